@@ -15,7 +15,7 @@ from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.inputs import Count, Unread
+from fisheye_svp_ros.nodes.subscriptions import Count, Unread
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 
 _STAMP = slice(4, 12)

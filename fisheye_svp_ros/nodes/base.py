@@ -1,4 +1,4 @@
-"""What every node shares: parameters, guarded inputs, diagnostics, how it runs."""
+"""What every node shares: parameters, guarded inputs, diagnostics; what managed nodes add."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from typing import Any, ClassVar, TypeVar
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.exceptions import NameValidationException
+from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from rclpy.node import Node
 
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io.parameters import rows, with_values
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.access import check_access
 from fisheye_svp_ros.nodes.declaration import (
+    check_access,
     declare,
     unknown_parameters,
     with_declared_types,
 )
-from fisheye_svp_ros.nodes.inputs import Unread
 from fisheye_svp_ros.nodes.quality import INPUT, RELIABLE, create_with_qos
+from fisheye_svp_ros.nodes.session import start_timer
 from fisheye_svp_ros.nodes.silence import LIMIT, explain_silence, silent_inputs
-from fisheye_svp_ros.nodes.subscriptions import Input
-from fisheye_svp_ros.nodes.timers import start_timer
-from fisheye_svp_ros.study.settings import Settings
+from fisheye_svp_ros.nodes.subscriptions import Input, Unread
+from fisheye_svp_ros.study.settings import Settings, SolverSettings
 
 _OF_ROS = ('use_sim_time', 'start_type_description_service')
 _KINDS_OF_ERRORS = 100  # that are told from each other
@@ -303,3 +303,69 @@ class BaseNode(Node):  # type: ignore[misc]
                 self.get_logger().warning(texts[-1])
         self._silences = reasons
         return '; '.join(texts)
+
+
+class ManagedNode(LifecycleNodeMixin, BaseNode):  # type: ignore[misc]
+    """A node that, with the parameter `lifecycle`, waits to be configured and activated.
+
+    Configure loads the lens, activate listens.  Without it nothing here makes a difference.
+    """
+
+    settings: SolverSettings
+
+    def __init__(self, node_name: str | None = None, **options: Any) -> None:
+        BaseNode.__init__(self, node_name, **options)
+        self._active = not self.settings.lifecycle
+        if self.settings.lifecycle:
+            LifecycleNodeMixin.__init__(self)
+
+    @property
+    def listening(self) -> bool:
+        """Whether the node is active."""
+        return self._active
+
+    def take_up(self) -> None:
+        """Take the initial parameters into use, unless `on_configure` is to do it."""
+        if not self.settings.lifecycle:
+            super().take_up()
+
+    def introduce(self) -> None:
+        """Say what the node listens to, once it does."""
+        if self._active:
+            super().introduce()
+
+    def has_listeners(self) -> bool:
+        """Say whether there is anybody to work for; there is nobody for an inactive node."""
+        return self._active and super().has_listeners()
+
+    def on_configure(self, state: Any) -> Any:
+        """Load the lens; the node stays unconfigured where that fails."""
+        try:
+            super().take_up()
+        except FisheyeSvpError as error:
+            self.get_logger().error(f'not configured: {error}')
+            return TransitionCallbackReturn.FAILURE
+        return super().on_configure(state)
+
+    def on_activate(self, state: Any) -> Any:
+        """Listen."""
+        self._active = True
+        for one in self._inputs.values():
+            one.subscribe()
+        self.introduce()
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: Any) -> Any:
+        """Listen no more."""
+        self._fall_silent()
+        return super().on_deactivate(state)
+
+    def on_shutdown(self, state: Any) -> Any:
+        """Listen no more, for good."""
+        self._fall_silent()
+        return super().on_shutdown(state)
+
+    def _fall_silent(self) -> None:
+        self._active = False
+        for one in self._inputs.values():
+            one.unsubscribe()

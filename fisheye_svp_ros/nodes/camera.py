@@ -72,14 +72,11 @@ class CameraTopics:
                 PoseStamped, f'{self._prefix}true_pose', wait=self._photographs)
 
     @property
-    def is_watched(self) -> bool:
-        """Whether somebody looks at the images, where there are any."""
-        return self._images is None or self._images.get_subscription_count() > 0
-
-    @property
-    def image_topic(self) -> str:
-        """The topic of the images; empty where there are none."""
-        return '' if self._images is None else str(self._images.topic_name)
+    def unwatched_topic(self) -> str:
+        """The topic of images that nobody looks at; empty where there is none."""
+        if self._images is None or self._images.get_subscription_count():
+            return ''
+        return str(self._images.topic_name)
 
     def publish(
         self, stamp: int, seen: Observations | Pixels, pose: Pose | None, lens: Lens | None
@@ -133,8 +130,8 @@ class CameraNode(BaseNode):
         """
         if not self.settings.wait_for_subscribers:
             return []
-        return [*super().unheard_topics(), *(
-            camera.image_topic for camera in self._cameras.values() if not camera.is_watched)]
+        unwatched = (camera.unwatched_topic for camera in self._cameras.values())
+        return [*super().unheard_topics(), *filter(None, unwatched)]
 
     @abstractmethod
     def publish_set(self, step: Any, stamp: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -19,6 +20,9 @@ from fisheye_svp_ros.io.parameters import Row, rows, with_values
 from fisheye_svp_ros.study.settings import Settings
 
 S = TypeVar('S', bound=Settings)
+
+MAX_FILE_BYTES = 1 << 26  # bytes of a file that somebody else names
+_NAME = re.compile(r'[\w-]{0,100}')
 
 
 def declare(node: Any, kind: type[S], given: Mapping[str, Any]) -> S:
@@ -99,3 +103,28 @@ def descriptor(row: Row) -> Any:
         limits = FloatingPointRange(from_value=float(row.low), to_value=float(row.high))
         message.floating_point_range = [limits]
     return message
+
+
+def check_access(name: str, folder: str, what: str) -> str:
+    """Return a name in config/, or a file, as given; raise ParameterError if it is out of bounds.
+
+    folder: below which a file must lie, symbolic links followed; empty: no file at all.
+    """
+    if _NAME.fullmatch(name) and not Path(name).is_file():
+        return name
+    if not folder:
+        raise ParameterError(f'{what}: {name[:100]!r} is a file, but a running node takes only '
+                             'names in config/; start it with folder:=DIR')
+    try:
+        path = Path(name).resolve()
+        inside = path.is_relative_to(Path(folder).resolve())
+        size = path.stat().st_size if inside and (path.is_file() or path.is_dir()) else -1
+    except (OSError, ValueError) as cause:
+        raise ParameterError(f'{what}: {name[:100]!r} is not a path ({cause})') from cause
+    if not inside:
+        raise ParameterError(f'{what}: {name[:100]!r} is not below {folder}, the folder of this '
+                             'node')
+    if not 0 <= size <= MAX_FILE_BYTES:
+        raise ParameterError(
+            f'{what}: {name[:100]!r} is no file, or above {MAX_FILE_BYTES >> 20} MB')
+    return name

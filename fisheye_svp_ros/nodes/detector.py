@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,7 +10,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.finders import default_detector
@@ -20,15 +19,14 @@ from fisheye_svp_ros.detect.photographs import Pixels, message_pixels
 from fisheye_svp_ros.detect.points import Points, search
 from fisheye_svp_ros.detect.workers import BoundedCalls, TimedOut
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
-from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.access import check_access
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
-from fisheye_svp_ros.nodes.image_topics import COMPRESSED_SUFFIX, compressed_topic
-from fisheye_svp_ros.nodes.inputs import Unread
-from fisheye_svp_ros.nodes.quality import INFO_INPUT, LATCHED, SENSOR
+from fisheye_svp_ros.nodes.declaration import check_access
+from fisheye_svp_ros.nodes.image_topics import COMPRESSED_SUFFIX, ImageTopics
+from fisheye_svp_ros.nodes.quality import LATCHED
+from fisheye_svp_ros.nodes.subscriptions import Unread
 from fisheye_svp_ros.optics.lens import INTRINSICS
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.study.settings import Settings
@@ -38,7 +36,6 @@ if TYPE_CHECKING:
 
 _RAW, _COMPRESSED = 'image', f'image{COMPRESSED_SUFFIX}'
 _LIVE_DETECTORS = {'saddle': 'quick'}  # a live camera has another image soon
-_MAX_LEAD = 100  # images of which one topic may be ahead of the other
 _MIN_FAILURES = 20  # images without a board before the first with one: it may be another board
 _LOOK = 0.005  # s, how often what a search found is looked for
 _GUIDE_PARAMETERS = ('e0', *INTRINSICS, 'k1', 'k2', 'k3', 'k4')  # that a guide can determine
@@ -107,7 +104,6 @@ class Detector(BaseNode):
         self._pattern: Pattern
         self._near: Array | None = None
         self._size: tuple[int, ...] | None = None
-        self._taken: deque[tuple[int, str]] = deque(maxlen=_MAX_LEAD)
         self._waiting: tuple[int, Unread] | None = None
         self._searched: tuple[int, str, Pixels] | None = None
         self._infos = CameraInfos(self.get_logger().info)
@@ -118,11 +114,8 @@ class Detector(BaseNode):
             self.listen(_tag_array(), 'detections', self._read_tags, self._publish_tags)
             self.start()
             return
-        self.collect(Image, _RAW, partial(_read, Image), self._take, SENSOR)
-        self.collect(CompressedImage, _COMPRESSED, partial(_read, CompressedImage), self._take,
-                     SENSOR, name=compressed_topic(self, _RAW))
-        self.collect(CameraInfo, CAMERA_INFO, read_camera_info,
-                     partial(self._infos.hear, CAMERA_INFO), INFO_INPUT, latched=True)
+        decode = partial(_read, Image), partial(_read, CompressedImage)
+        self._images = ImageTopics(self, _RAW, decode, self._take, CAMERA_INFO, self._infos)
         self.start()
         if self.settings.guide:
             # The diagnosis and the plots behind it take half a second to import.
@@ -191,10 +184,9 @@ class Detector(BaseNode):
         heard = looked_at or self._points.get_subscription_count()
         if not heard or not self.has_listeners():
             return
-        # image_transport sends each image on both topics.
-        if any(at == stamp and topic != image.topic for at, topic in self._taken):
+        if self._images.is_repeated(stamp, image):
             return
-        self._taken.append((stamp, image.topic))
+        self._images.remember(stamp, image)
         if self._waiting is not None:
             self._counts['images overtaken'] += 1
             if self._waiting[0] > stamp:

@@ -10,16 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Index
-from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.io.readers import read_observations, read_poses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes.camera import CameraNode, rows_by_frame
-from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.rectify.svp import svp_equivalent
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.study.settings import CameraSettings
@@ -82,7 +81,7 @@ class MeasuredCamera(CameraNode):
             rows=rows_by_frame(table),
             stamps=frame_stamps(table),
             poses=_true_poses(settings.true_poses, table),
-            lens=None if lens is None else kannala_brandt_equivalent(ForwardModel(lens).lens),
+            lens=None if lens is None else svp_equivalent(lens),
         )
 
     def configure(self, recording: Recording) -> None:

@@ -26,7 +26,6 @@ from std_msgs.msg import ColorRGBA, Float64, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.clouds import (
     DATATYPES,
     IMAGE_POINTS,
@@ -34,10 +33,10 @@ from fisheye_svp_ros.io.clouds import (
     Points,
     structured_array,
 )
-from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation
 from fisheye_svp_ros.rectify.maps import Rectification
+from fisheye_svp_ros.rectify.svp import svp_equivalent
 from fisheye_svp_ros.scene.landmarks import Landmarks
 
 _NS = 10**9
@@ -54,15 +53,10 @@ class Segments(NamedTuple):
     lines: bool = True
 
 
-def time_message(stamp: int) -> Any:
-    """Return builtin_interfaces/Time of nanoseconds."""
-    sec, nanosec = divmod(stamp, _NS)
-    return Time(sec=sec, nanosec=nanosec)
-
-
 def header(stamp: int, frame: str = '') -> Any:
     """Return std_msgs/Header."""
-    return Header(stamp=time_message(stamp), frame_id=frame)
+    sec, nanosec = divmod(stamp, _NS)
+    return Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=frame)
 
 
 def cloud_message(points: Points, stamp: int, frame: str) -> Any:
@@ -101,7 +95,7 @@ def image_message(pixels: NDArray[Any], stamp: int, frame: str, encoding: str = 
 
 def camera_info_message(lens: Lens, stamp: int, frame: str) -> Any:
     """Return CameraInfo as an SVP user has it: `equidistant` (Kannala-Brandt), k1 to k4."""
-    svp = kannala_brandt_equivalent(ForwardModel(lens).lens)
+    svp = svp_equivalent(lens)
     k = [svp.fx, 0.0, svp.cx, 0.0, svp.fy, svp.cy, 0.0, 0.0, 1.0]
     message = CameraInfo(header=header(stamp, frame), width=lens.width, height=lens.height)
     message.distortion_model = 'equidistant'

@@ -17,7 +17,7 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 from fisheye_svp_ros.diagnosis import Diagnosis, diagnose
-from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
+from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.parameters import parameter
@@ -225,19 +225,16 @@ class ModelCritic(SolverNode):
             f'{self._repeated} repeated; move the camera or the target', DiagnosticStatus.WARN))
 
     def _write_extended_lens(self, request: Any, response: Any) -> Any:
-        response.success = False
-        if self._verdict is None:
-            response.message = (
-                f'no diagnosis yet: {len(self._frames)} of {self.settings.min_frames} frames'
-            )
-            return response
         path = Path(self.settings.output).absolute()
         try:
+            if self._verdict is None:
+                raise ObservationError(f'no diagnosis yet: {len(self._frames)} of '
+                                       f'{self.settings.min_frames} frames')
             save_lens(self._verdict.lens, path, refusal_reason(self._verdict))
         except FisheyeSvpError as error:
-            response.message = str(error)
-            return response
-        response.success, response.message = True, str(path)
+            response.success, response.message = False, str(error)
+        else:
+            response.success, response.message = True, str(path)
         return response
 
 

@@ -13,8 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from fisheye_svp_ros.io.bags import BagWriter, OfferedQos
-from fisheye_svp_ros.nodes.signals import SignalHandler
-from fisheye_svp_ros.nodes.timers import start_timer
+from fisheye_svp_ros.nodes.session import SignalHandler, start_timer
 
 _COUNTED_TOPICS = ('/image_points', '/result')
 _LOOK_EVERY = 0.2  # s, for topics that are new

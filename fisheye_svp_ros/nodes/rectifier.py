@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -10,12 +9,11 @@ from typing import Any, NamedTuple
 
 import cv2
 from numpy.typing import NDArray
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, Image
 
 from fisheye_svp_ros.detect.image_messages import color_image
 from fisheye_svp_ros.detect.photographs import decode_image
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.io.rig_files import load_pair, pair_of_lenses
@@ -23,9 +21,9 @@ from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
-from fisheye_svp_ros.nodes.image_topics import COMPRESSED_SUFFIX, compressed_topic
-from fisheye_svp_ros.nodes.inputs import Unread
-from fisheye_svp_ros.nodes.quality import INFO_INPUT, SENSOR
+from fisheye_svp_ros.nodes.image_topics import COMPRESSED_SUFFIX, ImageTopics
+from fisheye_svp_ros.nodes.quality import SENSOR
+from fisheye_svp_ros.nodes.subscriptions import Unread
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.cameras import camera_for
@@ -35,7 +33,6 @@ from fisheye_svp_ros.scene.observations import STEREO
 from fisheye_svp_ros.study.settings import Settings
 
 _INFO = f'image/{CAMERA_INFO}'  # of the raw images; `camera_info` is that of the rectified ones
-_MAX_LEAD = 100  # images of which one topic may be ahead of the other
 
 
 @dataclass(frozen=True)
@@ -92,7 +89,7 @@ class Rectifier(BaseNode):
         self._setup: _Setup
         self._lenses: tuple[Lens, ...] = ()
         self._outputs: dict[str, tuple[Any, Any]] = {}
-        self._taken: dict[str, deque[tuple[int, str]]] = {}
+        self._images: dict[str, ImageTopics] = {}
         for camera in self._cameras:
             self._connect(camera)
         self.start()
@@ -107,14 +104,9 @@ class Rectifier(BaseNode):
         self._outputs[camera] = (
             self.announce(Image, f'{camera}image_rect', SENSOR, wait=True),
             self.announce(CameraInfo, f'{camera}{CAMERA_INFO}', SENSOR))
-        self._taken[camera] = deque(maxlen=_MAX_LEAD)
-        take = partial(self._take, camera)
-        image, topic = f'{camera}image', f'{camera}{_INFO}'
-        self.collect(Image, image, _read_raw, take, SENSOR)
-        self.collect(CompressedImage, image + COMPRESSED_SUFFIX, _read_compressed, take, SENSOR,
-                     name=compressed_topic(self, image))
-        self.collect(CameraInfo, topic, read_camera_info, partial(self._infos.hear, topic),
-                     INFO_INPUT, latched=True)
+        self._images[camera] = ImageTopics(
+            self, f'{camera}image', (_read_raw, _read_compressed), partial(self._take, camera),
+            f'{camera}{_INFO}', self._infos)
 
     def needed_inputs(self) -> Sequence[Sequence[str]]:
         """Return the topics without which there is nothing to rectify."""
@@ -177,9 +169,7 @@ class Rectifier(BaseNode):
         if not self.has_listeners() or not (
                 rectified.get_subscription_count() or info.get_subscription_count()):
             return
-        # image_transport sends each image on both topics.
-        taken = self._taken[camera]
-        if any(at == stamp and topic != image.topic for at, topic in taken):
+        if self._images[camera].is_repeated(stamp, image):
             return
         frame, pixels, encoding = image.read()
         side = self._side(camera, stamp)
@@ -188,7 +178,7 @@ class Rectifier(BaseNode):
             raise ObservationError(
                 f'{image.topic}: {width}x{height} px, but the lens is for '
                 f'{side.lens.width}x{side.lens.height} px; give the lens of these images')
-        taken.append((stamp, image.topic))
+        self._images[camera].remember(stamp, image)
         if rectified.get_subscription_count():
             rectified.publish(
                 messages.image_message(side.remap(pixels), stamp, frame, encoding))

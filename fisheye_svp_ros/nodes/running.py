@@ -12,8 +12,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.nodes.base import BaseNode, NodeExit, NodeFailure
-from fisheye_svp_ros.nodes.session import RCLError
-from fisheye_svp_ros.nodes.signals import SignalHandler
+from fisheye_svp_ros.nodes.session import RCLError, SignalHandler
 
 
 def run(kinds: Sequence[type[BaseNode]], args: list[str] | None = None) -> int:

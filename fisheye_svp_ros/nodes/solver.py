@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import time
 from abc import abstractmethod
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -28,15 +28,13 @@ from fisheye_svp_ros.io.decoding import (
     read_pose,
 )
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.access import check_access
-from fisheye_svp_ros.nodes.backlog import Counts, Pace, report
+from fisheye_svp_ros.nodes.base import ManagedNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
-from fisheye_svp_ros.nodes.inputs import Unread
-from fisheye_svp_ros.nodes.join import LIMIT, NeighborPair, Pending, StampJoin
+from fisheye_svp_ros.nodes.declaration import check_access
+from fisheye_svp_ros.nodes.join import LIMIT, NeighborPair, Pending, StampJoin, StandingLandmarks
 from fisheye_svp_ros.nodes.lenses import lens_of, lenses_of, shift_scale
-from fisheye_svp_ros.nodes.lifecycle import ManagedNode
 from fisheye_svp_ros.nodes.quality import INFO_INPUT
-from fisheye_svp_ros.nodes.standing import StandingLandmarks
+from fisheye_svp_ros.nodes.subscriptions import Unread
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -49,6 +47,37 @@ Items = Mapping[str, Any]
 _UNREAD = 5 * LIMIT  # messages to look at while there is nothing to solve
 _LONGEST_INTAKE = 0.05  # s of taking in before a set is solved, come what may
 _NS = 10**9
+_ENDS = ('taken', 'solved', 'not solved', 'dropped', 'incomplete')  # of sets
+
+
+class Pace:
+    """What became of the sets so far, by the words of the report, and how late they are."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.latency = 0.0  # s, of the latest set
+        self._restarted, self._reported = time.monotonic(), self.counts.copy()
+
+    def report(self, waiting: int) -> tuple[dict[str, object], str]:
+        """Return the counts since the start, and what is wrong since the last report.
+
+        taken = solved + not solved + dropped + incomplete + waiting, at any time.
+        """
+        counts, before, now = self.counts, self._reported, time.monotonic()
+        seconds = max(now - self._restarted, 1e-3)
+        self._restarted, self._reported = now, counts.copy()
+        came = (counts['taken'] - before['taken']) / seconds
+        done = sum(counts[end] - before[end] for end in ('solved', 'not solved')) / seconds
+        told: dict[str, object] = {
+            **{f'sets: {end}': counts[end] for end in _ENDS}, 'sets: waiting': waiting,
+            'sets: received per second': round(came, 1), 'sets: solved per second': round(done, 1),
+            'sets: latency_s': round(self.latency, 4),
+        }
+        if counts['dropped'] == before['dropped']:
+            return told, ''
+        return told, (
+            f'too slow: {came:.0f} sets per second are received and {done:.0f} are solved, '
+            f'{self.latency:.2f} s late; {waiting} wait, {counts["dropped"]} are dropped')
 
 
 class SolverNode(ManagedNode):
@@ -76,7 +105,6 @@ class SolverNode(ManagedNode):
             self._image_points, {**self._poses, 'landmarks': first, 'scenario': first})
         self._backlog: deque[Pending] = deque()
         self._unread: deque[tuple[int, str]] = deque(maxlen=_UNREAD)
-        self._counts = Counts()
         self._pace = Pace()
         self._standing = StandingLandmarks()
         self._said = ''
@@ -199,11 +227,8 @@ class SolverNode(ManagedNode):
         self._result.publish(messages.key_values_message(name, values, stamp, problem, level))
 
     def report(self) -> tuple[Mapping[str, object], str]:
-        """Return what became of every set, and whether this node keeps up.
-
-        taken = solved + not solved + dropped + incomplete + waiting, at any time.
-        """
-        return report(self._counts, self._pace, len(self._backlog) + len(self._join))
+        """Return what became of every set, and whether this node keeps up."""
+        return self._pace.report(len(self._backlog) + len(self._join))
 
     def _listen_to_camera_info(self) -> None:
         def hear(topic: str, stamp: int, unread: Unread) -> None:
@@ -220,7 +245,7 @@ class SolverNode(ManagedNode):
         self.collect(kind, topic, read, functools.partial(self._add, topic))
 
     def _add(self, topic: str, stamp: int, item: Unread) -> None:
-        self._counts.taken += self._join.add(topic, stamp, item, time.monotonic())
+        self._pace.counts['taken'] += self._join.add(topic, stamp, item, time.monotonic())
         self._unread.append((stamp, topic))
 
     def _hear_landmarks(self, stamp: int, unread: Unread) -> None:
@@ -246,7 +271,7 @@ class SolverNode(ManagedNode):
             self._drop_set(one)
         while len(self._backlog) > self.settings.backlog:
             self._backlog.popleft()
-            self._counts.dropped += 1
+            self._pace.counts['dropped'] += 1
         if not self.has_listeners():
             return
         if self._backlog:
@@ -305,7 +330,7 @@ class SolverNode(ManagedNode):
             landmarks = self._standing.find_for_set(
                 items.get('landmarks'), self._join.distance('landmarks', one.stamp))
             self.solve(one.stamp, landmarks, items)
-            self._counts.solved += 1
+            self._pace.counts['solved'] += 1
         except FisheyeSvpError as error:
             self.drop(topic, error)
             self._fail(one.stamp, str(error))
@@ -327,11 +352,11 @@ class SolverNode(ManagedNode):
         return items
 
     def _fail(self, stamp: int, problem: str) -> None:
-        self._counts.unsolved += 1
+        self._pace.counts['not solved'] += 1
         self.publish_result(stamp, {}, problem)
 
     def _drop_set(self, one: Pending) -> None:
-        self._counts.incomplete += 1
+        self._pace.counts['incomplete'] += 1
         missing = [topic for topic in self._image_points if topic not in one.items]
         for topic, stamp in one.stamps.items():
             reason = self._reason(missing[0], stamp) if missing else 'too many sets wait'

@@ -1,4 +1,4 @@
-"""The inputs of a node: each is heard from whoever publishes it, whatever it offers.
+"""The inputs of a node: each is heard from whoever publishes it, and decoded when it is needed.
 
 Who asks for more than a publisher offers does not hear it, and who asks for less does not get
 what a latched publisher has sent before.  So an input asks for what the topic usually has, and
@@ -8,23 +8,83 @@ would have the log of every driver say that no messages are sent.
 
 from __future__ import annotations
 
+import struct
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable
 from copy import copy
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 
-from fisheye_svp_ros.nodes.inputs import Count
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.decoding import nanoseconds
 from fisheye_svp_ros.nodes.quality import INPUT, create_with_qos, overridden
 
 _LONG_INTERVALS = 3  # of a topic, without a message: it has stopped
 # Messages by which one subscription of a topic may be ahead of another: as many as may wait.
 _MAX_HASHES = INPUT.depth
 
+_MIN_BYTES = 12  # bytes: the head of CDR and a stamp
+
 _Kind = tuple[bool, bool]  # of a subscription: reliable, latched
+
+
+@dataclass
+class Count:
+    """How many messages of a topic came, were looked at, and could not be used."""
+
+    received: int = 0
+    read: int = 0
+    dropped: int = 0
+
+
+class Unread:
+    """A message that has come and is not decoded yet."""
+
+    def __init__(
+        self, topic: str, kind: Any, data: bytes, decode: Callable[[Any, str], Any], counts: Count
+    ) -> None:
+        self.topic = topic
+        self._kind, self._data, self._decode, self._counts = kind, data, decode, counts
+        self._outcome: tuple[Any, ObservationError | None] | None = None
+
+    @property
+    def stamp(self) -> int:
+        """The stamp of its header, which every message starts with that a node listens to, ns."""
+        try:
+            if len(self._data) < _MIN_BYTES:
+                raise ObservationError(f'{self.topic}: {len(self._data)} bytes are not a message')
+            order = '<' if self._data[1] & 1 else '>'
+            sec, nanosec = struct.unpack_from(f'{order}iI', self._data, 4)
+            return nanoseconds(sec, nanosec, self.topic)
+        except ObservationError:
+            self._counts.read += 1
+            raise
+
+    def read(self) -> Any:
+        """Return what it holds; raise ObservationError where it cannot be used."""
+        if self._outcome is None:
+            self._counts.read += 1
+            try:
+                self._outcome = self._decode_data(), None
+            except ObservationError as error:
+                self._outcome = None, error
+        value, refusal = self._outcome
+        if refusal is not None:
+            raise refusal
+        return value
+
+    def _decode_data(self) -> Any:
+        try:
+            message = deserialize_message(self._data, self._kind)
+        except Exception as cause:
+            kind = self._kind.__name__
+            raise ObservationError(f'{self.topic}: not a {kind} ({cause})') from cause
+        return self._decode(message, self.topic)
 
 
 class _Subscription(NamedTuple):

@@ -13,16 +13,15 @@ from visualization_msgs.msg import MarkerArray
 
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import Pixels
-from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.parameters import SWEEP, Sweep, parameter, sweep_of, with_values
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.camera import CameraNode, rows_by_frame
 from fisheye_svp_ros.nodes.markers import camera_shape, landmarks_shape, rays_shape
 from fisheye_svp_ros.nodes.quality import LATCHED
-from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.rectify.svp import svp_equivalent
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.simulate.scenario import (
@@ -143,18 +142,12 @@ def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[SweepSet]
         for number, swept in enumerate(sweep):
             scenario = with_values(settings, swept)
             for first, sets, simulation in simulate_in_pieces(scenario, number, repetition):
-                equivalent = kannala_brandt_equivalent(ForwardModel(simulation.lens).lens)
-                svp_lenses = tuple(
-                    equivalent if lens is simulation.lens
-                    else kannala_brandt_equivalent(ForwardModel(lens).lens)
-                    for lens in simulation.lenses)
+                svp_lenses = tuple(map(svp_equivalent, simulation.lenses))
                 table = simulation.observations
                 rows_of = rows_by_frame(table)
                 for frame in range(len(simulation.poses[0].position)):
-                    seen = {
-                        camera: table.take(rows_of.get((frame, camera), nothing))
-                        for camera in table.cameras
-                    }
+                    seen = {camera: table.take(rows_of.get((frame, camera), nothing))
+                            for camera in table.cameras}
                     yield SweepSet(number, first + frame, sets, frame, scenario, swept,
                                    simulation, seen, svp_lenses)
         if not settings.repeat:

@@ -10,10 +10,9 @@ from rclpy.serialization import deserialize_message
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
-from fisheye_svp_ros.nodes.quality import LATCHED, RELIABLE, TRANSFORMS
+from fisheye_svp_ros.nodes.quality import LATCHED, TRANSFORMS
 from fisheye_svp_ros.pose import Pose
 
-_TOPICS = {False: ('/tf', RELIABLE), True: ('/tf_static', LATCHED)}
 _MAX_SENT = 100  # transforms by which those that come back may be late
 
 
@@ -30,9 +29,9 @@ class Transforms:
         self._sent: deque[Any] = deque(maxlen=_MAX_SENT)
         self._children: set[str] = set()
         if wanted:
-            topic, qos = _TOPICS[static]
             self._kind = _message_class()
-            self._publisher = node.announce(self._kind, topic, qos)
+            self._publisher = (node.announce(self._kind, '/tf_static', LATCHED) if static
+                               else node.announce(self._kind, '/tf'))
             for topic, asked in TRANSFORMS.items():
                 node.create_subscription(
                     self._kind, topic, node.guard_callback(self._compare), asked, raw=True)

@@ -13,8 +13,7 @@ from rclpy.node import Node
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.nodes.quality import RELIABLE
-from fisheye_svp_ros.nodes.signals import SignalHandler
-from fisheye_svp_ros.nodes.timers import start_timer
+from fisheye_svp_ros.nodes.session import SignalHandler, start_timer
 
 _TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 _LOOK_EVERY = 0.5  # s, for nodes that are new

@@ -20,6 +20,11 @@ _MOST_STEPS = 50
 _TOLERANCE = 1e-7  # px
 
 
+def svp_equivalent(lens: Lens) -> Lens:
+    """Return the Kannala-Brandt lens that an SVP user would be given, extended curves included."""
+    return kannala_brandt_equivalent(ForwardModel(lens).lens)
+
+
 def nearest_svp_lens(lens: Lens, range_m: float) -> tuple[Lens, float]:
     """Return the Kannala-Brandt lens nearest to a lens at a range, m, and its worst error, px.
 
@@ -40,7 +45,7 @@ def nearest_svp_lens(lens: Lens, range_m: float) -> tuple[Lens, float]:
     points = meet_sphere(origin, direction, np.zeros(3), range_m)
     square = lens.fx == lens.fy and not lens.corrections and lens.is_bare
     names = (*(('f',) if square else ('fx', 'fy')), 'cx', 'cy', 'k1', 'k2', 'k3', 'k4')
-    found = _fit_parameters(kannala_brandt_equivalent(ForwardModel(lens).lens), names, points, uv)
+    found = _fit_parameters(svp_equivalent(lens), names, points, uv)
     reach = float(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]).max())
     off = np.linalg.norm(camera.project(found, points, limited=False).uv - uv, axis=-1)
     if reach > curve_limit(found):

@@ -23,7 +23,7 @@ from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.nodes import access, inputs, messages
+from fisheye_svp_ros.nodes import declaration, messages, subscriptions
 from fisheye_svp_ros.nodes.detector import Detector
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.measured_camera import MeasuredCamera
@@ -139,10 +139,10 @@ def test_a_hostile_message_is_refused_with_a_reason_and_counted(
 
 def test_less_than_a_stamp_is_refused_and_counted(graph: Callable[..., Graph]) -> None:
     node = graph('lens:=fish214').start(Localizer)
-    count = inputs.Count()
+    count, head = subscriptions.Count(), messages.header
     for data in (b'', bytes(3), bytes(11)):
         with pytest.raises(ObservationError, match='bytes are not a message'):
-            _ = inputs.Unread('image_points', PointCloud2, data, messages.header, count).stamp
+            _ = subscriptions.Unread('image_points', PointCloud2, data, head, count).stamp
     assert node._failures == 0 and count.read == 3
 
 
@@ -304,7 +304,7 @@ def test_files_are_named_below_the_folder_alone(
     (inside.parent / 'link.yaml').symlink_to(outside)
     os.mkfifo(inside.parent / 'fifo.yaml')
     with (inside.parent / 'huge.yaml').open('wb') as file:
-        file.truncate(access.MAX_FILE_BYTES + 1)
+        file.truncate(declaration.MAX_FILE_BYTES + 1)
     node = graph(f'folder:={inside.parent}').start(Localizer)
     assert set_parameter(node, 'lens', str(inside)).successful
     for name, reason in ((outside, 'is not below'), (inside.parent / 'link.yaml', 'is not below'),

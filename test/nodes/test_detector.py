@@ -211,7 +211,7 @@ def test_a_camera_that_photographs_waits_for_who_compares_with_its_truth(
     g = graph(f'photograph:={BOARD}', f'lens:={lens}', 'rate:=20.0', 'wait_for_subscribers:=1')
     images = g.hear(Image, 'image', SENSOR)
     camera = g.start(SyntheticCamera)
-    g.until(lambda: camera.camera('').is_watched)
+    g.until(lambda: not camera.camera('').unwatched_topic)
     assert not camera.has_listeners() and not images
     g.idle(0.3)
     assert capfd.readouterr().err.count('too few listen to /true_pose') == 1

@@ -19,7 +19,7 @@ from helpers.nodes import ROOT, NodeProcess
 
 from fisheye_svp_ros import __version__
 from fisheye_svp_ros.nodes import NODES, base, executables, running
-from fisheye_svp_ros.nodes.signals import SignalHandler
+from fisheye_svp_ros.nodes.session import SignalHandler
 
 _CODE = """
 import sys

@@ -13,7 +13,7 @@ from helpers import graph  # noqa: F401 - skips where there is no rclpy
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.nodes.recorder import Recorder
-from fisheye_svp_ros.nodes.signals import SignalHandler
+from fisheye_svp_ros.nodes.session import SignalHandler
 from fisheye_svp_ros.nodes.watcher import Watcher
 
 SIGNALS = signal.SIGINT, signal.SIGTERM
