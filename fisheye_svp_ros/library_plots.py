@@ -37,12 +37,10 @@ def plot_lens(*lenses: AnyLens) -> Figure:
     height, shift = figure.subplots(1, 2)
     for lens in map(load_lens, lenses):
         theta = np.linspace(0, lens.max_incidence, _ANGLES)
-        degrees, curve = np.degrees(theta), lens.viewpoint_shift
+        degrees = np.degrees(theta)
         height.plot(degrees, lens.fx * lens.image_height.value_and_slope(theta)[0],
                     label=lens.name)
-        values = np.zeros_like(theta) if curve is None else curve.value_and_slope(
-            theta, np.tan(theta / 2))[0]
-        shift.plot(degrees, 1e3 * values, label=lens.name)
+        shift.plot(degrees, 1e3 * lens.shift_at(theta), label=lens.name)
     height.set(xlabel='incidence angle / degree', ylabel='image height / px')
     shift.set(xlabel='incidence angle / degree', ylabel='viewpoint shift / mm')
     height.legend()

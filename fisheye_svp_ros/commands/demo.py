@@ -33,9 +33,9 @@ from fisheye_svp_ros.paper.demonstration import (
     camera_parameters,
     compute_demo,
     demo_rows,
+    rectified_pair,
     residual_fields,
 )
-from fisheye_svp_ros.paper.demonstration_pair import rectified_pair
 from fisheye_svp_ros.paper.tables import LENSES
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.reporting.tables import print_table, range_text

@@ -42,12 +42,11 @@ def note_odd(lens: Lens, path: str | Path, worst: float) -> None:
     if not (-0.5 <= lens.cx <= lens.width - 0.5 and -0.5 <= lens.cy <= lens.height - 0.5):
         say(f'{path}: the principal point ({lens.cx:.1f}, {lens.cy:.1f}) lies outside the image '
             f'of {lens.width}x{lens.height} px; check cx, cy and the image size')
-    edge, limit = np.array([lens.max_incidence]), np.degrees(lens.max_incidence)
-    if lens.viewpoint_shift is not None:
-        shift = float(lens.viewpoint_shift.value_and_slope(edge, np.tan(edge / 2))[0][0])
-        if abs(shift) > _MAX_SHIFT:
-            say(f'{path}: the viewpoint shift is {shift:.2g} m at {limit:.3g} deg; its '
-                'coefficients are in m')
+    limit = np.degrees(lens.max_incidence)
+    shift = float(lens.shift_at(np.asarray(lens.max_incidence)))
+    if abs(shift) > _MAX_SHIFT:
+        say(f'{path}: the viewpoint shift is {shift:.2g} m at {limit:.3g} deg; its '
+            'coefficients are in m')
     if limit < _MIN_FIELD_DEG:
         say(f'{path}: max_incidence_deg is {limit:.3g}; it is in degrees')
     if worst > LARGE_DEVIATION:

@@ -14,7 +14,6 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.effort import Effort, Look
-from fisheye_svp_ros.detect.extent import goes_on
 from fisheye_svp_ros.detect.finders import FIRST_LOOKS, count_tags, default_detector, invert_image
 from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals, of_rig, turn_field
 from fisheye_svp_ros.detect.pairing import Pairing, pair_photographs, stamp_of
@@ -26,6 +25,7 @@ from fisheye_svp_ros.detect.points import (
     eight_bit,
     find_points,
     full_scale_share,
+    goes_on,
 )
 from fisheye_svp_ros.detect.workers import TimedOut, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError

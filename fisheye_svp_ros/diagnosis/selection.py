@@ -339,7 +339,7 @@ def reinstate_outliers(
     """
     views, again = data.views, np.zeros(len(outliers.rows), dtype=bool)
     off = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1) / relative_sigma(views)
-    scale, _ = robust_scale(views, np.where(views.used, off, np.nan))
+    scale = robust_scale(np.where(views.used, off, np.nan))
     near = ~views.used & (views.landmark >= 0) & (off < _REINSTATED_SIGMAS * scale)
     weight, row, table = views.weight.copy(), views.row.copy(), data.observations
     for view, point in np.argwhere(near):

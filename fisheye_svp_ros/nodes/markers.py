@@ -36,9 +36,7 @@ def rays_shape(lens: Lens, pose: Pose, points: Array, name: str) -> Segments:
     """Return the rays from each landmark (N, 3), m, to the viewpoint it has in the lens."""
     rays = incidence(lens, pose.into_body(points))
     viewpoint = np.zeros((len(points), 3))
-    if lens.viewpoint_shift is not None:
-        theta = rays.theta
-        viewpoint[:, 2] = lens.viewpoint_shift.value_and_slope(theta, np.tan(theta / 2))[0]
+    viewpoint[:, 2] = lens.shift_at(rays.theta)
     start = viewpoint @ pose.rotation.T + pose.position
     both = np.stack([start, points], axis=1)[rays.valid].reshape(-1, 3)
     return Segments(f'rays {name}'.strip(), both, (0.9, 0.5, 0.1, 0.5), 0.001)

@@ -204,7 +204,7 @@ def back_project(lens: Lens, uv: Array) -> Rays:
     direction = np.stack([sin * mx * inverse, sin * my * inverse, np.cos(theta)], axis=-1)
     origin = np.zeros_like(direction)
     if lens.viewpoint_shift is not None:
-        origin[..., 2] = lens.viewpoint_shift.value_and_slope(theta, np.tan(theta / 2))[0]
+        origin[..., 2] = lens.shift_at(theta)
     if lens.port is not None:
         at, way = port_projection.trace_rays(lens, direction.reshape(-1, 3))
         back = (at.value * way.value).sum(axis=0)

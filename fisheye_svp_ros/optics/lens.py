@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.curve_base import ImageHeight, ViewpointShift
 from fisheye_svp_ros.optics.image_field import ImageField
@@ -100,6 +101,13 @@ class Lens:
         """Return the lens with a viewpoint shift added to its own."""
         own = self.viewpoint_shift
         return replace(self, viewpoint_shift=shift if own is None else own.plus(shift))
+
+    def shift_at(self, theta: Array) -> Array:
+        """Return the viewpoint shift at incidence angles (...), rad, m; 0 of an SVP lens."""
+        shift = self.viewpoint_shift
+        if shift is None:
+            return np.zeros_like(theta)
+        return shift.value_and_slope(theta, np.tan(theta / 2))[0]
 
     @property
     def is_svp(self) -> bool:

@@ -7,9 +7,12 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.recording import NAMESPACE, Columns, ResidualSet, residual_sets
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.paper.tables import (
     CALIBRATION,
     ERROR2_RANGE,
@@ -19,8 +22,13 @@ from fisheye_svp_ros.paper.tables import (
     RIGHT_CAMERA_Z,
     STYLE_NAMES,
 )
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.rectify.cameras import camera_for
+from fisheye_svp_ros.rectify.stereo import RectifiedPair, rectify_pair
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 from fisheye_svp_ros.scene.observations import group_views
+from fisheye_svp_ros.scene.rigs import rig
+from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.simulate.scenario import Scenario, model_of, scalars, simulate_scenario
 from fisheye_svp_ros.study.settings import LocalizerSettings
 from fisheye_svp_ros.study.solutions import localize_sets, residual_points
@@ -31,6 +39,9 @@ DEPTH_POSES = [
     [0.0, 0.0, RIGHT_CAMERA_Z.get(lens, 0.0), 1.0, 0.0, 0.0, 0.0] for lens in LENSES
 ]
 _MM, _DEGREE = 1e-3, np.radians(1.0)
+_PAIR_RANGE = 0.5  # m, of the paper's nearer landmarks
+_BOARD = Print(9, 6, 0.065)
+_DIRECTION = np.array([0.0, -0.25, 0.9])  # the board, in the left camera: above the axes
 
 
 class Task(NamedTuple):
@@ -180,3 +191,23 @@ def _published_cells(
     ]
     error = z if task.name == 'localization' else np.sqrt(x * x + y * y + z * z)
     return (error * _MM,) * 2, float(axis * _DEGREE), (float(residual),) * 2
+
+
+def rectified_pair(lens: Lens) -> tuple[RectifiedPair, tuple[NDArray[Any], ...]]:
+    """Return the pair of two cameras with the lens, and their rectified photographs."""
+    place, both = _board_in_left(), rig('vergent')
+    camera = camera_for([lens], 'pinhole', (640, 480), np.radians(110.0), along_baseline=True)
+    pair = rectify_pair(lens, lens, both, camera, _PAIR_RANGE)
+    left = place.inverse()
+    images = [side.remap(render(lens, _BOARD, pose, Exposure(), np.random.default_rng(0)))
+              for side, pose in ((pair.left, left), (pair.right, left.compose(both.inverse())))]
+    return pair, tuple(images)
+
+
+def _board_in_left() -> Pose:
+    """Return the board, which faces the left camera."""
+    ahead: Array = _DIRECTION / np.linalg.norm(_DIRECTION)
+    right = np.cross([0.0, 1.0, 0.0], ahead)
+    right /= np.linalg.norm(right)
+    turn = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    return Pose(turn, _PAIR_RANGE * ahead - turn @ _BOARD.corners.mean(axis=0))

@@ -19,7 +19,6 @@ from fisheye_svp_ros.paper.lens_evaluation import (
     LocalizedSpread,
     Measurement,
     landmarks_at,
-    shift_at,
 )
 from fisheye_svp_ros.paper.results import Panel
 from fisheye_svp_ros.paper.studies import Family, shift_curves
@@ -56,7 +55,7 @@ def draw_shift(path: Path, lenses: dict[str, Lens], family: Family) -> None:
             theta = np.linspace(0, lens.max_incidence, 200)
             curves = 1e3 * shift_curves(family.matching, name, theta)
             axis.plot(np.degrees(theta), curves.T, color=_COLOURS[name], alpha=0.18, linewidth=0.8)
-            axis.plot(np.degrees(theta), 1e3 * shift_at(lens, theta), color=_COLOURS[name],
+            axis.plot(np.degrees(theta), 1e3 * lens.shift_at(theta), color=_COLOURS[name],
                       linewidth=2, label=f'{NAMES[name]} (light: all {len(family.matching)} fits)')
         axis.axvline(88, color=FAINT, linestyle=':')
         axis.annotate('outermost landmarks', (88, axis.get_ylim()[1]), ha='right', va='top',

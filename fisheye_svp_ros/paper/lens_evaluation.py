@@ -72,14 +72,6 @@ class LensEvaluation(NamedTuple):
         return np.array([measured.metrics[metric] for measured in self.measured])
 
 
-def shift_at(lens: Lens, theta: Array) -> Array:
-    """Return the viewpoint shift at incidence angles (T,), rad, m; 0 for an SVP lens."""
-    shift = lens.viewpoint_shift
-    if shift is None:
-        return np.zeros_like(theta)
-    return shift.value_and_slope(theta, np.tan(theta / 2))[0]
-
-
 def landmarks_at(spread: str, radius: float) -> Array:
     """Return the landmarks (N, 3) of an environment, m."""
     return radius * _directions(spread)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import Executor, Future, wait
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,7 +15,6 @@ from fisheye_svp_ros.io.files import replacing, write_json, write_together
 from fisheye_svp_ros.paper import figures
 from fisheye_svp_ros.paper.claims import FAILS, HOLDS, IN_PART
 from fisheye_svp_ros.paper.extensions import CALIBRATION_NOISE, NOISES, POSE_SETS
-from fisheye_svp_ros.paper.lens_evaluation import shift_at
 from fisheye_svp_ros.paper.results import Results
 from fisheye_svp_ros.paper.studies import COMMAND, shift_curves
 from fisheye_svp_ros.paper.tables import (
@@ -24,7 +23,6 @@ from fisheye_svp_ros.paper.tables import (
     OUT_OF_LINE,
     QUANTITIES,
     REPEATED_CELL,
-    STYLE_NAMES,
     UNITS,
     Cell,
 )
@@ -124,7 +122,7 @@ def _recovery(results: Results) -> Iterator[Block]:
     rows = []
     for k, name in enumerate(LENSES):
         curves = _MM * shift_curves(fits, name, theta)
-        own = shift_at(results.lenses[name], theta)
+        own = results.lenses[name].shift_at(theta)
         f = np.array([one.lens_numbers[k, 0] for one in fits])
         rows.append([NAMES[name], 'f, px', f'{results.lenses[name].fx:.1f}', _span(f, 1)])
         rows += [
@@ -145,7 +143,7 @@ def _localization(results: Results) -> Iterator[Block]:
     yield Heading('Self-localization: tables 1 and 2, figure 6')
     for table in (1, 2):
         yield Heading(f'Table {table}: {NAMES[LENSES[table - 1]]}', 3)
-        yield _comparison_table(results, table, SPREADS)
+        yield _comparison_table(results, table)
         if table == 1:
             yield Text('*: the row that is inconsistent in the paper itself, see below.')
     yield Picture('figure6.png', 'Figure 6: two views of each environment, image points and '
@@ -191,7 +189,7 @@ def _calibration(results: Results) -> Iterator[Block]:
                   'landmarks at 0.5 m.')
     for table in (3, 4):
         yield Heading(f'Table {table}: {NAMES[LENSES[table - 3]]}', 3)
-        yield _comparison_table(results, table, STYLE_NAMES)
+        yield _comparison_table(results, table)
     yield Text(
         'new: cells that the paper leaves empty. The ten poses are not printed either. The last '
         f'columns of the list of differences below are results of {POSE_SETS} random sets of ten '
@@ -290,8 +288,7 @@ def _differences(results: Results) -> Iterator[Block]:
             continue
         ends = ['', '']
         if cell.table > 2:
-            place = _cell_index(cell, STYLE_NAMES)
-            ends = [f'{low[place]:.4f}', f'{high[place]:.4f}']
+            ends = [f'{end[cell.place]:.4f}' for end in (low, high)]
         rows.append([
             str(cell.table), f'{NAMES[cell.lens]} {cell.radius} m {cell.row}', cell.quantity,
             cell.unit, _reason(cell, low, high), f'{cell.published:.4f}', f'{cell.ours:.4f}', *ends
@@ -309,7 +306,7 @@ def _reason(cell: Cell, low: Array, high: Array) -> str:
     if cell.table < 3:
         return (f'{abs(cell.ours - cell.published):.4f} {cell.unit} that the recovered layout '
                 'does not reproduce')
-    place = _cell_index(cell, STYLE_NAMES)
+    place = cell.place
     if place[:3] == REPEATED_CELL:
         return 'a row of the paper that repeats another one'
     if low[place] <= cell.published <= high[place]:
@@ -320,7 +317,7 @@ def _reason(cell: Cell, low: Array, high: Array) -> str:
     return 'beyond the range of other sets of poses'
 
 
-def _comparison_table(results: Results, table: int, names: Sequence[str]) -> TableBlock:
+def _comparison_table(results: Results, table: int) -> TableBlock:
     header = ['radius', 'range' if table < 3 else 'style']
     for quantity, unit in zip(QUANTITIES, UNITS, strict=True):
         header += [f'{quantity} {unit} published', 'ours', '%']
@@ -328,21 +325,16 @@ def _comparison_table(results: Results, table: int, names: Sequence[str]) -> Tab
     for cell in results.cells():
         if cell.table == table:
             row = rows.setdefault((cell.radius, cell.row), [f'{cell.radius} m', cell.row])
-            row += [_number(cell.published, 4), f'{cell.ours:.4f}', _percent(cell, names)]
+            row += [_number(cell.published, 4), f'{cell.ours:.4f}', _percent(cell)]
     return TableBlock(header, list(rows.values()), 2)
 
 
-def _percent(cell: Cell, names: Sequence[str]) -> str:
+def _percent(cell: Cell) -> str:
     if np.isnan(cell.published):
         return 'new'
     percent = 100 * cell.relative
     text = f'{percent:+.0f}' if abs(percent) < 1000 else '< -999' if percent < 0 else '> 999'
-    return text + '*' if cell.table == 1 and _cell_index(cell, names)[:3] == OUT_OF_LINE else text
-
-
-def _cell_index(cell: Cell, names: Sequence[str]) -> tuple[int, int, int, int]:
-    return (LENSES.index(cell.lens), RADII.index(cell.radius), list(names).index(cell.row),
-            QUANTITIES.index(cell.quantity))
+    return text + '*' if cell.table == 1 and cell.place[:3] == OUT_OF_LINE else text
 
 
 def _span(values: Array, decimals: int) -> str:

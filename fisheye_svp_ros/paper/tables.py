@@ -95,7 +95,10 @@ REPEATED_CELL = (0, 2, 2)
 
 
 class Cell(NamedTuple):
-    """One cell of tables 1 to 4: `published` is NaN where the paper has none."""
+    """One cell of tables 1 to 4: `published` is NaN where the paper has none.
+
+    place: of the lens, radius, row and quantity.
+    """
 
     table: int
     lens: str
@@ -105,6 +108,7 @@ class Cell(NamedTuple):
     unit: str
     published: float
     ours: float
+    place: tuple[int, ...]
 
     @property
     def relative(self) -> float:
@@ -122,6 +126,6 @@ def cells(published: Array, ours: Array, first_table: int, rows: Sequence[str]) 
     """Return the cells of a pair of tables (2, 3, 3, 5), one a lens, in printed order."""
     return [
         Cell(first_table + lens, LENSES[lens], RADII[radius], rows[row], QUANTITIES[quantity],
-             UNITS[quantity], float(value), float(ours[lens, radius, row, quantity]))
-        for (lens, radius, row, quantity), value in np.ndenumerate(published)
+             UNITS[quantity], float(value), float(ours[place]), place)
+        for place, value in np.ndenumerate(published) for lens, radius, row, quantity in [place]
     ]

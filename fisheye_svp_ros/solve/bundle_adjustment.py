@@ -62,11 +62,11 @@ class Prior(NamedTuple):
 
 def adjust(
     data: RigViews, state: RigState, free: Sequence[str], prior: Prior | None = None,
-    held: Collection[str] = (),
+    held: Collection[str] | None = (),
 ) -> RigState:
     """Fit poses, rig, free intrinsics and effect values together, from a state on.
 
-    held: effects whose values stay what they are.
+    held: effects whose values stay what they are; None: all but the poses does.
     """
     problem = Adjustment(data, state, free, held, prior)
     return problem.unpack(levenberg_marquardt(problem, problem.pack([state])).state)
@@ -74,8 +74,7 @@ def adjust(
 
 def adjust_poses(data: RigViews, state: RigState) -> RigState:
     """Fit the poses of the frames alone."""
-    problem = Adjustment(data, state, (), held=None)
-    return problem.unpack(levenberg_marquardt(problem, problem.pack([state])).state)
+    return adjust(data, state, (), held=None)
 
 
 def gauss_newton(
@@ -170,10 +169,9 @@ def adjust_lens(lens: Lens, views: Views, pose: Pose, names: Sequence[str]) -> A
     _, arrow = _equations(linear, linear.shared_columns)
     _check_determined(arrow, names)
     covariance = arrow_covariance(arrow)
-    residual = np.where(views.used[..., None], views.uv - linear.linear.uv, np.nan)
     return AdjustedLens(
         fitted.lens, tuple(names), covariance.shared[0], fitted.pose, covariance.blocks[0],
-        residual, (linear.residual**2).sum(axis=1), bool(solved.converged[0]),
+        linear.residual_px, (linear.residual**2).sum(axis=1), bool(solved.converged[0]),
     )
 
 
@@ -248,8 +246,7 @@ class Adjustment:
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         if not len(index):
             return np.zeros(0), ()
-        costs, systems = zip(*(self._system(self.unpack(state, i)) for i in range(len(index))),
-                             strict=True)
+        costs, systems = zip(*(self._equations(state, i) for i in range(len(index))), strict=True)
         return (np.concatenate(costs),
                 tuple(np.concatenate(parts) for parts in zip(*systems, strict=True)))
 
@@ -266,6 +263,9 @@ class Adjustment:
             *Pose(rig_rotation, rig_position).retract(move),
             values + shared[:, 6 * (bodies - 1):],
         )
+
+    def _equations(self, packed: Arrays, system: int) -> tuple[Array, Arrays]:
+        return self._system(self.unpack(packed, system))
 
     def _system(self, state: RigState) -> tuple[Array, Arrays]:
         """Return cost (1,) and normal equations of one state, infinite for an impossible lens."""
@@ -321,7 +321,7 @@ def _pose_rows(prior: PosePrior, pose: Pose) -> tuple[Array, Array]:
 def _equations(linear: Linearization, shared: Array) -> tuple[Array, Arrays]:
     """Return cost (1,) and arrow of a linearization with shared columns (F, M, K)."""
     residual, block = linear.residual, linear.frame_columns
-    cost = float((residual**2).sum())
+    cost = linear.sum_of_squares
     if not np.isfinite(cost):
         residual, block, shared = (np.zeros_like(a) for a in (residual, block, shared))
         cost = np.inf

@@ -136,16 +136,20 @@ def _solve_lengths(
 
 
 def _check_turns(flange: Pose) -> None:
-    if len(flange.position) >= MIN_FRAMES:
-        first = flange.take([0] * len(flange.position))
-        turns = flange.difference(first)[:, 3:]
-        sizes = np.linalg.svd(turns, compute_uv=False)
-        if sizes[1] > max(_MIN_TURN, _MIN_TURN * sizes[0]):
-            return
+    if len(flange.position) < MIN_FRAMES:
+        raise GeometryError(
+            f'{len(flange.position)} of the frames have a pose of the robot; {MIN_FRAMES} or more '
+            'are needed; check the frame numbers of the poses')
+    sizes = turn_sizes(flange)
+    if not sizes[1] > max(_MIN_TURN, _MIN_TURN * sizes[0]):
         raise GeometryError('the flange turns about one axis at most; turn it about two axes or '
                             'more, by 20 degrees or more')
-    raise GeometryError(f'{len(flange.position)} of the frames have a pose of the robot; '
-                        f'{MIN_FRAMES} or more are needed; check the frame numbers of the poses')
+
+
+def turn_sizes(poses: Pose) -> Array:
+    """Return how far poses (F,) turn from the first about three axes, rad, largest first."""
+    turns = poses.difference(poses.take([0] * len(poses.position)))[:, 3:]
+    return np.asarray(np.linalg.svd(turns, compute_uv=False), dtype=float)
 
 
 def fit_hand_eye(
@@ -162,7 +166,7 @@ def fit_hand_eye(
     unknowns = 6 * data.frames + linear.shared_columns.shape[-1]
     given = bool(np.isfinite(data.observations.sigma).all())
     sigma = 1.0 if given else noise_sigma(
-        float((linear.residual**2).sum()), int(linear.row_mask.sum()), unknowns)
+        linear.sum_of_squares, int(linear.row_mask.sum()), unknowns)
     robot = _Robot(flange, known, sigma)
     residual = robot.residual(start, state.pose)[known]
     noise = np.maximum(np.sqrt((residual.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2))), _MIN_NOISE)
@@ -244,14 +248,6 @@ class _HandEyeAdjustment(Adjustment):
         *poses, scale = (part[system] for part in packed[5:])
         return Transforms(Pose(*poses[:2]), Pose(*poses[2:]), float(scale[0]))
 
-    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
-        if not len(index):
-            return np.zeros(0), ()
-        costs, systems = zip(*(self._joint(self.unpack(state, i), self.transforms(state, i))
-                               for i in range(len(index))), strict=True)
-        return (np.concatenate(costs),
-                tuple(np.concatenate(parts) for parts in zip(*systems, strict=True)))
-
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         frame, shared = step
         mount, target, scale = np.split(shared[:, -PARAMETERS:], (6, 12), axis=1)
@@ -289,6 +285,9 @@ class _HandEyeAdjustment(Adjustment):
                                 'turn the flange about two axes or more, and move it')
         whole = arrow_covariance(normal).shared[0]
         return np.asarray(self._robot.sigma**2 * whole[-PARAMETERS:, -PARAMETERS:])
+
+    def _equations(self, packed: Arrays, system: int) -> tuple[Array, Arrays]:
+        return self._joint(self.unpack(packed, system), self.transforms(packed, system))
 
     def _joint(self, state: RigState, transforms: Transforms) -> tuple[Array, Arrays]:
         """Return cost (1,) and normal equations with those of the robot's poses."""

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.pose import Pose, cross_matrix, nearest_rotation, rotation_from_vector
 
 _STEPS, _MORE_STEPS = 4, 10  # Gauss-Newton, of an algebraic turn and of any turn
@@ -60,7 +60,7 @@ def initial_poses(points: Array, direction: Array, weight: Array, spread: bool =
     """
     problem = _problem(points, direction, weight)
     local, d = problem.local, problem.direction
-    misfit = _misfit(local, d, np.any(d, axis=-1))
+    misfit = _misfit(local, d)
     rotation, translation, error = _best_turn(
         _algebraic_rotations(local, misfit), misfit, local, d, _STEPS)
     rows = np.flatnonzero(error > _DOUBTFUL) if spread else np.empty(0, dtype=np.int64)
@@ -76,7 +76,7 @@ def initial_poses(points: Array, direction: Array, weight: Array, spread: bool =
 def candidate_poses(points: Array, direction: Array, weight: Array) -> Pose:
     """Return the poses (S, C) that evenly spread turns lead to, for sets with several minima."""
     problem = _problem(points, direction, weight)
-    misfit = _misfit(problem.local, problem.direction, np.any(problem.direction, axis=-1))
+    misfit = _misfit(problem.local, problem.direction)
     turns = np.broadcast_to(_cube_turns(), (len(points), 24, 3, 3))
     rotation = _polish(turns, misfit.form[:, None], _MORE_STEPS)
     return problem.camera(rotation, _translation(misfit, rotation))
@@ -97,9 +97,10 @@ def _problem(points: Array, direction: Array, weight: Array) -> _Problem:
     return _Problem(local, d, axes, scale, centre)
 
 
-def _misfit(local: Array, d: Array, seen: Mask) -> _Misfit:
-    """Sum the points up."""
+def _misfit(local: Array, d: Array) -> _Misfit:
+    """Sum the points up; d is zero where they are not seen."""
     systems, count = local.shape[:2]
+    seen = np.any(d, axis=-1)
     across = (np.eye(3) - d[..., :, None] * d[..., None, :]) * seen[..., None, None]
     flat = across.reshape(systems, count, 9)
     # Sums over the points of X (x) across and of X X^T (x) across; across is a projection, its

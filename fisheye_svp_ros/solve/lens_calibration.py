@@ -134,12 +134,10 @@ def calibrate_hand_eye(
         raise ObservationError(f'{observations.source}: the given poses are not those of a flange '
                                f'that carries the camera: {cause}') from cause
     linear = Linearization(data, state, names)
-    residual = np.where(views.used[..., None], views.uv - linear.linear.uv, np.nan)
     # The covariances stay those of the images alone, which are no smaller.
-    adjusted = adjusted._replace(lens=state.lens, pose=state.pose, residual=residual)
-    theta = incidence(
-        state.lens, state.pose.into_body(views.points), limited=False).theta[views.used]
-    block = {**(adjusted.lens.calibration or {}), 'rms_px': rms_px(residual),
+    adjusted = adjusted._replace(lens=state.lens, pose=state.pose, residual=linear.residual_px)
+    theta = _angles(adjusted, views)
+    block = {**(adjusted.lens.calibration or {}), 'rms_px': rms_px(adjusted.residual),
              'hand_eye': hand_eye.to_dict(), 'reached_deg': float(np.degrees(theta.max()))}
     lens = replace(_with_field(adjusted, theta), calibration=block)
     found = found._replace(adjusted=adjusted._replace(lens=lens), reached=float(theta.max()))
@@ -177,8 +175,7 @@ def _as_calibration(
             pose_covariance=adjusted.pose_covariance * sigma**2,
         )
     _check_focal(adjusted, observations.source)
-    theta = incidence(
-        adjusted.lens, adjusted.pose.into_body(views.points), limited=False).theta[views.used]
+    theta = _angles(adjusted, views)
     lens = _with_field(adjusted, theta)
     block = {
         'rms_px': rms_px(adjusted.residual),
@@ -191,6 +188,12 @@ def _as_calibration(
     beyond = int((theta > lens.max_incidence).sum())
     adjusted = adjusted._replace(lens=lens)
     return Calibration(adjusted, sigma, views, left_out, beyond, float(theta.max()))
+
+
+def _angles(adjusted: AdjustedLens, views: Views) -> Array:
+    """Return the incidence angles (P,) of all observations, rad."""
+    local = adjusted.pose.into_body(views.points)
+    return incidence(adjusted.lens, local, limited=False).theta[views.used]
 
 
 def _start_lens(model: str, image_size: tuple[int, int], free: Sequence[str], name: str) -> Lens:
@@ -234,11 +237,9 @@ def _check_inside(observations: Observations, image_size: tuple[int, int]) -> No
 def _fit_lens(start: Lens, views: Views, names: tuple[str, ...]) -> AdjustedLens:
     """Scan the focal length, adjust the best candidates to few points, then to everything."""
     shift = start.viewpoint_shift
-    svp_names = names
-    if shift is not None:
-        svp_names = tuple(name for name in names if name not in shift.coefficient_names)
     port_names = tuple(name for name in names if name in start.port_names)
-    svp_names = tuple(name for name in svp_names if name not in port_names)
+    other = (*port_names, *(() if shift is None else shift.coefficient_names))
+    svp_names = tuple(name for name in names if name not in other)
     few = select_points(views)
     focals, pose = focal_candidates(start.svp(), few, _CANDIDATES)
     values = np.tile(parameter_values(start, svp_names), (len(focals), 1))

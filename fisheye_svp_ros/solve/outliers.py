@@ -96,7 +96,8 @@ def _localize_robustly(data: RigViews, state: RigState) -> tuple[Pose, Pose, Arr
     model, views, pose = state.model, data.views, state.view_poses(data)
     alone = localize_cameras(model, views) if data.cameras > 1 else pose
     sigma = relative_sigma(views)
-    scale, offset = robust_scale(views, prediction_distances(model, pose, views) / sigma)
+    offset = prediction_distances(model, pose, views) / sigma
+    scale = robust_scale(offset)
     if not np.nanmax(offset / scale) > _SUSPICIOUS_SIGMAS:
         return pose, alone, scale, offset
     for _ in range(_MAX_ITERATIONS):
@@ -104,7 +105,8 @@ def _localize_robustly(data: RigViews, state: RigState) -> tuple[Pose, Pose, Arr
         fading = 1 / np.sqrt(1 + (offset / (_CAUCHY_SCALE * scale)) ** 2)
         weight = np.where(views.used, views.weight * fading, 0.0)
         pose = localize_cameras(model, views._replace(weight=weight), pose)
-        scale, offset = robust_scale(views, prediction_distances(model, pose, views) / sigma)
+        offset = prediction_distances(model, pose, views) / sigma
+        scale = robust_scale(offset)
         with np.errstate(invalid='ignore'):  # what is out of sight stays so
             change = np.nanmax(np.abs(offset - before) / scale)
         if change < _STEP_TOLERANCE:
@@ -202,11 +204,12 @@ def relative_sigma(views: Views) -> Array:
     return np.nan_to_num(np.maximum(sigma / np.nanmedian(sigma), 1.0), nan=1.0)
 
 
-def robust_scale(views: Views, offset: Array) -> tuple[Array, Array]:
-    """Robust standard deviation of a coordinate, one a view (S, 1), and the offsets."""
+def robust_scale(offset: Array) -> Array:
+    """Robust standard deviation of a coordinate, one a view (S, 1), from offsets (S, N)."""
     median, typical = (np.nanmedian(np.minimum(offset, _UNSEEN_PX), axis=axis, keepdims=True)
                        for axis in (1, None))
-    return np.maximum(median, np.maximum(typical, _MIN_RESIDUAL_PX)) / _MEDIAN_NORM, offset
+    scale: Array = np.maximum(median, np.maximum(typical, _MIN_RESIDUAL_PX)) / _MEDIAN_NORM
+    return scale
 
 
 def _landmark_scale(views: Views, offset: Array) -> Array:

@@ -38,7 +38,7 @@ def start_port(data: RigViews, lens: Lens) -> Lens | None:
             state = adjust(few, initial_state(few, replace(lens, port=port)), PORT_PLACE)
         except GeometryError:
             continue  # nothing of a view is seen through a port there
-        tried.append((sum_of_squares(Linearization(few, state, PORT_PLACE)), state.lens))
+        tried.append((Linearization(few, state, PORT_PLACE).sum_of_squares, state.lens))
     if not tried or not np.isfinite(min(cost for cost, _ in tried)):
         return None
     found = min(tried, key=lambda one: one[0])[1]
@@ -57,7 +57,7 @@ def fit_port(
     if data.views.used.sum() < _MIN_KEPT_SHARE * everything.views.used.sum():
         return None
     state = adjust(data, initial_state(data, wet), PORT_PLACE)
-    if not np.isfinite(sum_of_squares(Linearization(data, state, ()))):
+    if not np.isfinite(Linearization(data, state, ()).sum_of_squares):
         return None
     freed, errors, _ = _free_names(data, state, (*PORT_PLACE, MEDIUM_INDEX))
     names: tuple[str, ...] = PORT_PLACE
@@ -88,8 +88,8 @@ def _free_names(
     basis, clean = group_basis(linear.frame_columns), linear.shared_columns
     flat = flat_rows(clean - basis @ (np.swapaxes(basis, -1, -2) @ clean))
     inverse, _ = pseudo_inverse(flat.T @ flat, 1e-13)
-    square = sum_of_squares(linear) / int(linear.row_mask.sum())
-    gain = (sum_of_squares(Linearization(data, state, ())) - sum_of_squares(linear)) / square
+    square = linear.sum_of_squares / int(linear.row_mask.sum())
+    gain = (Linearization(data, state, ()).sum_of_squares - linear.sum_of_squares) / square
     return freed, np.sqrt(np.diag(inverse) * square), gain
 
 
@@ -100,8 +100,3 @@ def fit_free_curve(data: RigViews, base: RigState) -> RigState:
     effect = RadialProfileEffect(CURVE_TERMS, round(theta, 6))
     free = replace(base, terms=(*known, (effect, np.zeros(CURVE_TERMS))))
     return adjust(data, free, INTRINSICS)
-
-
-def sum_of_squares(linear: Linearization) -> float:
-    """Return the sum of squared whitened residuals."""
-    return float((linear.residual**2).sum())

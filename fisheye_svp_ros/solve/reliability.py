@@ -77,7 +77,9 @@ def examine(
     sigma = noise_sigma(result.cost[some].sum(), int(rows), 6 * int(some.sum()))
     reasons = checked.reasons
     if sigma > _NOISIEST:
-        reasons = tuple(_join_reasons(_noisy_reason(sigma), reason) for reason in reasons)
+        noisy = (f'the noise would be {sigma:.3g} px, more than any detector has: check lens, '
+                 'image size, landmarks and their unit')
+        reasons = tuple(_join_reasons(noisy, reason) for reason in reasons)
     return Examination(result._replace(covariance=result.covariance * sigma**2), checked.gross,
                     reasons, sigma)
 
@@ -97,9 +99,8 @@ def _examine(
     result = Localization.concatenate([found])  # a copy
     for i in np.flatnonzero(suspect):
         view = views.take([i])
-        other = None
-        if searched:
-            other = _consensus_pose(model, view, found.take([i]), sigma, tolerance)
+        other = (_consensus_pose(model, view, found.take([i]), sigma, tolerance) if searched
+                 else None)
         if other is not None:
             result.put([i], other)
             gross[i] = (view.weight[0] > 0) & np.isnan(other.residual[0, :, 0])
@@ -225,7 +226,9 @@ def _consensus(model: ForwardModel, view: Views, found: Localization, sigma: flo
         scale = np.maximum(sigma, _median(off, views) / _MEDIAN)[:, None]
         fading = 1 / (1 + (off / (_FADE * scale)) ** 2)
         pose = localize(model, views._replace(weight=views.weight * fading), pose).pose
-    score = _score(_lengths(model, pose, views), views, sigma)
+    worst = (3 * _GROSS * sigma) ** 2
+    squares = np.minimum(_lengths(model, pose, views) ** 2, worst)
+    score = np.where(views.weight > 0, squares, 0.0).sum(axis=1)
     return pose.take([int(np.argmin(score))])
 
 
@@ -234,12 +237,6 @@ def _lengths(model: ForwardModel, pose: Pose, views: Views) -> Array:
     off = views.uv - model.predict(pose, views).uv
     length = np.hypot(off[..., 0], off[..., 1]) * views.weight
     return np.where((views.weight > 0) & np.isfinite(length), length, np.inf)
-
-
-def _score(length: Array, views: Views, sigma: float) -> Array:
-    """Return truncated squares, summed (S,)."""
-    worst = (3 * _GROSS * sigma) ** 2
-    return np.asarray(np.where(views.weight > 0, np.minimum(length**2, worst), 0.0).sum(axis=1))
 
 
 def _median(length: Array, views: Views) -> Array:
@@ -272,11 +269,6 @@ def _landmark_names(landmark: Index, size: Array) -> str:
                       for one, px in zip(landmark[:_MAX_NAMES], size[:_MAX_NAMES], strict=True))
     more = f' and {len(landmark) - _MAX_NAMES} more' if len(landmark) > _MAX_NAMES else ''
     return f'landmark{"s" if len(landmark) > 1 else ""} {names}{more}'
-
-
-def _noisy_reason(sigma: float) -> str:
-    return (f'the noise would be {sigma:.3g} px, more than any detector has: check lens, image '
-            'size, landmarks and their unit')
 
 
 def _far_reasons(views: Views, found: Localization) -> list[str]:

@@ -1,4 +1,10 @@
-"""Rigs of any number of cameras: their poses in the first one, from what they saw together."""
+"""Rigs of any number of cameras: their poses in the first one, from what they saw together.
+
+Cameras that see boards of their own are related by the motion of the rig.  Each board stands
+still.  The poses A of one camera before its board and those B of another before its own, of the
+same moments, are those of a robot: A = Y B X^-1, with the camera X in the other and the board Y in
+the other's frame (`solve.hand_eye`).
+"""
 
 from __future__ import annotations
 
@@ -9,22 +15,149 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.optics.lens import Lens, monotone_limit, parameter_values
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import Observations, select_cameras, select_shared
 from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust, rig_covariance
+from fisheye_svp_ros.solve.hand_eye import MIN_FRAMES, Transforms, solve_hand_eye, turn_sizes
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.measured_poses import sigma_known
-from fisheye_svp_ros.solve.moving_rig import PlacedBoards, place_boards
 from fisheye_svp_ros.solve.outliers import FRAME, find_outliers
 from fisheye_svp_ros.solve.reliability import misfit_fails, misfit_reason
+from fisheye_svp_ros.solve.rig_checks import contradicted_views, is_unrelated
 from fisheye_svp_ros.solve.rig_state import (
     Linearization,
     RigState,
     RigViews,
     group_by_frame,
 )
+
+_MIN_TIED_FRAMES = 3  # of two cameras that see one board: any relative pose explains one frame
+_MIN_TURN = np.radians(3.0)  # rms, about the second axis; poses of a view are off by less
+_MAX_DISTANCE_RATIO = 5.0  # times the median: frames of other moments
+_ROUNDS = 3
+
+
+class PlacedBoards(NamedTuple):
+    """A rig's rows with the boards in one frame, and where its bundle adjustment starts.
+
+    boards: of each camera; empty where all cameras see one.
+    """
+
+    rows: Observations
+    data: RigViews
+    state: RigState
+    boards: tuple[int, ...]
+
+
+def place_boards(rows: Observations, lenses: Sequence[Lens]) -> PlacedBoards:
+    """Return the rows with the boards of all cameras in the frame of the first camera's board.
+
+    rows: of frames that several cameras share.  Cameras that no relative pose relates, as seeing
+    one target, see boards of their own.
+    Raises ObservationError where neither explains most frames.
+    """
+    data, state = _start_rig(rows, lenses)
+    if not _contradicts(data, state):
+        return PlacedBoards(rows, data, state, ())
+    boards = _boards_of_cameras(rows, lenses)
+    try:
+        placed = _in_first_board(rows, boards, _board_poses(rows, lenses, boards))
+        data, state = _start_rig(placed, lenses)
+        if _contradicts(data, state):
+            raise GeometryError('no motion of a rig explains these frames')
+    except GeometryError as cause:
+        raise ObservationError(
+            f'{rows.source}: no relative pose of {" and ".join(rows.cameras)} explains most '
+            'frames; give simultaneous photographs the same frame number, others different ones, '
+            'and number points from the same end; if the cameras see boards of their own, '
+            f'{cause}') from cause
+    return PlacedBoards(placed, data, state, boards)
+
+
+def _start_rig(rows: Observations, lenses: Sequence[Lens]) -> tuple[RigViews, RigState]:
+    data = group_by_frame(rows)
+    return data, initial_state(data, lenses[0], lenses[1:])
+
+
+def _contradicts(data: RigViews, state: RigState) -> bool:
+    """Whether a rig does not explain most shared views, of all cameras or of one."""
+    several, contradicted = contradicted_views(data, state)
+    shared, apart = (np.bincount(data.camera_of, mask) for mask in (several, contradicted))
+    return bool(apart.any() and (2 * apart.sum() >= shared.sum() or (2 * apart > shared).any()))
+
+
+def _boards_of_cameras(rows: Observations, lenses: Sequence[Lens]) -> tuple[int, ...]:
+    """Return the board of each camera, the same for cameras that a relative pose relates."""
+    board = np.arange(len(lenses))
+    for one in range(len(lenses)):
+        for other in range(one):
+            pair = select_shared(
+                select_cameras(rows, (rows.cameras[other], rows.cameras[one])))
+            if len(pair.frames) >= _MIN_TIED_FRAMES and not is_unrelated(
+                    *_start_rig(pair, (lenses[other], lenses[one]))):
+                board[board == board[one]] = board[other]
+    return tuple(np.unique(board, return_inverse=True)[1].tolist())
+
+
+def _board_poses(
+    rows: Observations, lenses: Sequence[Lens], boards: tuple[int, ...]
+) -> Pose:
+    """Return the poses (B,) of the boards in the frame of the first; raise GeometryError."""
+    views = []
+    for board in range(max(boards) + 1):
+        mine = [camera for camera, its in enumerate(boards) if its == board]
+        own = select_cameras(rows, [rows.cameras[camera] for camera in mine])
+        _, state = _start_rig(own, [lenses[camera] for camera in mine])
+        views.append(dict(zip(own.frames.tolist(), map(state.pose.take, range(len(own.frames))),
+                              strict=True)))
+    placed, left = identity(len(views)), set(range(1, len(views)))
+    body = dict(views[0])
+    while left:
+        board = max(left, key=lambda one: len(body.keys() & views[one].keys()))
+        left.remove(board)
+        shared = sorted(body.keys() & views[board].keys())
+        _check_motion([body[frame] for frame in shared])
+        found = _solve_robustly(Pose.stack([views[board][frame] for frame in shared]),
+                                Pose.stack([body[frame] for frame in shared]))
+        placed.put(board, found.target)
+        moved = found.flange(Pose.stack(list(views[board].values())))
+        for number, frame in enumerate(views[board]):
+            body.setdefault(frame, moved.take(number))
+    return placed
+
+
+def _check_motion(poses: Sequence[Pose]) -> None:
+    """Raise GeometryError where the motion of the rig does not relate its cameras."""
+    if len(poses) < MIN_FRAMES:
+        raise GeometryError(f'{len(poses)} frames show two of them; take {MIN_FRAMES} or more')
+    sizes = turn_sizes(Pose.stack(poses)) / np.sqrt(len(poses))
+    if sizes[1] < _MIN_TURN:
+        motion = 'does not turn' if sizes[0] < _MIN_TURN else 'turns about one axis only'
+        raise GeometryError(f'the rig {motion}; turn it about two axes or more, by 20 degrees or '
+                            'more')
+
+
+def _solve_robustly(camera: Pose, flange: Pose) -> Transforms:
+    """Solve both transforms of poses (F,), without frames that contradict the others."""
+    kept = np.ones(len(camera.position), dtype=bool)
+    size = float(np.median(np.linalg.norm(camera.position, axis=1)))
+    for _ in range(_ROUNDS):
+        found = solve_hand_eye(camera.take(kept), flange.take(kept), 1.0)
+        off = found.flange(camera).difference(flange) / np.repeat([size, 1.0], 3)
+        distance = np.linalg.norm(off, axis=1)
+        kept = np.asarray(distance <= _MAX_DISTANCE_RATIO * np.median(distance))
+    return found
+
+
+def _in_first_board(
+    rows: Observations, boards: tuple[int, ...], placed: Pose
+) -> Observations:
+    """Return rows with their landmarks in the frame of the first board, numbered by board."""
+    board = np.array(boards)[rows.camera]
+    return replace(rows, board=board, xyz=placed.take(board).transform(rows.xyz),
+                   landmark=rows.landmark + board * (int(rows.landmark.max()) + 1))
 
 
 class RigCalibration(NamedTuple):
@@ -98,21 +231,21 @@ def calibrate_rig(
     place = [order.index(name) for name in cameras if name in order]
     known = sigma_known(rows)
     free, mean, information = _stated_errors(order, ordered)
-    held, freedom = _sum_of_squares(data, state)
+    start = Linearization(data, state, ())
+    freedom = int(start.row_mask.sum()) - 6 * (data.frames + len(state.rig.position) - 1)
     if freedom < 1:
         raise GeometryError(f'{rows.source}: too few points for a rig of {len(order)} cameras')
     if free:
-        noise = 1.0 if known else np.sqrt(held / freedom)
+        noise = 1.0 if known else np.sqrt(start.sum_of_squares / freedom)
         values, vectors = np.linalg.eigh(information)
         root = noise * np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
         state = adjust(data, state, free, Prior(mean, root))
-    squared, freedom = _sum_of_squares(data, state)
+    linear = Linearization(data, state, free)
+    squared = linear.sum_of_squares
     fails = known and bool(misfit_fails(np.array(squared), np.array(freedom)))
     sigma = None if known else float(np.sqrt(squared / freedom))
-    linear = Linearization(data, state, free)
     covariance = rig_covariance(linear, sigma or 1.0, information)
-    squares = ((data.views.uv - linear.linear.uv) ** 2).sum(axis=-1)
-    squares = np.where(data.views.used, squares, np.nan)
+    squares = (linear.residual_px**2).sum(axis=-1)
     return RigCalibration(
         tuple(order[i] for i in place), state.rig.take(place),
         covariance[[i - 1 for i in place[1:]]], rows.frames, state.pose,
@@ -139,8 +272,7 @@ def _fit_rig(
     rows: Observations, lenses: Sequence[Lens], boards: tuple[int, ...]
 ) -> tuple[RigViews, RigState]:
     """Return rig, boards of the cameras' own and poses of the frames, fitted, the lenses known."""
-    data = group_by_frame(rows)
-    start = initial_state(data, lenses[0], lenses[1:])
+    data, start = _start_rig(rows, lenses)
     rig = Pose.concatenate([start.rig, identity(max(boards, default=0))])
     state = replace(start, rig=rig, lens=lenses[0], others=tuple(lenses[1:]), terms=(),
                     corrected=True, boards=boards)
@@ -150,13 +282,6 @@ def _fit_rig(
 def _within_curve(lens: Lens) -> Lens:
     """Return the lens with a field of view that its curve, which has moved, still allows."""
     return replace(lens, max_incidence=min(lens.max_incidence, monotone_limit(lens)))
-
-
-def _sum_of_squares(data: RigViews, state: RigState) -> tuple[float, int]:
-    """Return the whitened sum of squares and its degrees of freedom."""
-    linear = Linearization(data, state, ())
-    freedom = int(linear.row_mask.sum()) - 6 * (data.frames + len(state.rig.position) - 1)
-    return float((linear.residual**2).sum()), freedom
 
 
 def _stated_errors(

@@ -76,11 +76,9 @@ def localize_rig(
         raise GeometryError(f'{table.source}: the rig does not determine the pose of a frame; '
                             'check that lenses, rig and observations belong together, and that '
                             'all cameras see one target')
-    known = sigma_known(rows)
-    sigma = None if known else noise_sigma(
-        float((linear.residual**2).sum()), int(linear.row_mask.sum()), 6 * data.frames)
-    residual = np.where(data.views.used[..., None], data.views.uv - linear.linear.uv, np.nan)
+    sigma = None if sigma_known(rows) else noise_sigma(
+        linear.sum_of_squares, int(linear.row_mask.sum()), 6 * data.frames)
     covariance = np.asarray((sigma or 1.0) ** 2 * np.linalg.inv(information))
     return RigLocalization(
-        rows, outliers, np.unique(data.views.frame), state.pose, covariance, data, residual,
-        sigma, left_out, rig_differs(data, state))
+        rows, outliers, np.unique(data.views.frame), state.pose, covariance, data,
+        linear.residual_px, sigma, left_out, rig_differs(data, state))

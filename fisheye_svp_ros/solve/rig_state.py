@@ -226,6 +226,17 @@ class Linearization:
         ]
         return self.whiten(np.concatenate(shared, axis=-1))
 
+    @property
+    def sum_of_squares(self) -> float:
+        """Sum of the squared whitened residuals."""
+        return float((self.residual**2).sum())
+
+    @property
+    def residual_px(self) -> Array:
+        """Residuals (S, N, 2), px, measured minus predicted, NaN for padding."""
+        views = self.data.views
+        return np.where(views.used[..., None], views.uv - self.linear.uv, np.nan)
+
     @cached_property
     def row_weight(self) -> Array:
         """Weights (F, M) of the rows, 1/px, zero for padding."""

@@ -19,15 +19,16 @@ from fisheye_svp_ros.scene.rigs import STYLES
 from fisheye_svp_ros.simulate.scenario import (
     MONO,
     SCALARS,
+    Batch,
     Scenario,
     check_sweep,
     model_of,
     scalars,
     scenario_landmarks,
     scenario_poses,
+    simulate_batches,
     true_lens,
 )
-from fisheye_svp_ros.simulate.scenario_batch import Batch, simulate_batches
 from fisheye_svp_ros.study.settings import (
     SolverSettings,
     StereoDepthSettings,

@@ -12,8 +12,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views, views_of
-from fisheye_svp_ros.simulate.scenario import model_of
-from fisheye_svp_ros.simulate.scenario_batch import Batch
+from fisheye_svp_ros.simulate.scenario import Batch, model_of
 from fisheye_svp_ros.study.metrics import (
     LOCALIZATION_METRICS,
     STEREO_CALIBRATION_METRICS,

@@ -165,7 +165,7 @@ def test_a_landmark_behind_its_ray_is_as_far_off_as_it_can_be():
     ahead = points + np.array([0, 0, 0.2])
     direction = ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
     local, d = _problem(points, direction, np.ones((1, 5)))[:2]
-    misfit = _misfit(local, d, np.ones((1, 5), dtype=bool))
+    misfit = _misfit(local, d)
     true, _, least = _best_turn(_cube_turns()[None], misfit, local, d, 10)
     _, _, error = _best_turn((true @ np.diag([-1.0, -1, 1]))[:, None], misfit, local, d, 0)
     assert least < 1e-9 and error == 1

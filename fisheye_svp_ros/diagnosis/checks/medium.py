@@ -38,7 +38,6 @@ from fisheye_svp_ros.solve.port_fit import (
     fit_port,
     is_glass,
     start_port,
-    sum_of_squares,
 )
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, rms_px
 
@@ -212,7 +211,7 @@ def _assess_port(
     base = adjust(data, initial_state(data, lens), free)
     air, curve = Linearization(data, base, free), fit_free_curve(data, base)
     plain = replace(base, lens=replace(state.lens, port=None))
-    before, after, least = (sum_of_squares(Linearization(data, fitted, ())) for fitted in (
+    before, after, least = (Linearization(data, fitted, ()).sum_of_squares for fitted in (
         adjust(data, plain, ()), state, curve))
     rows = int(air.row_mask.sum())
     square = min(after, least) / rows
@@ -221,7 +220,7 @@ def _assess_port(
     near = before - after > _EXPLAINED_SHARE * (before - least) and after < _MAX_COST_RATIO * least
     if not (criteria[0] < criteria[1] or near):
         return None
-    mine = sum_of_squares(air)
+    mine = air.sum_of_squares
     p_value = float(special.chdtrc(len(names), max(before - after, 0.0) / square))
     return Medium(
         state, names, outliers, air, p_value, max(0.0, 1 - after / mine),
@@ -234,7 +233,7 @@ def _leaves_room_for_port(air: Linearization, curve: Linearization) -> bool:
     Where the curve explains little of a misfit in air, that is noise or lies elsewhere.
     """
     rms = rms_px(curve)
-    explains = sum_of_squares(curve) < _CURVE_SHARE * sum_of_squares(air)
+    explains = curve.sum_of_squares < _CURVE_SHARE * air.sum_of_squares
     return rms > LOST_PX or (rms > _SUSPICIOUS_PX and (explains or bool(air.free)))
 
 

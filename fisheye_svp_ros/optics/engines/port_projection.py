@@ -14,7 +14,7 @@ from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.optics.engines import numpy_engine
 from fisheye_svp_ros.optics.engines.results import Incidence
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.optics.varying import Varying
+from fisheye_svp_ros.optics.ports import Varying
 from fisheye_svp_ros.pose import cross_matrix
 
 _STEPS = 20
