@@ -11,14 +11,22 @@ import numpy as np
 from benchmark.speed.engines import use
 from benchmark.speed.harness import Side, exponent, measure
 from benchmark.speed.report import Table, number
-from benchmark.speed.scenes import LANDMARKS, localization, points, shift_lens, stereo, svp_lens
+from benchmark.speed.scenes import (
+    LANDMARKS,
+    localization,
+    on_board,
+    points,
+    shift_lens,
+    stereo,
+    svp_lens,
+)
 from fisheye_svp_ros.diagnosis import NullModel, diagnose
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.scene.observations import Observations, make_observations
+from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.rigs import paper_pose
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
@@ -114,22 +122,9 @@ def _diagnosis(count: int) -> Callable[[], Any]:
 
 
 def _of_board(landmarks: int, cameras: int) -> Callable[[], Any]:
-    """Prepare a diagnosis of cameras side by side that all see a flat board, 0.4 m wide."""
-    rng, lens = np.random.default_rng(1), shift_lens()
-    rows = 1 << (landmarks.bit_length() - 1) // 2
-    y, x = np.mgrid[:rows, : landmarks // rows]
-    board = 0.4 / rows * np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=-1)
-    board -= board.mean(axis=0)
-    frame, camera, point = np.indices((10, cameras, landmarks)).reshape(3, -1)
-    poses = Pose(rotation_from_vector(rng.uniform(-0.5, 0.5, (10, 3))),
-                 rng.uniform([-0.2, -0.2, 0.3], [0.2, 0.2, 0.7], (10, 3)))
-    seen = poses.take(frame).transform(board[point][:, None])[:, 0] - camera[:, None] * [
-        0.02, 0.0, 0.0]
-    names = tuple(f'camera{i}' for i in range(cameras))
-    uv = project(lens, seen).uv + rng.normal(0, 0.2, (len(seen), 2))
-    table = make_observations(frame, point, uv, board[point], camera=camera, cameras=names)
-    lenses = dict.fromkeys(names, lens.svp())
-    return lambda: diagnose(table, lenses)
+    seen, names = on_board(10, landmarks, cameras)
+    lenses = dict.fromkeys(names, shift_lens().svp())
+    return lambda: diagnose(seen, lenses)
 
 
 def _seen(frames: int) -> Observations:

@@ -13,7 +13,12 @@ from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.scene.observations import Views, views_of
+from fisheye_svp_ros.scene.observations import (
+    Observations,
+    Views,
+    make_observations,
+    views_of,
+)
 from fisheye_svp_ros.scene.rigs import rig
 
 LANDMARKS = 33
@@ -118,3 +123,21 @@ def stereo(lens: Lens, views: int = 10, grid: tuple[int, int] = (3, 11)) -> Ster
         lens, board, grid, spacing, views_of(board, left), views_of(board, right),
         pose.retract(rng.normal(0, 0.01, (views, 6))), pair.retract(rng.normal(0, 0.01, 6)),
     )
+
+
+def on_board(frames: int, landmarks: int, cameras: int) -> tuple[Observations, tuple[str, ...]]:
+    """Return what cameras side by side see of a flat board, 0.4 m wide, and their names."""
+    rng, lens = np.random.default_rng(1), shift_lens()
+    rows = 1 << (landmarks.bit_length() - 1) // 2
+    y, x = np.mgrid[:rows, : landmarks // rows]
+    board = 0.4 / rows * np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=-1)
+    board -= board.mean(axis=0)
+    frame, camera, point = np.indices((frames, cameras, landmarks)).reshape(3, -1)
+    poses = Pose(rotation_from_vector(rng.uniform(-0.5, 0.5, (frames, 3))),
+                 rng.uniform([-0.2, -0.2, 0.3], [0.2, 0.2, 0.7], (frames, 3)))
+    seen = poses.take(frame).transform(board[point][:, None])[:, 0] - camera[:, None] * [
+        0.02, 0.0, 0.0]
+    names = tuple(f'camera{i}' for i in range(cameras))
+    uv = project(lens, seen).uv + rng.normal(0, 0.2, (len(seen), 2))
+    return make_observations(
+        frame, point, uv, board[point], camera=camera, cameras=names), names

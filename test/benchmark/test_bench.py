@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 import sys
 import time
 from functools import partial
@@ -10,7 +11,16 @@ from functools import partial
 import numpy as np
 import pytest
 
-from benchmark.speed import growth, localization, maps, projection, report, stereo, variants
+from benchmark.speed import (
+    commands,
+    growth,
+    localization,
+    maps,
+    projection,
+    report,
+    stereo,
+    variants,
+)
 from benchmark.speed.adjustment import exact_view, moved, scipy_pose
 from benchmark.speed.compiled import Kernel
 from benchmark.speed.harness import (
@@ -162,3 +172,11 @@ def test_the_report_is_markdown_with_versions_goals_and_reasons():
     assert '| fisheye-svp, numpy | 1 | 1 to 1 | 2.0e-12 |' in text
     assert '- peer did not take part: not installed.' in text
     assert '| work | numpy | peer | 2 × | not measured | - |' in text
+
+
+def test_commands_are_timed_to_their_end_and_until_a_text(tmp_path):
+    assert commands._seconds([*commands._COMMAND, '--help'], tmp_path) > 0
+    assert commands._seconds([*commands._COMMAND, 'localize'], tmp_path, code=2) > 0
+    with pytest.raises(subprocess.CalledProcessError):
+        commands._seconds([*commands._COMMAND, 'localize'], tmp_path)
+    assert commands._seconds_until('localize', tmp_path, b'required') > 0
