@@ -335,10 +335,13 @@ def factor_equations(eq: Equations, lam: Array, weight: Array) -> FactoredEquati
         return flat.T @ flat, flat.T @ block_border[part].reshape(len(flat), len(b.xx))
 
     cut = len(e) // 2  # most of the time goes here
-    gone = map_in_threads(
+    (rr, rx), (more, more_border) = map_in_threads(
         eliminate_blocks, (slice(cut), slice(cut, None)), e.size * len(b.rr) ** 2)
-    rr, rx = (whole - sum(parts) for whole, parts in
-              zip((b.rr, b.rx), zip(*gone, strict=True), strict=True))
+    # In place: these may be as large as all else together.
+    rr += more
+    rx += more_border
+    np.subtract(b.rr, rr, out=rr)
+    np.subtract(b.rx, rx, out=rx)
     flat_border = block_border.reshape(e.size, len(b.xx))
     rr[np.diag_indices_from(rr)] += r
     if len(rr):
