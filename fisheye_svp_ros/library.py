@@ -46,8 +46,7 @@ from fisheye_svp_ros.library_results import (
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.cameras import camera_for
-from fisheye_svp_ros.rectify.maps import RANGE, Rectification
-from fisheye_svp_ros.rectify.stereo import RectifiedPair, rectify_pair
+from fisheye_svp_ros.rectify.maps import RANGE, Rectification, RectifiedPair, rectify_pair
 from fisheye_svp_ros.scene.observations import STEREO, Observations, stereo_views
 from fisheye_svp_ros.scene.rigs import BASELINE, rig
 from fisheye_svp_ros.simulate import scenario as scenarios

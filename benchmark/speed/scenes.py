@@ -10,7 +10,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.camera import project
-from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
+from fisheye_svp_ros.optics.curves import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import (

@@ -8,16 +8,27 @@ fitted by least squares.
 
 from __future__ import annotations
 
-import cv2
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from scipy.special import erf
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.detect.corner_fit import CONTRAST, Corners
-from fisheye_svp_ros.detect.one_view import imaging
 from fisheye_svp_ros.detect.patterns import local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
-from fisheye_svp_ros.detect.windows import IN_SILENCE, PIXEL, WindowProblem, Windows, windows
+from fisheye_svp_ros.detect.windows import (
+    IN_SILENCE,
+    PIXEL,
+    WindowProblem,
+    Windows,
+    halve_image,
+    windows,
+)
+from fisheye_svp_ros.errors import FisheyeSvpError
+from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.scene.observations import make_observations
+from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 # Of the lens that fits one photograph, as far as that determines it
 _FREE = (('f', 'cx', 'cy', 'k1', 'k2', 'k3'), ('f', 'cx', 'cy', 'k1'), ('f', 'k1', 'k2', 'k3'))
@@ -27,6 +38,7 @@ _MAX_CLEARANCE = 48.0  # px from a center to the next edge; beyond, the image is
 _MIN_HALF_AXIS = 3.0  # px, of a circle's lesser half axis
 _UNKNOWNS = 10  # u, v; ellipse (3); log blur; brightness, contrast, its gradient
 _ROOT = float(np.sqrt(2 / np.pi))
+_MAX_RMS = 0.6  # px rms; rough places are off by less, as far as no lens explains it
 
 
 @np.errstate(**IN_SILENCE)
@@ -59,10 +71,7 @@ def fit_circles(
 
 
 def _fit_halved_image(pixels: Pixels, start: Array, points: Array, censored: bool) -> Corners:
-    height, width = (side // 2 * 2 for side in pixels.shape)
-    half = cv2.resize(pixels[:height, :width], (width // 2, height // 2),
-                      interpolation=cv2.INTER_AREA)
-    found = fit_circles(half, (start + 0.5) / 2 - 0.5, points, censored)
+    found = fit_circles(halve_image(pixels), (start + 0.5) / 2 - 0.5, points, censored)
     return found._replace(uv=2 * found.uv + 0.5, sigma=2 * found.sigma, blur=2 * found.blur)
 
 
@@ -220,3 +229,23 @@ def _distance(place: Array, matrix: Array) -> tuple[Array, Array]:
                 + z[..., i] * place[..., j] + z[..., j] * place[..., i])
         derivatives[..., 2 + k] = both * (by_far * by_x + by_steep * by_y)
     return far * (far - 1) / steep, derivatives
+
+
+def imaging(
+    points: Array, uv: Array, shape: tuple[int, ...], free: Sequence[str]
+) -> Callable[[Array], Array] | None:
+    """Return what takes places (..., 3), m, on a board to their images (..., 2), px, or None.
+
+    By the Kannala-Brandt lens, with so many of its parameters, that fits one photograph (H, W)
+    best, of points (N, 3), m, at uv (N, 2), px; None where they do not determine it, or it does
+    not fit.
+    """
+    table = make_observations(np.zeros(len(uv), dtype=np.int64), np.arange(len(uv)), uv, points)
+    try:
+        fitted = calibrate(table, 'kannala_brandt', (shape[1], shape[0]), free).adjusted
+    except FisheyeSvpError:
+        return None
+    if np.sqrt((fitted.residual**2).sum(axis=-1).mean()) > _MAX_RMS:
+        return None
+    pose = fitted.pose.take(0)
+    return lambda places: project(fitted.lens, pose.into_body(places), limited=False).uv

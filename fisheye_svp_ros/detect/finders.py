@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.detect.circle_grid import find_circles
+from fisheye_svp_ros.detect.grids import find_circles, find_squares
 from fisheye_svp_ros.detect.patterns import Pattern
-from fisheye_svp_ros.detect.square_grid import find_squares
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.registry import Registry
 

@@ -29,6 +29,7 @@ _MARKERS = {
 }
 _TAGS = _MARKERS[_APRILTAGS]
 _NEIGHBOURS = 6
+_CORNERS = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])  # of a square, sides of one
 _MAX_SPACING = 10.0  # m; a larger spacing is a slip of the unit
 
 
@@ -161,10 +162,8 @@ def _circles(spec: str, words: list[str]) -> Pattern:
 
 def _squares(spec: str, words: list[str]) -> Pattern:
     (columns, rows), (side, gap) = _numbers(spec, words, 2, least=1)
-    corner = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])
-    tiles = _grid(columns, rows, side + gap)[:, None, :2] + side * corner
-    points = np.pad(tiles.reshape(-1, 2), ((0, 0), (0, 1)))
-    inward = np.tile(1 - 2 * corner, (columns * rows, 1))
+    points = _tiles(columns, rows, side + gap, side)
+    inward = np.tile(1 - 2 * _CORNERS, (columns * rows, 1))
     return Pattern('squares', spec, columns, rows, points, min(side, gap), inward,
                    np.zeros(len(points)), side)
 
@@ -186,9 +185,7 @@ def _aprilgrid(spec: str, words: list[str]) -> Pattern:
     tag = _positive(document, 'tagSize', path, _MAX_SPACING)
     ratio = _positive(document, 'tagSpacing', path, _MAX_SPACING)
     # As Kalibr has it: x right, y up, tags and the corners of each from the lower left.
-    corner = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])
-    tiles = _grid(columns, rows, tag * (1 + ratio))[:, None, :2] + tag * corner
-    points = np.pad(tiles.reshape(-1, 2), ((0, 0), (0, 1)))
+    points = _tiles(columns, rows, tag * (1 + ratio), tag)
     # The border of a tag is two of its ten cells: a corner of a cell is nearest.
     clearance = tag * min(ratio, 0.2 * np.sqrt(2))
     return Pattern('aprilgrid', spec, columns, rows, points, clearance, np.zeros((len(points), 2)),
@@ -242,6 +239,12 @@ def _grid(columns: int, rows: int, size: float) -> Array:
     """Return points (columns * rows, 3), m, row by row: x right, y down, z into the board."""
     y, x = np.mgrid[:rows, :columns]
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1) * size
+
+
+def _tiles(columns: int, rows: int, pitch: float, side: float) -> Array:
+    """Return the corners (4 * columns * rows, 3), m, of separate squares, square by square."""
+    return (_grid(columns, rows, pitch)[:, None] + side * np.pad(_CORNERS, ((0, 0), (0, 1)))
+            ).reshape(-1, 3)
 
 
 def _checks(columns: int, rows: int) -> Array:

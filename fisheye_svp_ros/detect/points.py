@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.detect.circle_fit import fit_circles
+from fisheye_svp_ros.detect.circle_fit import fit_circles, imaging
 from fisheye_svp_ros.detect.corner_fit import Corners, edge_clearance, fit_corners
 from fisheye_svp_ros.detect.finders import (
     DETECTORS,
@@ -19,9 +19,9 @@ from fisheye_svp_ros.detect.finders import (
     Grey,
     explain_failure,
 )
-from fisheye_svp_ros.detect.one_view import imaging
 from fisheye_svp_ros.detect.patterns import Pattern, local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
+from fisheye_svp_ros.detect.windows import halve_image
 
 SATURATED_SHARE = 0.02  # of a board's pixels at the end of the scale
 _MIN_SHARE = 0.5  # of the points found must turn out to be what the pattern says
@@ -211,11 +211,8 @@ def _fit_corners(
     soft = np.flatnonzero((~corners.ok | (corners.blur > _SOFT_BLUR)) & (reach > _MAX_CLEARANCE))
     if not len(soft):
         return corners, reach
-    height, width = (side // 2 * 2 for side in pixels.shape)
-    half = cv2.resize(pixels[:height, :width], (width // 2, height // 2),
-                      interpolation=cv2.INTER_AREA)
-    again = fit_corners(half, (start[soft] + 0.5) / 2 - 0.5, axes[soft] / 2, reach[soft] / 2,
-                        square, censored)
+    again = fit_corners(halve_image(pixels), (start[soft] + 0.5) / 2 - 0.5, axes[soft] / 2,
+                        reach[soft] / 2, square, censored)
     found = soft[again.ok]
     size = {'uv': 2 * again.uv + 0.5, 'sigma': 2 * again.sigma, 'blur': 2 * again.blur}
     for name, whole, part in zip(Corners._fields, corners, again, strict=True):

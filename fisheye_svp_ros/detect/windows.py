@@ -102,6 +102,14 @@ def windows(pixels: Pixels, start: Array, reach: float) -> Windows:
                    _ROUNDING if pixels.dtype.kind == 'u' else 0.0)
 
 
+def halve_image(pixels: Pixels) -> Pixels:
+    """Return an image (H, W) at half its size."""
+    height, width = (side // 2 * 2 for side in pixels.shape)
+    half = cv2.resize(pixels[:height, :width], (width // 2, height // 2),
+                      interpolation=cv2.INTER_AREA)
+    return np.asarray(half)
+
+
 def _smoothing_support(at: Index) -> tuple[int, int]:
     """Return from where to where smoothing sees pixels at these places along an axis."""
     return max(int(at.min()) - _SIGHT, 0), int(at.max()) + _SIGHT + 1

@@ -162,7 +162,6 @@ class BaseNode(Node):  # type: ignore[misc]
         topic: str,
         read: Callable[[Any, str], T],
         use: Callable[[int, T], None],
-        qos: Any = INPUT,
         latched: bool = False,
     ) -> None:
         """Subscribe: `read` decodes a message, `use` gets its stamp (ns) and what was read.
@@ -171,7 +170,7 @@ class BaseNode(Node):  # type: ignore[misc]
         published before counts as well.
         """
         self.collect(
-            kind, topic, read, lambda stamp, unread: use(stamp, unread.read()), qos, latched)
+            kind, topic, read, lambda stamp, unread: use(stamp, unread.read()), latched=latched)
 
     def collect(
         self,

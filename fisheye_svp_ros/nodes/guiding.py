@@ -28,7 +28,7 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.quality import LATCHED
-from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
+from fisheye_svp_ros.optics.curves import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.planning.guide import (
     DetectedBoard,

@@ -14,7 +14,7 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
 from fisheye_svp_ros.nodes.lenses import lens_of
-from fisheye_svp_ros.nodes.markers import camera_shape
+from fisheye_svp_ros.nodes.messages import camera_shape
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.nodes.transforms import Transforms

@@ -27,8 +27,7 @@ from fisheye_svp_ros.nodes.subscriptions import Unread
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.cameras import camera_for
-from fisheye_svp_ros.rectify.maps import RANGE, Rectification
-from fisheye_svp_ros.rectify.stereo import rectify_pair
+from fisheye_svp_ros.rectify.maps import RANGE, Rectification, rectify_pair
 from fisheye_svp_ros.scene.observations import STEREO
 from fisheye_svp_ros.study.settings import Settings
 

@@ -54,17 +54,14 @@ def _reason(node: Any, inputs: Sequence[Input], one: Input, publishers: Sequence
         return (f'{names} is still connected; check its own input, and run ros2 topic hz '
                 f'{one.resolved}')
     offers = [info.qos_profile for info in right]
-    if not any(_is_compatible(offered, asked) for offered in offers for asked in one.profiles):
+    if all(qos_check_compatible(offered, asked)[0] == QoSCompatibility.ERROR
+           for offered in offers for asked in one.profiles):
         return (f'{names} offers {qos_words(offers[0])}, but this node requests '
                 f'{qos_words(one.profiles[0])}; remove {PREFIX}{one.resolved}.subscription.*')
     lossy = all(asked.reliability == ReliabilityPolicy.BEST_EFFORT for asked in one.profiles)
     large = (' (best effort loses large messages: raise net.core.rmem_max, or set '
              f'{PREFIX}{one.resolved}.subscription.reliability:=reliable)' if lossy else '')
     return f'{names} is connected, but no message has arrived{large}'
-
-
-def _is_compatible(offered: Any, asked: Any) -> bool:
-    return bool(qos_check_compatible(offered, asked)[0] != QoSCompatibility.ERROR)
 
 
 def _comes_from_elsewhere(node: Any, topic: str) -> bool:

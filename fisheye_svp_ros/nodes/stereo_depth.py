@@ -16,7 +16,7 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.clouds import LANDMARKS, structured_array
 from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.markers import camera_shape, epipolar_shapes, landmarks_shape
+from fisheye_svp_ros.nodes.messages import camera_shape, epipolar_shapes, landmarks_shape
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.solver import (
     Items,
@@ -76,9 +76,11 @@ class StereoDepth(SolverNode):
             left.landmark, right.landmark, assume_unique=True, return_indices=True
         )
         uv = left.uv[in_left], right.uv[in_right]
+        true: Pose | None = items.get('right/true_pose')
+        known = known_points(landmarks, right)[in_right]
         found = measure_points(
             models, rig.take(None), uv[0][None], uv[1][None],
-            _true_points(known_points(landmarks, right)[in_right], items), self.settings.optimal,
+            None if true is None else true.into_body(known)[None], self.settings.optimal,
         ).require()
         points = found.solution.points[0]
         seen = np.isfinite(points[:, 0])
@@ -109,12 +111,6 @@ def _rig_file(settings: SolverSettings) -> Pose | None:
     except LensError as cause:
         raise ParameterError(
             f'rig is {rig!r}; true, topic or the file of a rig is needed ({cause})') from cause
-
-
-def _true_points(points: Array, items: Items) -> Array | None:
-    """Return landmarks (N, 3) in the frame of the right camera where its pose is known."""
-    pose: Pose | None = items.get('right/true_pose')
-    return None if pose is None else pose.into_body(points)[None]
 
 
 def _shapes(

@@ -17,7 +17,7 @@ from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.parameters import SWEEP, Sweep, parameter, sweep_of, with_values
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.camera import CameraNode, rows_by_frame
-from fisheye_svp_ros.nodes.markers import camera_shape, landmarks_shape, rays_shape
+from fisheye_svp_ros.nodes.messages import camera_shape, landmarks_shape, rays_shape
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose

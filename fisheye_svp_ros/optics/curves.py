@@ -6,14 +6,17 @@ A distribution of the user's own adds curves by entry points in the groups
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.optics import formulas
 from fisheye_svp_ros.optics.curve_base import ImageHeight, Trigonometric, ViewpointShift
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.registry import Registry
+
+_SAMPLES = 512
 
 
 @dataclass(frozen=True)
@@ -155,3 +158,28 @@ VIEWPOINT_SHIFTS: Registry[type[ViewpointShift]] = Registry('viewpoint_shifts', 
     'gennery': Gennery,
     'flat_port': FlatPort,
 }, ViewpointShift)
+
+
+def kannala_brandt_equivalent(lens: Lens) -> Lens:
+    """Return the SVP Kannala-Brandt lens nearest to the image-height curve of a lens.
+
+    Exact where the lens is Kannala-Brandt or equidistant; otherwise the least-squares fit of the
+    five odd powers of theta over the field of view.  Corrections have no place in it.
+    """
+    curve = lens.image_height
+    bare = replace(lens.svp(), image_field=None, corrections={}, target={})
+    exact = curve.with_powers(())
+    if exact is not None:
+        return replace(bare, image_height=exact)
+    theta = np.linspace(0.0, lens.max_incidence, _SAMPLES)
+    scaled = theta / lens.max_incidence
+    powers = np.arange(1, 10, 2)
+    height, _ = curve.value_and_slope(theta)
+    fitted = np.linalg.lstsq(scaled[:, None] ** powers, height, rcond=None)[0]
+    scale, *k = fitted / lens.max_incidence**powers
+    return replace(
+        bare,
+        fx=lens.fx * float(scale),
+        fy=lens.fy * float(scale),
+        image_height=KannalaBrandt(*(float(value / scale) for value in k)),
+    )

@@ -8,8 +8,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.rectify.cameras import RectifiedCamera
-from fisheye_svp_ros.rectify.maps import Rectification
-from fisheye_svp_ros.rectify.stereo import RectifiedPair
+from fisheye_svp_ros.rectify.maps import Rectification, RectifiedPair
 
 _RANGES = (0.3, 0.5, 1.0, 2.0, 5.0, np.inf)  # m, of tables
 LIMIT = 0.5  # px

@@ -11,7 +11,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import LensError, ParameterError
 from fisheye_svp_ros.optics import camera
 from fisheye_svp_ros.optics.camera import unique_range
-from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
+from fisheye_svp_ros.optics.curves import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens, curve_limit
 from fisheye_svp_ros.rectify.maps import meet_sphere
 

@@ -22,8 +22,7 @@ from fisheye_svp_ros.rectify.errors import (
     table_ranges,
     tolerated_ranges,
 )
-from fisheye_svp_ros.rectify.maps import Rectification
-from fisheye_svp_ros.rectify.stereo import RectifiedPair
+from fisheye_svp_ros.rectify.maps import Rectification, RectifiedPair
 from fisheye_svp_ros.reporting.tables import print_table, range_text
 
 _LINES = 16  # across a drawn pair

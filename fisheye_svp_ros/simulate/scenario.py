@@ -33,7 +33,6 @@ from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import STEREO, Observations
 from fisheye_svp_ros.scene.rigs import BASELINE, STYLES, calibration_poses, rig_from_angle
 from fisheye_svp_ros.simulate.simulation import (
-    Prediction,
     add_noise,
     blank_views,
     predict_points,
@@ -380,11 +379,11 @@ def _simulate_batch(scenes: Sequence[_Scene], first: int) -> Batch:
     for number, camera in enumerate(cameras):
         views = blank_views(landmark[sets], points[sets], flat)
         views = views._replace(camera=views.camera + number)
-        seen = predict_points(model, camera.reshape(flat), views)
-        ideal = Prediction(seen.uv.reshape(*shape, 2), seen.scale.reshape(*shape, 1))
+        seen = (part.reshape(*shape, -1)
+                for part in predict_points(model, camera.reshape(flat), views))
         uv.append(np.stack([
-            add_noise(model, Prediction(*parts), scene.scenario.noise_px, rng)
-            for scene, rng, *parts in zip(scenes, noise, *ideal, strict=True)
+            add_noise(model, (ideal, scale), scene.scenario.noise_px, rng)
+            for scene, rng, ideal, scale in zip(scenes, noise, *seen, strict=True)
         ]))
     row = np.array([scene.row for scene in scenes])
     return Batch(row, one.lens, one.shift_scale, landmark, points, rig, cameras, tuple(uv))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -88,13 +87,6 @@ def simulate_rig(
     return _table(np.stack(seen, axis=1), landmarks, sigma, t, None, cameras)
 
 
-class Prediction(NamedTuple):
-    """Image points (S, N, 2), px, without noise; scale: factor (S, N, 1) on the noise."""
-
-    uv: Array
-    scale: Array
-
-
 def blank_views(
     ids: Index, points: Array, count: int, t: Array | None = None, board: Index | None = None
 ) -> Views:
@@ -107,31 +99,32 @@ def blank_views(
     )
 
 
-def predict_points(model: ForwardModel, poses: Pose, views: Views) -> Prediction:
-    """Return what a camera at poses (S,) sees of views (S, N) before the noise."""
-    return Prediction(model.predict(poses, views).uv, _noise_scale(model, poses, views))
+def predict_points(model: ForwardModel, poses: Pose, views: Views) -> tuple[Array, Array]:
+    """Return what a camera at poses (S,) sees of views (S, N), and how noisy that is.
+
+    Image points (S, N, 2), px, without noise, and the factor (S, N, 1) on the noise.
+    """
+    uv = model.predict(poses, views).uv
+    if not model.noise_terms:
+        return uv, np.ones((*uv.shape[:2], 1))
+    scene = model.scene(poses, views, model.linearise(poses, views))
+    return uv, np.broadcast_to(noise_scale(model.terms, scene), uv.shape[:2])[..., None]
 
 
 def add_noise(
-    model: ForwardModel, seen: Prediction, sigma: float, rng: np.random.Generator
+    model: ForwardModel, seen: tuple[Array, Array], sigma: float, rng: np.random.Generator
 ) -> Array:
-    """Return image points (S, N, 2), px, with noise; NaN where there is none."""
+    """Return image points (S, N, 2), px, of `predict_points` with noise; NaN where none is."""
     if not (np.isfinite(sigma) and sigma >= 0):
         raise ParameterError(f'noise is {sigma} px; 0 or more is needed')
-    uv = seen.uv + sigma * seen.scale * rng.standard_normal(seen.uv.shape)
+    ideal, scale = seen
+    uv = ideal + sigma * scale * rng.standard_normal(ideal.shape)
     size = np.array([model.lens.width, model.lens.height])
     inside = np.all((uv >= -0.5) & (uv <= size - 0.5), axis=-1, keepdims=True)
     uv = np.where(inside, uv, np.nan)
     for effect, values in model.noise_terms:
         uv = effect.record_points(uv, values, rng)
     return uv
-
-
-def _noise_scale(model: ForwardModel, poses: Pose, views: Views) -> Array:
-    if not model.noise_terms:
-        return np.ones((*views.uv.shape[:2], 1))
-    scene = model.scene(poses, views, model.linearise(poses, views))
-    return np.broadcast_to(noise_scale(model.terms, scene), views.uv.shape[:2])[..., None]
 
 
 def _table(

@@ -88,7 +88,7 @@ def gauss_newton(
     step moves predictions by, root mean square, whitened.
     """
     data, state, free, residual = linear.data, linear.state, linear.free, linear.residual
-    limit = _MAX_RISE * float((residual**2).sum())
+    limit = _MAX_RISE * linear.sum_of_squares
 
     def is_linear(before: Array, change: Array, part: float, after: Array) -> bool:
         apart = after - (before - part * change)
@@ -97,18 +97,12 @@ def gauss_newton(
     for _ in range(_GAUSS_NEWTON_STEPS):
         frame, shared = solve(residual, state)
         change = (linear.frame_columns @ frame[..., None])[..., 0] + linear.shared_columns @ shared
-        after = partial(_partial_step, state, free, frame, shared)
+        after = partial(state.retract, free, frame, shared)
         state, residual = shorten_step(
             data, free, after, limit, partial(is_linear, residual, change))
         if np.sqrt((change**2).mean()) < tolerance:
             break
     return state
-
-
-def _partial_step(
-    state: RigState, free: Sequence[str], frame: Array, shared: Array, part: float
-) -> RigState:
-    return state.retract(free, part * frame, part * shared)
 
 
 def shorten_step(
@@ -123,11 +117,11 @@ def shorten_step(
     """
     for part in _STEP_FRACTIONS:
         state = after(part)
-        residual = Linearization(data, state, free).residual
-        squares = float((residual**2).sum())
-        if np.isfinite(squares) and (squares <= limit or is_linear(part, residual)):
+        linear = Linearization(data, state, free)
+        squares = linear.sum_of_squares
+        if np.isfinite(squares) and (squares <= limit or is_linear(part, linear.residual)):
             break
-    return state, residual
+    return state, linear.residual
 
 
 class AdjustedLens(NamedTuple):

@@ -53,10 +53,6 @@ class Transforms(NamedTuple):
         return self.target.reshape(1).take(rows).compose(camera).compose(
             self.camera.reshape(1).take(rows).inverse())
 
-    def scale_lengths(self, flange: Pose) -> Pose:
-        """Return what the robot states, in lengths of the target."""
-        return Pose(flange.rotation, self.scale * flange.position)
-
 
 @dataclass(frozen=True)
 class HandEye:
@@ -202,7 +198,8 @@ class _Robot(NamedTuple):
 
     def residual(self, transforms: Transforms, camera: Pose) -> Array:
         """Return flange by the images minus flange by the robot (F, 6), zero where unknown."""
-        off = transforms.flange(camera).difference(transforms.scale_lengths(self.flange))
+        stated = Pose(self.flange.rotation, transforms.scale * self.flange.position)
+        off = transforms.flange(camera).difference(stated)
         return np.where(self.known[:, None], off, 0.0)
 
     def columns(self, transforms: Transforms, camera: Pose) -> tuple[Array, Array]:

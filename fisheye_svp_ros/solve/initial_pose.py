@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.pose import Pose, cross_matrix, nearest_rotation, rotation_from_vector
 
 _STEPS, _MORE_STEPS = 4, 10  # Gauss-Newton, of an algebraic turn and of any turn
@@ -21,20 +21,12 @@ _DOUBTFUL = 1e-3  # mean squared sine (about 2 degrees) above which evenly sprea
 _FLOOR = 1e-12  # relative; keeps rays that are all parallel invertible
 
 
-class _Misfit(NamedTuple):
-    """Squared distances of S sets of landmarks from their rays: r^T form r, r = columns of R.
-
-    form (S, 9, 9); pull (S, 3, 9): the best translation is pull r.
-    """
-
-    form: Array
-    pull: Array
-
-
 class _Problem(NamedTuple):
     """S sets of landmarks in their own principal axes, over their size.
 
     local, direction (S, N, 3), zero where not seen; axes (S, 3, 3), scale (S,), centre (S, 3).
+    form (S, 9, 9): the squared distances of landmarks from their rays are r^T form r, r = columns
+    of R; pull (S, 3, 9): the best translation is pull r.
     """
 
     local: Array
@@ -42,6 +34,12 @@ class _Problem(NamedTuple):
     axes: Array
     scale: Array
     centre: Array
+    form: Array
+    pull: Array
+
+    def take(self, rows: Index) -> _Problem:
+        """Return some of the sets."""
+        return _Problem(*(part[rows] for part in self))
 
     def camera(self, rotation: Array, translation: Array) -> Pose:
         """Return cameras in the world from turns (S, ..., 3, 3) and translations (S, ..., 3)."""
@@ -59,15 +57,11 @@ def initial_poses(points: Array, direction: Array, weight: Array, spread: bool =
     four in a plane, and where those fail, if `spread`, from evenly spread turns.
     """
     problem = _problem(points, direction, weight)
-    local, d = problem.local, problem.direction
-    misfit = _misfit(local, d)
-    rotation, translation, error = _best_turn(
-        _algebraic_rotations(local, misfit), misfit, local, d, _STEPS)
+    rotation, translation, error = _best_turn(_algebraic_rotations(problem), problem, _STEPS)
     rows = np.flatnonzero(error > _DOUBTFUL) if spread else np.empty(0, dtype=np.int64)
     if rows.size:
         turns = np.broadcast_to(_cube_turns(), (len(rows), 24, 3, 3))
-        own = _Misfit(misfit.form[rows], misfit.pull[rows])
-        other = _best_turn(turns, own, local[rows], d[rows], _MORE_STEPS)
+        other = _best_turn(turns, problem.take(rows), _MORE_STEPS)
         better = other[2] < error[rows]
         rotation[rows[better]], translation[rows[better]] = other[0][better], other[1][better]
     return problem.camera(rotation, translation)
@@ -76,10 +70,9 @@ def initial_poses(points: Array, direction: Array, weight: Array, spread: bool =
 def candidate_poses(points: Array, direction: Array, weight: Array) -> Pose:
     """Return the poses (S, C) that evenly spread turns lead to, for sets with several minima."""
     problem = _problem(points, direction, weight)
-    misfit = _misfit(problem.local, problem.direction)
     turns = np.broadcast_to(_cube_turns(), (len(points), 24, 3, 3))
-    rotation = _polish(turns, misfit.form[:, None], _MORE_STEPS)
-    return problem.camera(rotation, _translation(misfit, rotation))
+    rotation = _polish(turns, problem.form[:, None], _MORE_STEPS)
+    return problem.camera(rotation, _translation(problem, rotation))
 
 
 def _problem(points: Array, direction: Array, weight: Array) -> _Problem:
@@ -94,11 +87,11 @@ def _problem(points: Array, direction: Array, weight: Array) -> _Problem:
     )
     scale = np.maximum(np.sqrt((local**2).sum((1, 2)) / count), 1e-12)
     local = local @ np.swapaxes(axes, -1, -2) / scale[:, None, None]
-    return _Problem(local, d, axes, scale, centre)
+    return _Problem(local, d, axes, scale, centre, *_sum_points(local, d))
 
 
-def _misfit(local: Array, d: Array) -> _Misfit:
-    """Sum the points up; d is zero where they are not seen."""
+def _sum_points(local: Array, d: Array) -> tuple[Array, Array]:
+    """Return form and pull of a problem."""
     systems, count = local.shape[:2]
     seen = np.any(d, axis=-1)
     across = (np.eye(3) - d[..., :, None] * d[..., None, :]) * seen[..., None, None]
@@ -112,18 +105,19 @@ def _misfit(local: Array, d: Array) -> _Misfit:
     rays = across.sum(axis=1)
     rays[:, range(3), range(3)] += _FLOOR * count
     pull = -np.linalg.solve(rays, np.swapaxes(mixed, -1, -2))
-    return _Misfit(form + mixed @ pull, pull)
+    return form + mixed @ pull, pull
 
 
 def _best_turn(
-    candidates: Array, misfit: _Misfit, local: Array, d: Array, steps: int
+    candidates: Array, problem: _Problem, steps: int
 ) -> tuple[Array, Array, Array]:
     """Polish candidates (S, C, 3, 3) and return the best turn, its translation and its error.
 
     error (S,): mean squared sine between rays and landmarks; 1 for a landmark behind its ray.
     """
-    rotation = _polish(candidates, misfit.form[:, None], steps)
-    translation = _translation(misfit, rotation)
+    local, d = problem.local, problem.direction
+    rotation = _polish(candidates, problem.form[:, None], steps)
+    translation = _translation(problem, rotation)
     placed = local[:, None] @ np.swapaxes(rotation, -1, -2) + translation[:, :, None]
     along = (placed * d[:, None]).sum(-1)
     cos2 = np.where(along > 0, along**2 / np.maximum((placed**2).sum(-1), 1e-18), 0.0)
@@ -133,9 +127,9 @@ def _best_turn(
     return rotation[rows, best], translation[rows, best], error[rows, best]
 
 
-def _translation(misfit: _Misfit, rotation: Array) -> Array:
+def _translation(problem: _Problem, rotation: Array) -> Array:
     """Return the best translations (S, C, 3) for turns (S, C, 3, 3)."""
-    translation: Array = (misfit.pull[:, None] @ _columns(rotation)[..., None])[..., 0]
+    translation: Array = (problem.pull[:, None] @ _columns(rotation)[..., None])[..., 0]
     return translation
 
 
@@ -159,14 +153,14 @@ def _columns(rotation: Array) -> Array:
     return np.swapaxes(rotation, -1, -2).reshape(*rotation.shape[:-2], 9)
 
 
-def _algebraic_rotations(local: Array, misfit: _Misfit) -> Array:
+def _algebraic_rotations(problem: _Problem) -> Array:
     """Rotations (S, 2, 3, 3) from the eigenvector of the smallest misfit, one sign each way."""
-    flat = (np.abs(local[..., 2]).max(axis=1) < 1e-6)[:, None, None]
-    form = misfit.form.copy()
+    flat = (np.abs(problem.local[..., 2]).max(axis=1) < 1e-6)[:, None, None]
+    form = problem.form.copy()
     form[:, 6:, :] = 0
     form[:, :, 6:] = 0
     form[:, range(6, 9), range(6, 9)] = 1e9
-    vectors = np.linalg.eigh(np.where(flat, form, misfit.form))[1]
+    vectors = np.linalg.eigh(np.where(flat, form, problem.form))[1]
     columns = np.swapaxes(vectors[..., 0].reshape(-1, 3, 3), -1, -2)
     # A first column of zeros is no turn, but must not end the other views' search.
     size = np.maximum(np.linalg.norm(columns[..., 0], axis=-1), 1e-9)

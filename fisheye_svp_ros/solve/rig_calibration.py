@@ -253,7 +253,8 @@ def calibrate_rig(
         float(np.sqrt(np.nanmean(squares))), sigma,
         np.bincount(data.camera_of, minlength=len(order))[place], torn,
         misfit_reason(squared / freedom, freedom) if fails else '',
-        tuple(_within_curve(state.lenses[i]) for i in place),
+        tuple(replace(lens, max_incidence=min(lens.max_incidence, monotone_limit(lens)))
+              for lens in (state.lenses[i] for i in place)),  # as far as their curves still allow
         tuple(placed.boards[i] for i in place if placed.boards),
     )
 
@@ -277,11 +278,6 @@ def _fit_rig(
     state = replace(start, rig=rig, lens=lenses[0], others=tuple(lenses[1:]), terms=(),
                     corrected=True, boards=boards)
     return data, adjust(data, state, ())
-
-
-def _within_curve(lens: Lens) -> Lens:
-    """Return the lens with a field of view that its curve, which has moved, still allows."""
-    return replace(lens, max_incidence=min(lens.max_incidence, monotone_limit(lens)))
 
 
 def _stated_errors(

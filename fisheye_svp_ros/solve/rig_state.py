@@ -154,11 +154,14 @@ class RigState:
         return replace(self, lens=lenses[0], others=tuple(lenses[1:]),
                        terms=tuple(terms))
 
-    def retract(self, free: Sequence[str], frame: Array, shared: Array) -> RigState:
-        """Return the state after a step of poses (F, 6) and of what all frames share.
+    def retract(
+        self, free: Sequence[str], frame: Array, shared: Array, part: float = 1.0
+    ) -> RigState:
+        """Return the state after a part of a step of poses (F, 6) and of what all frames share.
 
         shared (6 (C - 1) + K,): of the rig with its boards, free intrinsics and effects.
         """
+        frame, shared = part * frame, part * shared
         move = np.zeros((*self.rig.shape, 6))
         turned = move[1:].size
         move[1:] = shared[:turned].reshape(-1, 6)

@@ -10,7 +10,7 @@ import pytest
 from helpers.patterns import pattern_photograph
 
 from benchmark.detectors import LENS
-from fisheye_svp_ros.detect.circle_grid import _ellipses, find_circles
+from fisheye_svp_ros.detect.grids import _ellipses, find_circles
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.points import find_points
 from fisheye_svp_ros.simulate.render import Exposure

@@ -20,8 +20,8 @@ from fisheye_svp_ros.optics.curves import (
     Gennery,
     KannalaBrandt,
     Stereographic,
+    kannala_brandt_equivalent,
 )
-from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import group_views, views_of
 from fisheye_svp_ros.scene.rigs import rig

@@ -13,7 +13,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.markers import camera_shape, rays_shape
+from fisheye_svp_ros.nodes.messages import camera_shape, rays_shape
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth, _shapes
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.optics.curves import Equidistant

@@ -20,7 +20,7 @@ from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
+from fisheye_svp_ros.optics.curves import kannala_brandt_equivalent
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 
 STAMP = 1_700_000_000_123_456_789

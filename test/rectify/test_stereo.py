@@ -16,7 +16,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.rectify.cameras import camera_for, rectified_camera
 from fisheye_svp_ros.rectify.errors import pair_error
-from fisheye_svp_ros.rectify.stereo import rectify_pair
+from fisheye_svp_ros.rectify.maps import rectify_pair
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 
 LEFT = Lens('left', 640, 400, 210.0, 210.0, 318.3, 203.4, KannalaBrandt(-0.02, 0.003),

@@ -15,7 +15,6 @@ from fisheye_svp_ros.scene.rigs import rig
 from fisheye_svp_ros.solve.initial_pose import (
     _best_turn,
     _cube_turns,
-    _misfit,
     _problem,
     initial_poses,
 )
@@ -164,10 +163,9 @@ def test_a_landmark_behind_its_ray_is_as_far_off_as_it_can_be():
     points = np.array([[[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0.3, 0]]])
     ahead = points + np.array([0, 0, 0.2])
     direction = ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
-    local, d = _problem(points, direction, np.ones((1, 5)))[:2]
-    misfit = _misfit(local, d)
-    true, _, least = _best_turn(_cube_turns()[None], misfit, local, d, 10)
-    _, _, error = _best_turn((true @ np.diag([-1.0, -1, 1]))[:, None], misfit, local, d, 0)
+    problem = _problem(points, direction, np.ones((1, 5)))
+    true, _, least = _best_turn(_cube_turns()[None], problem, 10)
+    _, _, error = _best_turn((true @ np.diag([-1.0, -1, 1]))[:, None], problem, 0)
     assert least < 1e-9 and error == 1
 
 
