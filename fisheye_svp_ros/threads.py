@@ -34,6 +34,7 @@ def limit_threads(function: Callable[_P, _R]) -> Callable[_P, _R]:
     def wrapper(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         if any(os.environ.get(name) for name in VARIABLES) or not find_spec('threadpoolctl'):
             return function(*args, **kwargs)
+        import scipy.linalg  # noqa: F401 (BLAS of its own: loaded later it would have all threads)
         from threadpoolctl import threadpool_limits
 
         with threadpool_limits(1, user_api='blas'):

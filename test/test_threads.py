@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import pytest
 
 from fisheye_svp_ros.threads import VARIABLES, limit_threads, set_thread_count
@@ -31,6 +35,26 @@ def test_one_thread_inside_and_as_many_as_before_afterwards() -> None:
         assert _threads.__wrapped__() == before
 
 
+_LOADED_INSIDE = """
+import numpy as np
+from threadpoolctl import threadpool_info
+from fisheye_svp_ros.threads import limit_threads
+
+@limit_threads
+def count():
+    import scipy.linalg
+    return {pool['num_threads'] for pool in threadpool_info() if pool['user_api'] == 'blas'}
+
+assert count() == {1}, count()
+"""
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason='one core has one thread anyway')
+def test_what_is_loaded_inside_is_limited_too() -> None:
+    environment = {name: value for name, value in os.environ.items() if name not in VARIABLES}
+    subprocess.run([sys.executable, '-c', _LOADED_INSIDE], check=True, env=environment)
+
+
 @pytest.mark.usefixtures('no_number')
 def test_a_number_in_the_environment_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv('OPENBLAS_NUM_THREADS', '2')
@@ -40,8 +64,6 @@ def test_a_number_in_the_environment_is_kept(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.usefixtures('no_number')
 def test_processes_of_the_package_ask_for_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    import os
-
     monkeypatch.setenv(VARIABLES[0], '')
     monkeypatch.delenv(VARIABLES[0])
     set_thread_count()
