@@ -117,7 +117,8 @@ bench: .venv-bench/ready
 		.venv-bench/mrcal || echo 'mrcal: no sources to be had; its rows are left out'
 	touch $@
 
-# Held-out corners of real cameras through other calibrations, into docs/results/compare.md; ten minutes.
+# Held-out corners of real cameras through other calibrations, and halves of their frames, into
+# docs/results/compare.md; half an hour.
 COMPARE_PYTHON ?= python3.12
 COMPARE_DATA ?= data
 compare: .venv-compare/ready
@@ -148,12 +149,14 @@ hand-eye: .venv-hand-eye/ready
 	$(QUIETLY) .venv-hand-eye/bin/pip install --quiet -e '.[fast]' 'opencv-python-headless<5'
 	touch $@
 
-# mrcal without what only its windows need, which wants to be compiled.
+# mrcal without what only its windows need, which wants to be compiled; the others without the
+# OpenCV that they ask for, which would overwrite the one that is here.
 .venv-compare/ready: setup.py
 	@echo "Installing what is compared into .venv-compare: some minutes, this once"
 	$(COMPARE_PYTHON) -m venv .venv-compare
-	$(QUIETLY) .venv-compare/bin/pip install --quiet -e '.[fast]' numpysane gnuplotlib packaging
-	.venv-compare/bin/pip install --quiet --no-deps mrcal || echo 'mrcal: not to be had here'
+	$(QUIETLY) .venv-compare/bin/pip install --quiet -e '.[fast]' numpysane gnuplotlib packaging pyyaml
+	for peer in mrcal lensboy calibsense ds-msp; do .venv-compare/bin/pip install --quiet \
+		--no-deps $$peer || echo "$$peer: not to be had here"; done
 	touch $@
 
 # What spoilt views do to poses, into docs/results/reliability.md; ten minutes.

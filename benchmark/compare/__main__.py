@@ -1,7 +1,9 @@
 """`python -m benchmark.compare DATA`: the same held-out corners through ours and through others.
 
 DATA holds the folders ov_plane, ov_cube (train.csv, test.csv) and photos (chessboard,
-square_grid); what is not there is left out.  Writes docs/results/compare.md.
+square_grid); what is not there is left out.  Then halves of the frames of each set: what lenses of
+one half predict in the other, and how far intrinsics are apart beside their standard errors.
+Writes docs/results/compare.md.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +25,14 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
 import numpy as np  # noqa: E402
 
 import fisheye_svp_ros as fsvp  # noqa: E402
+from benchmark.compare.halves import (  # noqa: E402
+    all_pairs,
+    differences,
+    half_sets,
+    honesty_table,
+)
 from benchmark.compare.peers import PEERS, Fitted, NotHereError  # noqa: E402
+from benchmark.compare.python_peers import PYTHON_PEERS  # noqa: E402
 from benchmark.compare.scoring import residuals, rms  # noqa: E402
 from benchmark.compare.sets import (  # noqa: E402
     BOARDS,
@@ -31,6 +41,7 @@ from benchmark.compare.sets import (  # noqa: E402
     photograph_set,
     table_set,
 )
+from benchmark.workers import in_processes  # noqa: E402
 from fisheye_svp_ros.arrays import Array, Mask  # noqa: E402
 from fisheye_svp_ros.diagnosis import (  # noqa: E402
     Diagnosis,
@@ -40,7 +51,6 @@ from fisheye_svp_ros.diagnosis import (  # noqa: E402
 )
 from fisheye_svp_ros.io.files import write_text  # noqa: E402
 from fisheye_svp_ros.library_results import Localized  # noqa: E402
-from fisheye_svp_ros.reporting.progress import progress  # noqa: E402
 from fisheye_svp_ros.scene.observations import Observations  # noqa: E402
 from fisheye_svp_ros.solve.initial_rig import localize_frames  # noqa: E402
 from fisheye_svp_ros.solve.measured_poses import (  # noqa: E402
@@ -51,6 +61,7 @@ from fisheye_svp_ros.solve.rig_state import group_by_frame  # noqa: E402
 _DOC = Path(__file__).parents[2] / 'docs' / 'results' / 'compare.md'
 _MARK = '<!-- figures -->'
 _OV = (1280, 800)
+TOOLS = {**PEERS, **PYTHON_PEERS}
 SETS: dict[str, Callable[[Path], Set]] = {
     'ov_plane': lambda data: table_set(data / 'ov_plane', _OV),
     'ov_cube': lambda data: table_set(data / 'ov_cube', _OV),
@@ -115,7 +126,7 @@ def compared(data: Set) -> list[Row]:
             count, np.nan, ours=True),
         Row('ours, `diagnose`: extended', figures.extended.heldout_rms_px,
             _whole(found, data.test, found.offsets), count, np.nan, ours=True),
-        *(_row(name, data, fair, start, lens.fx) for name in PEERS),
+        *(_row(name, data, fair, start, lens.fx) for name in TOOLS),
     ]
 
 
@@ -136,7 +147,7 @@ def _row(name: str, data: Set, fair: Mask, start: Localized, focal: float) -> Ro
     """Return the row of the best lens that a tool has found."""
     try:
         with timed() as clock:
-            found = PEERS[name](data, grid_of(data), focal)
+            found = TOOLS[name](data, grid_of(data), focal)
     except NotHereError as reason:
         return Row(name, np.nan, np.nan, 0, np.nan, str(reason))
     rows = [_scored(name, one, data.test, fair, start)._replace(seconds=clock.seconds)
@@ -186,21 +197,50 @@ def section(data: Set, rows: list[Row]) -> list[str]:
     return [*lines, '']
 
 
+def halves_table(found: dict[str, list[list[Row]]]) -> list[str]:
+    """Return what lenses of one half predict in the other; found: the rows of halves, by set."""
+    lines = [f'| model | {" | ".join(found)} |', f'|---|{"---:|" * len(found)}']
+    for i, row in enumerate(next(iter(found.values()))[0]):
+        cells = []
+        for many in found.values():
+            mine = [rows[i] for rows in many if np.isfinite(rows[i].rms_px)]
+            pooled = np.sqrt(np.average([one.rms_px**2 for one in mine],
+                                        weights=[one.points for one in mine])) if mine else np.nan
+            missing = f' ({len(mine)} of {len(many)})' * (len(mine) < len(many))
+            cells.append(f'{pooled:.3f}{missing}' if mine else '-')
+        lines.append(f'| {row.model} | {" | ".join(cells)} |')
+    return lines
+
+
+def page(sets: list[tuple[Set, list[Row]]], halves: list[str], honesty: list[str]) -> str:
+    """Return the generated part of docs/results/compare.md."""
+    lines = [_versions(), '']
+    for data, rows in sets:
+        lines += section(data, rows)
+    return '\n'.join([*lines, '## Half against half', '', *halves, '', '## Standard errors', '',
+                      *honesty, ''])
+
+
 def main() -> None:
     """Compare on every set that is there, write the page."""
     parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.compare')
     parser.add_argument('data', type=Path)
     parser.add_argument('--only', nargs='+', choices=SETS, default=list(SETS))
+    parser.add_argument('--workers', type=int, default=os.cpu_count(), help='processes for halves')
     parser.add_argument('-o', '--output', type=Path, default=_DOC)
     asked = parser.parse_args()
-    there = [name for name in asked.only if (asked.data / name).is_dir()]
-    lines = [_versions(), '']
-    with progress('comparing', len(there)) as advance:
-        for name in there:
-            data = SETS[name](asked.data)
-            lines += section(data, compared(data))
-            advance()
-    text = '\n'.join(lines)
+    sets = [SETS[name](asked.data) for name in asked.only if (asked.data / name).is_dir()]
+    # Whole sets one by one: their seconds are compared.
+    rows = in_processes('comparing', compared, sets, 1)
+    halves, honesty = ({data.name: list(parts(data)) for data in sets}
+                       for parts in (half_sets, all_pairs))
+    scores = iter(in_processes('halves', compared, [*chain(*halves.values())], asked.workers))
+    apart = iter(in_processes('errors', differences, [*chain(*honesty.values())], asked.workers))
+    text = page(
+        list(zip(sets, rows, strict=True)),
+        halves_table({name: [next(scores) for _ in many] for name, many in halves.items()}),
+        honesty_table({name: [one for _ in many for one in next(apart)]
+                       for name, many in honesty.items()}))
     print(text)
     if asked.only == list(SETS):
         head = asked.output.read_text(encoding='utf-8').split(_MARK)[0]
@@ -209,7 +249,8 @@ def main() -> None:
 
 def _versions() -> str:
     found = []
-    for name in ('mrcal', 'opencv-python-headless', 'numpy', 'scipy'):
+    for name in ('mrcal', 'lensboy', 'calibsense', 'ds-msp', 'opencv-python-headless',
+                 'numpy', 'scipy'):
         try:
             found.append(f'{name} {version(name)}')
         except PackageNotFoundError:

@@ -7,8 +7,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -20,8 +20,8 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.scene.observations import Observations
 
 MRCAL = 'mrcal-calibrate-cameras'
-_PLANE = 89.0  # degrees: models of x / z end here
-_NARROWER = (180.0, 85.0, 80.0, 75.0, 70.0, 65.0, 60.0)  # degrees
+PLANE_LIMIT = 89.0  # degrees: models of x / z end here
+ANGLES = (180.0, 85.0, 80.0, 75.0, 70.0, 65.0, 60.0)  # degrees
 _FEWEST = 12  # points in a view for OpenCV to start from
 _MOST_LEFT_OUT = 10
 _TERMS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-10)
@@ -36,13 +36,16 @@ class Fitted:
     """A lens as a tool has it.
 
     project: how it projects; places: where it believes the landmarks (N, 3) of a table to be;
-    before: degrees, the incidence angle at which its model ends.
+    before: degrees, the incidence angle at which its model ends; intrinsics: fx, fy, cx, cy, px;
+    errors: their standard errors (4,) as the tool states them, by kind.
     """
 
     project: Project
     places: Callable[[Observations], Array]
     note: str = ''
     before: float = 180.0
+    intrinsics: Array = field(default_factory=lambda: np.full(4, np.nan))
+    errors: dict[str, Array] = field(default_factory=dict)
 
 
 Fit = Callable[[Set, Grid, float], list[Fitted]]
@@ -57,6 +60,22 @@ def views(table: Observations, grid: Grid) -> Iterator[tuple[int, Index, Array]]
         yield int(number), steps, split.uv[mine]
 
 
+def fit_within(fit: Callable[[float], Fitted], angles: Sequence[float]) -> list[Fitted]:
+    """Return the lenses fitted to the points within each of several angles, degrees."""
+    found, reason = [], ''
+    for limit in angles:
+        try:
+            one = fit(limit)
+        except (cv2.error, ArithmeticError, RuntimeError, ValueError) as failure:
+            reason = str(failure).strip().splitlines()[0]
+            continue
+        note = f'fitted to the points within {limit:.0f}°' * (limit < 180)
+        found.append(replace(one, note='; '.join(filter(None, (one.note, note)))))
+    if not found:
+        raise NotHereError(f'finds no lens: {reason}')
+    return found
+
+
 def opencv_fisheye(data: Set, grid: Grid, focal: float) -> list[Fitted]:
     """Fit `cv2.fisheye`: Kannala-Brandt with four coefficients, boards flat.
 
@@ -65,37 +84,36 @@ def opencv_fisheye(data: Set, grid: Grid, focal: float) -> list[Fitted]:
     """
     of = cv2 if hasattr(cv2, 'CALIB_FIX_SKEW') else cv2.fisheye  # where OpenCV 5, and 4, has them
     flags = of.CALIB_USE_INTRINSIC_GUESS + of.CALIB_RECOMPUTE_EXTRINSIC + of.CALIB_FIX_SKEW
-    start, reason = _pinhole(data, focal), ''
-    found: list[Fitted] = []
-    for limit in _NARROWER:
-        points, seen = _planes(data.train, grid, start, limit)
-        try:
-            _, matrix, curve, _, _ = cv2.fisheye.calibrate(
-                [one[None] for one in points], [one[None] for one in seen], data.size,
-                start.copy(), np.zeros(4), flags=flags, criteria=_TERMS)
-        except cv2.error as failure:
-            reason = failure.err
-            continue
+    start = pinhole_matrix(data, focal)
 
-        def project(xyz: Array, matrix: Array = matrix, curve: Array = curve) -> Array:
-            zero = np.zeros(3)
-            seen, _ = cv2.fisheye.projectPoints(xyz[:, None], zero, zero, matrix, curve)
-            return np.asarray(seen[:, 0])
+    def fit(limit: float) -> Fitted:
+        points, seen = board_points(data.train, grid, start, limit)
+        _, matrix, curve, _, _ = cv2.fisheye.calibrate(
+            [one[None] for one in points], [one[None] for one in seen], data.size,
+            start.copy(), np.zeros(4), flags=flags, criteria=_TERMS)
+        return Fitted(fisheye_projection(matrix, curve), nominal_places, before=PLANE_LIMIT)
 
-        note = f'fitted to the points within {limit:.0f}°' * (limit < 180)
-        found.append(Fitted(project, _flat, note, _PLANE))
-    if not found:
-        raise NotHereError(f'finds no lens: {reason}')
-    return found
+    return fit_within(fit, ANGLES)
+
+
+def fisheye_projection(matrix: Array, curve: Array) -> Project:
+    """Return the projection of `cv2.fisheye` by a matrix (3, 3) and four coefficients."""
+    zero = np.zeros(3)
+
+    def project(xyz: Array) -> Array:
+        seen, _ = cv2.fisheye.projectPoints(xyz[:, None], zero, zero, matrix, curve)
+        return np.asarray(seen[:, 0])
+
+    return project
 
 
 def opencv_rational(data: Set, grid: Grid, focal: float) -> list[Fitted]:
     """Fit `cv2.calibrateCamera` with the rational model, boards flat."""
     flags = cv2.CALIB_USE_INTRINSIC_GUESS + cv2.CALIB_RATIONAL_MODEL
-    start = _pinhole(data, focal)
-    points, seen = _planes(data.train, grid, start)
+    start = pinhole_matrix(data, focal)
+    points, seen = board_points(data.train, grid, start)
     try:
-        _, matrix, curve, _, _ = cv2.calibrateCamera(
+        _, matrix, curve, _, _, errors, *_ = cv2.calibrateCameraExtended(
             [one.astype(np.float32) for one in points], [one.astype(np.float32) for one in seen],
             data.size, start, np.zeros(8), flags=flags, criteria=_TERMS)
     except cv2.error as failure:
@@ -105,19 +123,23 @@ def opencv_rational(data: Set, grid: Grid, focal: float) -> list[Fitted]:
         zero = np.zeros(3)
         return np.asarray(cv2.projectPoints(xyz, zero, zero, matrix, curve)[0][:, 0])
 
-    return [Fitted(project, _flat, before=_PLANE)]
+    return [Fitted(project, nominal_places, before=PLANE_LIMIT,
+                   intrinsics=matrix[[0, 1, 0, 1], [0, 1, 2, 2]],
+                   errors={'': errors[:4].ravel()})]
 
 
-def _pinhole(data: Set, focal: float) -> Array:
+def pinhole_matrix(data: Set, focal: float) -> Array:
+    """Return a matrix (3, 3) of a focal length, px, with its center in the middle."""
     width, height = data.size
     return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
 
 
-def _flat(table: Observations) -> Array:
+def nominal_places(table: Observations) -> Array:
+    """Return the landmarks (N, 3) as the table has them."""
     return table.xyz
 
 
-def _planes(
+def board_points(
     table: Observations, grid: Grid, matrix: Array, limit: float = 180.0
 ) -> tuple[list[Array], list[Array]]:
     """Return points on flat boards and their images, up to an angle."""
@@ -147,8 +169,8 @@ def mrcal_model(model: str) -> Fit:
         lens = found.intrinsics()
         note = f'{left_out} board views left out: it finds no start for them' if left_out else ''
         return [Fitted(lambda xyz: np.asarray(mrcal.project(xyz, *lens)),
-                       lambda table: _bent(table, grid, board), note,
-                       _PLANE if 'OPENCV' in model else 180.0)]
+                       lambda table: warped_places(table, grid, board), note,
+                       PLANE_LIMIT if 'OPENCV' in model else 180.0)]
 
     return fit
 
@@ -190,7 +212,7 @@ def vnlog(table: Observations, grid: Grid, left_out: Collection[int] = ()) -> st
     return '\n'.join(lines) + '\n'
 
 
-def _bent(table: Observations, grid: Grid, board: Array) -> Array:
+def warped_places(table: Observations, grid: Grid, board: Array) -> Array:
     """Return the landmarks (N, 3) where mrcal's warped board, (row, column, 3), has them.
 
     The board lies on the nominal landmarks as well as a flat one can.

@@ -1,4 +1,4 @@
-"""The comparison with other calibrations: grids, corners for mrcal, scores, OpenCV's fit."""
+"""The comparison with other calibrations: grids, corners, scores, fits, halves of frames."""
 
 from __future__ import annotations
 
@@ -10,7 +10,17 @@ import pytest
 from helpers.targets import plane, poses_around
 
 import fisheye_svp_ros as fsvp
-from benchmark.compare.peers import PEERS, NotHereError, _bent, opencv_fisheye, vnlog
+from benchmark.compare.__main__ import Row, halves_table
+from benchmark.compare.halves import (
+    Difference,
+    all_pairs,
+    fixed_halves,
+    half_sets,
+    honesty_table,
+    whole,
+)
+from benchmark.compare.peers import PEERS, NotHereError, opencv_fisheye, vnlog, warped_places
+from benchmark.compare.python_peers import PYTHON_PEERS
 from benchmark.compare.scoring import residuals, rms
 from benchmark.compare.sets import BOARDS, Set, grid_of, one_board_a_frame
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -64,13 +74,13 @@ def test_corners_for_mrcal_are_whole_grids(data):
     assert sum(not line.endswith('-') for line in lines[1:]) == len(data.train)
 
 
-def test_a_bent_board_lies_on_the_nominal_one(data):
+def test_awarped_places_board_lies_on_the_nominal_one(data):
     grid = grid_of(data)
     across, along = np.meshgrid(np.arange(9), np.arange(9))
     flat = grid.spacing * np.stack([across, along, 0 * across], axis=-1)
-    assert np.abs(_bent(data.test, grid, flat) - data.test.xyz).max() < 1e-6
+    assert np.abs(warped_places(data.test, grid, flat) - data.test.xyz).max() < 1e-6
     bow = 1e-3 * (across / 8)**2
-    bent = _bent(data.test, grid, flat + np.stack([0 * bow, 0 * bow, bow], axis=-1))
+    bent = warped_places(data.test, grid, flat + np.stack([0 * bow, 0 * bow, bow], axis=-1))
     assert 8e-4 < np.abs(bent - data.test.xyz).max() < 1.1e-3
 
 
@@ -90,3 +100,53 @@ def test_opencv_finds_the_lens_and_poses_are_fitted(data):
 def test_a_missing_tool_says_so(data):
     with pytest.raises(NotHereError, match='not installed'):
         PEERS['mrcal, CAHVORE'](data, grid_of(data), 220.0)
+
+
+@pytest.mark.parametrize(('tool', 'module', 'largest'), [
+    ('lensboy, rational', 'lensboy', 0.3),  # another model
+    ('calibsense, fisheye', 'calibsense', 1e-3),
+    ('ds-msp, Kannala-Brandt', 'ds_msp', 1e-3),
+])
+def test_tools_of_the_index_find_the_lens(data, tool, module, largest):
+    if find_spec(module) is None:
+        with pytest.raises(NotHereError, match='not installed'):
+            PYTHON_PEERS[tool](data, grid_of(data), 200.0)
+        pytest.skip(f'{module} is not installed')
+    fitted = PYTHON_PEERS[tool](data, grid_of(data), 200.0)[0]
+    start = fsvp.localize(data.test, LENS)
+    apart = residuals(fitted.project, data.test.frame, fitted.places(data.test), data.test.uv,
+                      start.pose)
+    assert rms(apart) < largest
+    for error in fitted.errors.values():
+        off = fitted.intrinsics - [LENS.fx, LENS.fy, LENS.cx, LENS.cy]
+        assert (np.abs(off) < 1e-2).all()
+        assert (error < 1e-2).all()
+
+
+def test_halves_are_disjoint_and_whole(data):
+    table = whole(data)
+    assert len(table) == len(data.train) + len(data.test)
+    assert table.frames.tolist() == [*range(14)]
+    for one, other in fixed_halves(table.frames).values():
+        assert sorted([*one, *other]) == [*range(14)]
+    for one in half_sets(data):
+        assert len(one.train) + len(one.test) == len(table)
+        assert not set(one.train.frames) & set(one.test.frame // BOARDS)
+    for pair in all_pairs(data):
+        assert [len(one.train.frames) for one in pair] == [7, 7]
+
+
+def test_differences_are_counted_beside_their_errors():
+    ones = np.ones(4)
+    found = {'a': [Difference('tool', np.array([0.5, -1.5, 3.0, 0.0]), ones)],
+             'b': [Difference('tool', 0 * ones, np.array([1.0, 1.0, 1.0, np.nan])),
+                   Difference('other', 2 * ones, ones)]}
+    lines = honesty_table(found)
+    assert lines[2] == '| tool | 7 | 86 % | 75 % | 100 % | 1.28 | 0.71 / 0.71 |'
+    assert lines[3] == '| other | 4 | 0 % | - | 0 % | 2.00 | - / 0.71 |'
+
+
+def test_halves_are_pooled():
+    rows = [[Row('tool', 1.0, 1.0, 30, 1.0)], [Row('tool', 3.0, 3.0, 10, 1.0)]]
+    lost = [[Row('tool', np.nan, np.nan, 0, 1.0)], rows[1]]
+    assert halves_table({'a': rows, 'b': lost})[2] == '| tool | 1.732 | 3.000 (1 of 2) |'
