@@ -7,7 +7,7 @@ line in FORMATS.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
@@ -52,6 +52,14 @@ class Foreign(NamedTuple):
     rigs: tuple[Pose, ...]
     worst_px: dict[str, float]
     cameras: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls, form: str, found: Mapping[str, tuple[Lens, float]], rigs: Sequence[Pose] = ()
+    ) -> Foreign:
+        """Return what a file holds; found: each lens with how far it is from the file, px."""
+        lenses = {camera: lens for camera, (lens, _) in found.items()}
+        return cls(form, lenses, tuple(rigs), {camera: px for camera, (_, px) in found.items()})
 
     def deviation_px(self, lens: Lens) -> float:
         """Return how far a lens of the file is from what the file says, px."""

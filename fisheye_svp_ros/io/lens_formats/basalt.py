@@ -9,21 +9,19 @@ from typing import Any
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_json
-from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
-from fisheye_svp_ros.io.lens_formats.distortion import OPENCV, Distortion, brown, nearest_lens
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
 # Coefficients of each model, and what they make
-_MODELS: dict[str, tuple[tuple[str, ...], Callable[..., Distortion]]] = {
-    'kb4': (('k1', 'k2', 'k3', 'k4'), lambda *k: Distortion(radial.EQUIDISTANT, k)),
-    'ds': (('xi', 'alpha'), lambda *of: Distortion(radial.double_sphere(*of))),
-    'eucm': (('alpha', 'beta'), lambda *of: Distortion(radial.unified_heights(*of))),
-    'ucm': (('alpha',), lambda alpha: Distortion(radial.unified_heights(alpha, 1.0))),
-    'fov': (('w',), lambda omega: Distortion(radial.field_of_view_model(omega))),
-    'pinhole': ((), lambda: Distortion(radial.PERSPECTIVE)),
-    'pinhole-radtan8': (OPENCV, lambda *d: brown(
-        radial.PERSPECTIVE, dict(zip(OPENCV, d, strict=True)))),
+_MODELS: dict[str, tuple[tuple[str, ...], Callable[..., models.Distortion]]] = {
+    'kb4': (('k1', 'k2', 'k3', 'k4'), lambda *k: models.Distortion(models.EQUIDISTANT, k)),
+    'ds': (('xi', 'alpha'), lambda *of: models.Distortion(models.double_sphere(*of))),
+    'eucm': (('alpha', 'beta'), lambda *of: models.Distortion(models.unified_heights(*of))),
+    'ucm': (('alpha',), lambda alpha: models.Distortion(models.unified_heights(alpha, 1.0))),
+    'fov': (('w',), lambda omega: models.Distortion(models.field_of_view_model(omega))),
+    'pinhole': ((), lambda: models.Distortion(models.PERSPECTIVE)),
+    'pinhole-radtan8': (models.OPENCV, lambda *d: models.opencv_distortion(d)),
 }
 _NAMES = ('px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw')
 
@@ -43,12 +41,10 @@ def read(text: str, where: str) -> Foreign:
     if not isinstance(sizes, list) or len(sizes) != len(cameras):
         raise LensError(f'{where}: resolution is {sizes!r}; a list of width and height of each of '
                         f'the {len(cameras)} cameras of intrinsics is needed')
-    lenses, worst = {}, {}
-    for i, (camera, size) in enumerate(zip(cameras, sizes, strict=True)):
-        lens, off = _lens(f'cam{i}', camera, size, f'{where}: camera {i}')
-        lenses[f'cam{i}'], worst[f'cam{i}'] = lens, off
+    found = {f'cam{i}': _lens(f'cam{i}', camera, size, f'{where}: camera {i}')
+             for i, (camera, size) in enumerate(zip(cameras, sizes, strict=True))}
     rigs = _rigs(fields.sections({'T_imu_cam': [], **document}, 'T_imu_cam', where), where)
-    return Foreign('Basalt', lenses, rigs, worst)
+    return Foreign.of('Basalt', found, rigs)
 
 
 def _lens(name: str, camera: Mapping[str, Any], size: Any, where: str) -> tuple[Lens, float]:
@@ -60,7 +56,7 @@ def _lens(name: str, camera: Mapping[str, Any], size: Any, where: str) -> tuple[
     given = fields.section(camera, 'intrinsics', where)
     pinhole = fields.values(given, ('fx', 'fy', 'cx', 'cy'), where)
     size = fields.numbers({'resolution': size}, 'resolution', 2, where)
-    return nearest_lens(
+    return models.nearest_lens(
         name, size, pinhole, distortion(*fields.values(given, names, where)), where)
 
 
@@ -74,9 +70,9 @@ def _rigs(entries: Sequence[Mapping[str, Any]], where: str) -> tuple[Pose, ...]:
 
 def write(lens: Lens) -> str:
     """Return the lens in this form, as the one camera of its rig."""
-    near = radial.nearest_kannala_brandt(lens)
+    near = models.nearest_kannala_brandt(lens)
     values = {'fx': near.fx, 'fy': near.fy, 'cx': near.cx, 'cy': near.cy}
-    values |= {f'k{i}': k for i, k in enumerate(radial.coefficients(near), start=1)}
+    values |= {f'k{i}': k for i, k in enumerate(models.coefficients(near), start=1)}
     return json.dumps({'value0': {
         'T_imu_cam': [dict(zip(_NAMES, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), strict=True))],
         'intrinsics': [{'camera_type': 'kb4', 'intrinsics': values}],

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_yaml
-from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
-from fisheye_svp_ros.io.lens_formats.distortion import Distortion, nearest_lens
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 
 
 def recognises(text: str) -> bool:
@@ -25,6 +24,6 @@ def read(text: str, where: str) -> Foreign:
     listed, place = distortion.get('radial'), f'{where}: radial_tangential'
     k = fields.numbers(distortion, 'radial', len(listed) if isinstance(listed, list) else 2, place)
     tangential = fields.values({'t1': 0.0, 't2': 0.0, **distortion}, ('t1', 't2'), place)
-    bent = Distortion(radial.omnidirectional(offset), k, (), tangential)
-    lens, worst = nearest_lens('camera', size, intrinsics, bent, where)
-    return Foreign('BoofCV', {'camera': lens}, (), {'camera': worst})
+    bent = models.Distortion(models.omnidirectional(offset), k, (), tangential)
+    return Foreign.of('BoofCV', {
+        'camera': models.nearest_lens('camera', size, intrinsics, bent, where)})

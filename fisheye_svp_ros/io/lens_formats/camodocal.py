@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
-from fisheye_svp_ros.io.lens_formats.distortion import Distortion, brown, nearest_lens
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 
 INTRINSICS = {'KANNALA_BRANDT': ('mu', 'mv', 'u0', 'v0'), 'MEI': ('gamma1', 'gamma2', 'u0', 'v0'),
           'PINHOLE': ('fx', 'fy', 'cx', 'cy')}
@@ -35,16 +34,15 @@ def read(text: str, where: str) -> Foreign:
 
     intrinsics = values('projection_parameters', INTRINSICS[model])
     if model == 'KANNALA_BRANDT':
-        distortion = Distortion(
-            radial.EQUIDISTANT, values('projection_parameters', ('k2', 'k3', 'k4', 'k5')))
+        distortion = models.Distortion(
+            models.EQUIDISTANT, values('projection_parameters', ('k2', 'k3', 'k4', 'k5')))
     else:
-        base = radial.PERSPECTIVE
+        base = models.PERSPECTIVE
         if model == 'MEI':
-            base = radial.omnidirectional(*values('mirror_parameters', ('xi',)))
-        names = ('k1', 'k2', 'p1', 'p2')
-        distortion = brown(base, dict(zip(
-            names, values('distortion_parameters', names), strict=True)))
+            base = models.omnidirectional(*values('mirror_parameters', ('xi',)))
+        distortion = models.opencv_distortion(
+            values('distortion_parameters', ('k1', 'k2', 'p1', 'p2')), base)
     size = fields.values(document, ('image_width', 'image_height'), where)
     name = str(document.get('camera_name', 'camera'))
-    lens, worst = nearest_lens(name, size, intrinsics, distortion, where)
-    return Foreign('CamOdoCal', {name: lens}, (), {name: worst})
+    return Foreign.of('CamOdoCal', {
+        name: models.nearest_lens(name, size, intrinsics, distortion, where)})

@@ -9,8 +9,7 @@ import re
 from collections.abc import Callable, Sequence
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.lens_formats import Foreign, radial
-from fisheye_svp_ros.io.lens_formats.distortion import Distortion, brown, nearest_lens
+from fisheye_svp_ros.io.lens_formats import Foreign, models
 from fisheye_svp_ros.optics.lens import Lens
 
 Values = dict[str, float]
@@ -19,26 +18,26 @@ _CORNER = 0.5  # px, of our first pixel's center from the corner where COLMAP's 
 _ROW = re.compile(r'(\d+)[ ,\t]+([A-Z][A-Z\d_]+)[ ,\t]+(.+)')
 
 
-def _fisheye(values: Values) -> Distortion:
+def _fisheye(values: Values) -> models.Distortion:
     k = [values.get(f'k{i}', 0.0) for i in range(1, 5)]
-    return Distortion(radial.EQUIDISTANT, k, (), (values.get('p1', 0.0), values.get('p2', 0.0)),
-                      prism=((values.get('sx1', 0.0),), (values.get('sy1', 0.0),)))
+    p1, p2, sx1, sy1 = (values.get(name, 0.0) for name in ('p1', 'p2', 'sx1', 'sy1'))
+    return models.Distortion(models.EQUIDISTANT, k, (), (p1, p2), prism=((sx1,), (sy1,)))
 
 
-def fisheye624(values: Values) -> Distortion:
+def fisheye624(values: Values) -> models.Distortion:
     """Return the distortion of six radial, two tangential and four thin prism coefficients."""
     k, s = ([values[f'{name}{i}'] for i in range(count)] for name, count in (('k', 6), ('s', 4)))
     # Its p0 belongs to u, as OpenCV's p2 does.
-    return Distortion(radial.EQUIDISTANT, k, (), (values['p1'], values['p0']),
+    return models.Distortion(models.EQUIDISTANT, k, (), (values['p1'], values['p0']),
                       prism=(s[:2], s[2:]), late=True)
 
 
-def _brown(values: Values) -> Distortion:
-    return brown(radial.PERSPECTIVE, values)
+def _brown(values: Values) -> models.Distortion:
+    return models.brown(models.PERSPECTIVE, values)
 
 
 # Parameters in their order, and what they distort
-_MODELS: dict[str, tuple[str, Callable[[Values], Distortion]]] = {
+_MODELS: dict[str, tuple[str, Callable[[Values], models.Distortion]]] = {
     'OPENCV_FISHEYE': ('fx fy cx cy k1 k2 k3 k4', _fisheye),
     'SIMPLE_RADIAL_FISHEYE': ('f cx cy k1', _fisheye),
     'RADIAL_FISHEYE': ('f cx cy k1 k2', _fisheye),
@@ -47,17 +46,18 @@ _MODELS: dict[str, tuple[str, Callable[[Values], Distortion]]] = {
     'THIN_PRISM_FISHEYE': ('fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1', _fisheye),
     'RAD_TAN_THIN_PRISM_FISHEYE': (
         'fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3', fisheye624),
-    'FOV': ('fx fy cx cy omega', lambda v: Distortion(radial.field_of_view_model(v['omega']))),
+    'FOV': ('fx fy cx cy omega',
+            lambda v: models.Distortion(models.field_of_view_model(v['omega']))),
     'EUCM': ('fx fy cx cy alpha beta',
-             lambda v: Distortion(radial.unified_heights(v['alpha'], v['beta']))),
+             lambda v: models.Distortion(models.unified_heights(v['alpha'], v['beta']))),
     'SIMPLE_PINHOLE': ('f cx cy', _brown),
     'PINHOLE': ('fx fy cx cy', _brown),
     'SIMPLE_RADIAL': ('f cx cy k1', _brown),
     'RADIAL': ('f cx cy k1 k2', _brown),
     'OPENCV': ('fx fy cx cy k1 k2 p1 p2', _brown),
     'FULL_OPENCV': ('fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6', _brown),
-    'SIMPLE_DIVISION': ('f cx cy k', lambda v: Distortion(radial.division(v['k']))),
-    'DIVISION': ('fx fy cx cy k', lambda v: Distortion(radial.division(v['k']))),
+    'SIMPLE_DIVISION': ('f cx cy k', lambda v: models.Distortion(models.division(v['k']))),
+    'DIVISION': ('fx fy cx cy k', lambda v: models.Distortion(models.division(v['k']))),
 }
 
 
@@ -75,7 +75,7 @@ def _lines(text: str) -> list[str]:
 
 def read(text: str, where: str) -> Foreign:
     """Read all cameras, by their ids; raises LensError, naming camera and model."""
-    lenses, worst = {}, {}
+    found = {}
     for row in filter(None, map(_ROW.fullmatch, _lines(text))):
         camera, model, rest = row.groups()
         place = f'{where}: camera {camera}'
@@ -84,9 +84,8 @@ def read(text: str, where: str) -> Foreign:
         except ValueError as cause:
             raise LensError(f'{place}: width, height and the parameters of {model} must be '
                             f'numbers ({cause})') from cause
-        lenses[camera], worst[camera] = _lens(
-            f'camera{camera}', model, (width, height), values, place)
-    return Foreign('COLMAP', lenses, (), worst)
+        found[camera] = _lens(f'camera{camera}', model, (width, height), values, place)
+    return Foreign.of('COLMAP', found)
 
 
 def _lens(
@@ -102,13 +101,13 @@ def _lens(
     values = dict(zip(names, given, strict=True))
     focal = values.get('fx', values.get('f', 0.0)), values.get('fy', values.get('f', 0.0))
     middle = values['cx'] - _CORNER, values['cy'] - _CORNER
-    return nearest_lens(name, size, (*focal, *middle), distortion(values), where)
+    return models.nearest_lens(name, size, (*focal, *middle), distortion(values), where)
 
 
 def write(lens: Lens) -> str:
     """Return the lens in this form, as its first camera."""
-    near = radial.nearest_kannala_brandt(lens)
-    values = (near.fx, near.fy, near.cx + _CORNER, near.cy + _CORNER, *radial.coefficients(near))
+    near = models.nearest_kannala_brandt(lens)
+    values = (near.fx, near.fy, near.cx + _CORNER, near.cy + _CORNER, *models.coefficients(near))
     return ('# Camera list with one line of data per camera:\n'
             '#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n'
             f'1 OPENCV_FISHEYE {near.width} {near.height} {" ".join(map(repr, values))}\n')

@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
-from fisheye_svp_ros.io.lens_formats.distortion import OPENCV, Distortion, brown, nearest_lens
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 
 # Kimera's has camera_id in place of sensor_type.
 _OF_CAMERA = re.compile(r'^(sensor_type: *camera|camera_id:)', re.MULTILINE)
@@ -27,14 +26,13 @@ def read(text: str, where: str) -> Foreign:
     name = 'distortion_coefficients'
     if kind == 'equidistant':
         k = fields.coefficients(document, name, (4,), where)
-        distortion = Distortion(radial.EQUIDISTANT, k)
+        distortion = models.Distortion(models.EQUIDISTANT, k)
     elif kind in (*_RADIAL_TANGENTIAL, 'none'):
         d = fields.coefficients(document, name, (4, 5), where) if kind != 'none' else ()
-        distortion = brown(radial.PERSPECTIVE, dict(zip(OPENCV, d, strict=False)))
+        distortion = models.opencv_distortion(d)
     else:
         raise LensError(f'{where}: distortion_model is {kind!r}; equidistant and '
                         'radial-tangential can be read')
-    lens, worst = nearest_lens(
+    return Foreign.of('EuRoC', {'camera': models.nearest_lens(
         'camera', fields.numbers(document, 'resolution', 2, where),
-        fields.numbers(document, 'intrinsics', 4, where), distortion, where)
-    return Foreign('EuRoC', {'camera': lens}, (), {'camera': worst})
+        fields.numbers(document, 'intrinsics', 4, where), distortion, where)})

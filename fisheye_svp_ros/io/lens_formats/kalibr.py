@@ -9,8 +9,7 @@ import numpy as np
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import dump_yaml
-from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
-from fisheye_svp_ros.io.lens_formats.distortion import OPENCV, Distortion, brown, nearest_lens
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
@@ -29,17 +28,17 @@ def read(text: str, where: str) -> Foreign:
     # YAML libraries write cam10 before cam2.
     names = sorted((name for name in map(str, document) if name.startswith('cam')),
                    key=lambda name: (len(name), name))
-    lenses, worst = {}, {}
+    found = {}
     rigs: list[Pose] = []
     for number, name in enumerate(names):
         camera = fields.section(document, name, where)
-        lenses[name], worst[name] = _lens(name, camera, f'{where}: {name}')
+        found[name] = _lens(name, camera, f'{where}: {name}')
         if number and 'T_cn_cnm1' in camera:
             if len(rigs) < number - 1:
                 raise LensError(f'{where}: {names[len(rigs) + 1]} has no T_cn_cnm1, and {name} '
                                 'after it has one; the chain is broken')
             rigs.append(_rig(camera['T_cn_cnm1'], f'{where}: {name}'))
-    return Foreign('Kalibr', lenses, tuple(rigs), worst)
+    return Foreign.of('Kalibr', found, rigs)
 
 
 def _lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float]:
@@ -49,27 +48,27 @@ def _lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float
     *own, fx, fy, cx, cy = fields.numbers(camera, 'intrinsics', _INTRINSICS[model], where)
     size = fields.numbers(camera, 'resolution', 2, where)
     distortion = _distortion(camera, model, own, where)
-    return nearest_lens(name, size, (fx, fy, cx, cy), distortion, where)
+    return models.nearest_lens(name, size, (fx, fy, cx, cy), distortion, where)
 
 
 def _distortion(
     camera: Mapping[str, Any], model: str, own: Sequence[float], where: str
-) -> Distortion:
+) -> models.Distortion:
     """Return what the image is distorted by; own: numbers of the model beside the intrinsics."""
     kind = str(camera.get('distortion_model', 'none'))
     d = fields.coefficients(camera, 'distortion_coeffs', (_COEFFICIENTS[kind],), where) if (
         _COEFFICIENTS.get(kind)) else []
     match model, kind:
         case 'pinhole', 'equidistant':
-            return Distortion(radial.EQUIDISTANT, d)
+            return models.Distortion(models.EQUIDISTANT, d)
         case 'pinhole', 'fov':
-            return Distortion(radial.field_of_view_model(*d))
+            return models.Distortion(models.field_of_view_model(*d))
         case 'pinhole' | 'omni', 'radtan' | 'none':
-            base = radial.omnidirectional(*own) if own else radial.PERSPECTIVE
-            return brown(base, dict(zip(OPENCV, d, strict=False)))
+            return models.opencv_distortion(
+                d, models.omnidirectional(*own) if own else models.PERSPECTIVE)
         case 'ds' | 'eucm', 'radtan' | 'none' if not any(d):
-            heights = radial.double_sphere if model == 'ds' else radial.unified_heights
-            return Distortion(heights(*own))
+            heights = models.double_sphere if model == 'ds' else models.unified_heights
+            return models.Distortion(heights(*own))
     raise LensError(f'{where}: {model} with {kind} is not a form that can be read; those are '
                     'pinhole with equidistant, fov, radtan or none, omni with radtan or none, ds '
                     'and eucm')
@@ -91,12 +90,12 @@ def write(lens: Lens) -> str:
 def write_chain(lenses: Sequence[Lens], rigs: Sequence[Pose]) -> str:
     """Return lenses and each camera in the next one in this form; viewpoint shifts stay behind."""
     document: dict[str, Any] = {}
-    for number, near in enumerate(map(radial.nearest_kannala_brandt, lenses)):
+    for number, near in enumerate(map(models.nearest_kannala_brandt, lenses)):
         document[f'cam{number}'] = {
             'camera_model': 'pinhole',
             'intrinsics': [near.fx, near.fy, near.cx, near.cy],
             'distortion_model': 'equidistant',
-            'distortion_coeffs': radial.coefficients(near),
+            'distortion_coeffs': models.coefficients(near),
             'resolution': [near.width, near.height],
             'rostopic': f'/{near.name}/image_raw',
         }

@@ -10,13 +10,12 @@ import re
 from xml.etree.ElementTree import Element
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
-from fisheye_svp_ros.io.lens_formats.distortion import Distortion, nearest_lens
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 
 _MARKS = re.compile(r'<calibration[ >].*<(projection|resolution)[ >]', re.DOTALL)
-_BASES = {'frame': radial.PERSPECTIVE, 'fisheye': radial.EQUIDISTANT,
-          'equidistant_fisheye': radial.EQUIDISTANT, 'equisolid_fisheye': radial.EQUISOLID}
+_BASES = {'frame': models.PERSPECTIVE, 'fisheye': models.EQUIDISTANT,
+          'equidistant_fisheye': models.EQUIDISTANT, 'equisolid_fisheye': models.EQUISOLID}
 _NAMES = ('f', 'cx', 'cy', 'b1', 'b2', 'k1', 'k2', 'k3', 'k4', 'p1', 'p2', 'p3', 'p4')
 
 
@@ -33,10 +32,9 @@ def read(text: str, where: str) -> Foreign:
     if not found:
         raise LensError(f'{where}: no adjusted calibration in it; align the photographs first')
     names = ['camera'] if len(found) == 1 else [f'sensor{i}' for i in range(len(found))]
-    read_ones = {name: _lens(name, one, f'{where}: {name}' if len(found) > 1 else where)
-                 for name, one in zip(names, found, strict=True)}
-    return Foreign('Metashape', {name: lens for name, (lens, _) in read_ones.items()}, (),
-                   {name: worst for name, (_, worst) in read_ones.items()})
+    return Foreign.of('Metashape', {
+        name: _lens(name, one, f'{where}: {name}' if len(found) > 1 else where)
+        for name, one in zip(names, found, strict=True)})
 
 
 def _lens(name: str, calibration: Element, where: str) -> tuple[Lens, float]:
@@ -56,8 +54,8 @@ def _lens(name: str, calibration: Element, where: str) -> tuple[Lens, float]:
             raise LensError(f'{where}: {tag} is {words.get(tag)!r}; a number is needed') from cause
     width, height = values['width'], values['height']
     f, b1, b2 = values['f'], values['b1'], values['b2']
-    distortion = Distortion(
+    distortion = models.Distortion(
         _BASES[projection], [values[f'k{i}'] for i in range(1, 5)], (),
         (values['p2'], values['p1']), (values['p3'], values['p4']))
     middle = width / 2 + values['cx'] - 0.5, height / 2 + values['cy'] - 0.5
-    return nearest_lens(name, (width, height), (f + b1, f, *middle, b2), distortion, where)
+    return models.nearest_lens(name, (width, height), (f + b1, f, *middle, b2), distortion, where)

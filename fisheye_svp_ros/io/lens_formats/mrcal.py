@@ -16,8 +16,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.lens_formats import Foreign, mrcal_splined, radial
-from fisheye_svp_ros.io.lens_formats.distortion import OPENCV, brown, nearest_lens
+from fisheye_svp_ros.io.lens_formats import Foreign, models, mrcal_splined
 from fisheye_svp_ros.optics.curves import Gennery, Stereographic
 from fisheye_svp_ros.optics.lens import Lens
 
@@ -60,9 +59,8 @@ def read(text: str, where: str) -> Foreign:
         lens = mrcal_splined.read(model, values, size, where)
         return Foreign('mrcal', {'camera': lens}, (), {})
     if model in _PERSPECTIVE:
-        distortion = brown(radial.PERSPECTIVE, dict(zip(OPENCV, values[4:], strict=False)))
-        lens, worst = nearest_lens('camera', size, values[:4], distortion, where)
-        return Foreign('mrcal', {'camera': lens}, (), {'camera': worst})
+        return Foreign.of('mrcal', {'camera': models.nearest_lens(
+            'camera', size, values[:4], models.opencv_distortion(values[4:]), where)})
     if match is None:
         raise LensError(f'{where}: lensmodel is {model}; CAHVORE with its linearity, '
                         'STEREOGRAPHIC, SPLINED_STEREOGRAPHIC, PINHOLE and OPENCV4 to 8 can be '
@@ -78,8 +76,8 @@ def read(text: str, where: str) -> Foreign:
 
     shift = Gennery(0.0, *values[9:12]) if any(values[9:12]) else None
     limit = np.pi / 2 / abs(linearity) * (1 - 1e-3) if abs(linearity) > 0.5 else np.pi * 0.999
-    lens, worst = radial.fit_curve('camera', size, values[:4], curve, limit, where, shift)
-    return Foreign('mrcal', {'camera': lens}, (), {'camera': worst})
+    return Foreign.of('mrcal', {
+        'camera': models.fit_curve('camera', size, values[:4], curve, limit, where, shift)})
 
 
 def _chi(theta: Array, linearity: float) -> Array:
@@ -91,7 +89,7 @@ def _chi(theta: Array, linearity: float) -> Array:
 
 def _read_stereographic(size: list[int], values: list[float], where: str) -> Foreign:
     value = Stereographic().value_and_slope
-    lens, _ = radial.fit_curve(
+    lens, _ = models.fit_curve(
         'camera', size, values, lambda theta: value(theta)[0], np.pi * 0.9, where)
     lens = replace(lens, fx=values[0], fy=values[1], image_height=Stereographic())
     return Foreign('mrcal', {'camera': lens}, (), {})

@@ -11,8 +11,7 @@ from typing import Any
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_json
-from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
-from fisheye_svp_ros.io.lens_formats.distortion import Distortion, brown, nearest_lens
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 
 _CORNER = 0.5  # px, of our first pixel's center from the corner where the image begins
@@ -39,8 +38,7 @@ def read(text: str, where: str) -> Foreign:
     else:
         found = {f'camera{i}': _lens(f'camera{i}', one, f'{where}: camera{i}')
                  for i, one in enumerate(different, start=1)}
-    return Foreign('nerfstudio', {name: lens for name, (lens, _) in found.items()}, (),
-                   {name: worst for name, (_, worst) in found.items()})
+    return Foreign.of('nerfstudio', found)
 
 
 def _lens(name: str, given: Mapping[str, Any], where: str) -> tuple[Lens, float]:
@@ -54,18 +52,18 @@ def _lens(name: str, given: Mapping[str, Any], where: str) -> tuple[Lens, float]
     names = tuple(key for key in _NAMES if key in given)
     values = dict(zip(names, fields.values(given, names, where), strict=True))
     if model == _FISHEYE:
-        distortion = Distortion(
-            radial.EQUIDISTANT, [values.get(key, 0.0) for key in _NAMES[:4]])
+        distortion = models.Distortion(
+            models.EQUIDISTANT, [values.get(key, 0.0) for key in _NAMES[:4]])
     else:
-        distortion = brown(radial.PERSPECTIVE, values)
-    return nearest_lens(name, size, (fx, fy, cx - _CORNER, cy - _CORNER), distortion, where)
+        distortion = models.brown(models.PERSPECTIVE, values)
+    return models.nearest_lens(name, size, (fx, fy, cx - _CORNER, cy - _CORNER), distortion, where)
 
 
 def write(lens: Lens) -> str:
     """Return the lens in this form, without frames."""
-    near = radial.nearest_kannala_brandt(lens)
+    near = models.nearest_kannala_brandt(lens)
     return json.dumps({
         'camera_model': _FISHEYE, 'w': near.width, 'h': near.height,
         'fl_x': near.fx, 'fl_y': near.fy, 'cx': near.cx + _CORNER, 'cy': near.cy + _CORNER,
-        **dict(zip(_NAMES, radial.coefficients(near), strict=False)), 'frames': [],
+        **dict(zip(_NAMES, models.coefficients(near), strict=False)), 'frames': [],
     }, indent=4) + '\n'

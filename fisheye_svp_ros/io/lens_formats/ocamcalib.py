@@ -13,10 +13,8 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.lens_formats import Foreign
-from fisheye_svp_ros.io.lens_formats.distortion import Distortion, nearest_lens
+from fisheye_svp_ros.io.lens_formats import Foreign, models
 from fisheye_svp_ros.io.lens_formats.fields import MAX_NUMBER
-from fisheye_svp_ros.io.lens_formats.radial import Base
 
 _NUMBERS = re.compile(r'^[-+.\deE\s]+$')
 _LINES = ('direct polynomial', 'inverse polynomial', 'center', 'affine c, d, e', 'image size')
@@ -51,13 +49,12 @@ def read(text: str, where: str) -> Foreign:
     focal = float(-direct[1])
     farthest = 2 * float(np.hypot(max(row, height - row), max(column, width - column)))
     base = _heights(direct[1:], farthest)
-    lens, worst = nearest_lens(
+    return Foreign.of('OCamCalib', {'camera': models.nearest_lens(
         'camera', (width, height), (focal * fx, focal * fy, column, row, focal * skew),
-        Distortion(base), where)
-    return Foreign('OCamCalib', {'camera': lens}, (), {'camera': worst})
+        models.Distortion(base), where)})
 
 
-def _heights(direct: Array, farthest: float) -> Base:
+def _heights(direct: Array, farthest: float) -> models.Base:
     """Return image heights, in units of the focal length, up to `farthest`, px."""
     rho = np.linspace(0.0, farthest, _SAMPLES)
     theta = np.arctan2(rho, -np.polynomial.polynomial.polyval(rho, direct))
@@ -74,4 +71,4 @@ def _heights(direct: Array, farthest: float) -> Base:
             found = found - (found * cos + value * sin) / (cos + slope * sin)
         return np.asarray(found / -direct[0])
 
-    return Base(height, float(theta[-1]))
+    return models.Base(height, float(theta[-1]))

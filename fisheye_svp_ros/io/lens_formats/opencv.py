@@ -15,14 +15,7 @@ import numpy as np
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_json
-from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
-from fisheye_svp_ros.io.lens_formats.distortion import (
-    OPENCV,
-    Distortion,
-    brown,
-    nearest_lens,
-    skew_of,
-)
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
@@ -68,7 +61,7 @@ def read(text: str, where: str) -> Foreign:
     def lens(name: str, matrix: tuple[str, ...], named: tuple[str, ...]) -> tuple[Lens, float]:
         k = _matrix(value(matrix), ((3, 3),), where)
         distortion = _distortion(_matrix(value(named), _COUNTS, where), document, where)
-        return nearest_lens(name, size, (k[0], k[4], k[2], k[5], k[1]), distortion, where)
+        return models.nearest_lens(name, size, (k[0], k[4], k[2], k[5], k[1]), distortion, where)
 
     pair = {'camera': lens('camera', _MATRIX, _COEFFICIENTS)}
     if any(name in document for name in _RIGHT_KEYS[0]):
@@ -78,23 +71,22 @@ def read(text: str, where: str) -> Foreign:
         turn = np.reshape(_matrix(value(('R',)), ((3, 3),), where), (3, 3))
         place = _matrix(value(('T',)), ((3, 1), (1, 3)), where)
         rigs = (fields.pose(place, turn, f'{where}: R, T'),)
-    return Foreign('OpenCV', {name: one for name, (one, _) in pair.items()}, rigs,
-                   {name: worst for name, (_, worst) in pair.items()})
+    return Foreign.of('OpenCV', pair, rigs)
 
 
-def _distortion(d: Sequence[float], document: Mapping[str, Any], where: str) -> Distortion:
+def _distortion(d: Sequence[float], document: Mapping[str, Any], where: str) -> models.Distortion:
     """Four coefficients are those of cv2.fisheye, with xi of cv2.omnidir; more, of a pinhole."""
     if _XI in document:
         given = document[_XI]
         xi = _matrix(given, ((1, 1),), where)[0] if isinstance(given, dict) else (
             fields.values(document, (_XI,), where)[0])
-        return brown(radial.omnidirectional(xi), dict(zip(OPENCV, d, strict=False)))
+        return models.opencv_distortion(d, models.omnidirectional(xi))
     if len(d) == _OF_FISHEYE and document.get(_IS_FISHEYE, 1):
-        return Distortion(radial.EQUIDISTANT, d)
-    if any(d[len(OPENCV):]):
+        return models.Distortion(models.EQUIDISTANT, d)
+    if any(d[len(models.OPENCV):]):
         raise LensError(f'{where}: {len(d)} coefficients, with a thin prism or a tilt; the four '
                         'of cv2.fisheye, or five or eight of cv2.calibrateCamera can be read')
-    return brown(radial.PERSPECTIVE, dict(zip(OPENCV, d, strict=False)))
+    return models.opencv_distortion(d)
 
 
 def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[float]:
@@ -127,12 +119,11 @@ def write(lens: Lens) -> str:
     """Return the lens in this form, YAML."""
     import cv2  # takes a while, and other formats do without
 
-    near = radial.nearest_kannala_brandt(lens)
+    near = models.nearest_kannala_brandt(lens)
     storage = cv2.FileStorage('.yml', cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write('image_width', near.width)
     storage.write('image_height', near.height)
-    storage.write('camera_matrix', np.array(
-        [[near.fx, skew_of(near), near.cx], [0, near.fy, near.cy], [0, 0, 1]]))
-    storage.write('distortion_coefficients', np.array([radial.coefficients(near)]))
+    storage.write('camera_matrix', models.camera_matrix(near))
+    storage.write('distortion_coefficients', np.array([models.coefficients(near)]))
     text: str = storage.releaseAndGetString()
     return text

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
-from fisheye_svp_ros.io.lens_formats.distortion import OPENCV, Distortion, brown, nearest_lens
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
@@ -33,13 +32,12 @@ def read(text: str, where: str) -> Foreign:
     prefixes = {camera: next((p for p in known if f'{p}fx' in document), '')
                 for camera, known in _CAMERAS.items()}
     if not prefixes['right']:
-        lens, worst = _lens('camera', prefixes['left'], document, where)
-        return Foreign('ORB-SLAM3', {'camera': lens}, (), {'camera': worst})
+        return Foreign.of(
+            'ORB-SLAM3', {'camera': _lens('camera', prefixes['left'], document, where)})
     found = {camera: _lens(camera, prefix, document, f'{where}: {prefix.rstrip(".")}')
              for camera, prefix in prefixes.items()}
     rigs = tuple(_rig(document[name], f'{where}: {name}') for name in _STEREO if name in document)
-    return Foreign('ORB-SLAM3', {camera: lens for camera, (lens, _) in found.items()}, rigs[:1],
-                   {camera: worst for camera, (_, worst) in found.items()})
+    return Foreign.of('ORB-SLAM3', found, rigs[:1])
 
 
 def _lens(
@@ -52,14 +50,15 @@ def _lens(
     size = fields.values(document, ('Camera.width', 'Camera.height'), where)
     intrinsics = values('fx', 'fy', 'cx', 'cy')
     if kind == 'KannalaBrandt8':
-        distortion = Distortion(radial.EQUIDISTANT, values('k1', 'k2', 'k3', 'k4'))
+        distortion = models.Distortion(models.EQUIDISTANT, values('k1', 'k2', 'k3', 'k4'))
     elif kind == 'PinHole':
-        names = [name for name in OPENCV if f'{prefix}{name}' in document]
-        distortion = brown(radial.PERSPECTIVE, dict(zip(names, values(*names), strict=True)))
+        names = [name for name in models.OPENCV if f'{prefix}{name}' in document]
+        distortion = models.brown(
+            models.PERSPECTIVE, dict(zip(names, values(*names), strict=True)))
     else:
         raise LensError(f'{where}: Camera.type is {kind!r}; KannalaBrandt8 and PinHole can be '
                         'read')
-    return nearest_lens(name, size, intrinsics, distortion, where)
+    return models.nearest_lens(name, size, intrinsics, distortion, where)
 
 
 def _rig(matrix: Any, where: str) -> Pose:

@@ -18,14 +18,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError, ObservationError
 from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
-from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
-from fisheye_svp_ros.io.lens_formats.distortion import (
-    OPENCV,
-    Distortion,
-    brown,
-    nearest_lens,
-    skew_of,
-)
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 
 # How many coefficients each distortion model of sensor_msgs/distortion_models has
@@ -65,8 +58,8 @@ def read(text: str, where: str) -> Foreign:
         raise LensError(f'{where}: not a whole camera_info; {cause.args[0]} is missing') from cause
     except (TypeError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
-    lens, worst = _fit_lens(model, size, (k[0], k[4], k[2], k[5], k[1]), tuple(d), name, where)
-    return Foreign('ROS', {name: lens}, (), {name: worst} if worst else {})
+    return Foreign.of('ROS', {
+        name: _fit_lens(model, size, (k[0], k[4], k[2], k[5], k[1]), tuple(d), name, where)})
 
 
 def _read_message(text: str, where: str) -> Foreign:
@@ -81,8 +74,7 @@ def _read_message(text: str, where: str) -> Foreign:
         raise LensError(str(cause)) from cause
     except (LookupError, TypeError, ValueError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
-    lens, worst = _fit_lens(*model, name, where)
-    return Foreign('ROS', {name: lens}, (), {name: worst} if worst else {})
+    return Foreign.of('ROS', {name: _fit_lens(*model, name, where)})
 
 
 @lru_cache(maxsize=64)
@@ -122,7 +114,8 @@ def _nearest_lens(
     if model in _EQUIDISTANT:
         if len(d) < 4 or any(d[4:]):
             raise LensError(f'{where}: {model} has {len(d)} coefficients; k1 to k4 are needed')
-        return nearest_lens(name, size, intrinsics, Distortion(radial.EQUIDISTANT, d[:4]), where)
+        distortion = models.Distortion(models.EQUIDISTANT, d[:4])
+        return models.nearest_lens(name, size, intrinsics, distortion, where)
     if model not in _PERSPECTIVE:
         raise LensError(f'{where}: distortion_model is {model!r}; known are '
                         f'{", ".join((*_EQUIDISTANT, *_PERSPECTIVE))}')
@@ -130,16 +123,15 @@ def _nearest_lens(
     # rational_polynomial may carry coefficients of a thin prism and a tilt as well.
     if len(d) not in counts and any(d[counts[-1]:] or d):
         raise LensError(f'{where}: {model} has {len(d)} coefficients; {counts[-1]} are needed')
-    distortion = brown(radial.PERSPECTIVE, dict(zip(OPENCV, d, strict=False)))
-    return nearest_lens(name, size, intrinsics, distortion, where)
+    return models.nearest_lens(name, size, intrinsics, models.opencv_distortion(d), where)
 
 
 def write(lens: Lens) -> str:
     """Return the lens in this form."""
-    near = radial.nearest_kannala_brandt(lens)
-    k = np.array([[near.fx, skew_of(near), near.cx], [0.0, near.fy, near.cy], [0.0, 0.0, 1.0]])
+    near = models.nearest_kannala_brandt(lens)
+    k = models.camera_matrix(near)
     return camera_info_text(near.name, (near.width, near.height), k, 'equidistant',
-                            radial.coefficients(near), np.column_stack([k, np.zeros(3)]))
+                            models.coefficients(near), np.column_stack([k, np.zeros(3)]))
 
 
 def camera_info_text(

@@ -1,0 +1,296 @@
+"""Images as other tools model them, and the Kannala-Brandt lens nearest to one.
+
+A base height g(theta) (tan theta, theta, Mei's, ...) is stretched by polynomials of its square and
+moved sideways: Brown and Conrady's p1, p2, numbered as OpenCV does, and thin prisms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.base import Effect, Scene
+from fisheye_svp_ros.effects.forward import project
+from fisheye_svp_ros.effects.image_effects import DecenteringEffect, SensorTiltEffect, SkewEffect
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.lens_formats.fields import MAX_NUMBER
+from fisheye_svp_ros.optics.curve_base import ViewpointShift
+from fisheye_svp_ros.optics.curves import KannalaBrandt
+from fisheye_svp_ros.optics.lens import Lens, field_of_view
+from fisheye_svp_ros.pose import identity
+from fisheye_svp_ros.scene.observations import views_of
+
+Curve = Callable[[Array], Array]  # image height for unit focal length, of the incidence angle
+
+OPENCV = ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6')  # in its order
+RADIAL_TERMS = 4  # radial coefficients that Kannala-Brandt has
+_GRID, _STEPS = 600, 40  # angles of a curve; angles and azimuths of an image
+_ANGLE_MARGIN = 1 - 1e-3  # of the angle at which a curve ends
+_TOLERANCE = 0.01  # px, of a lens written in a form that knows fewer curves
+
+
+class Base(NamedTuple):
+    """A curve, and the incidence angle, rad, up to which it holds."""
+
+    height: Curve
+    limit: float
+
+
+def omnidirectional(xi: float) -> Base:
+    """Return Mei's heights (Mei and Rives, ICRA 2007); xi 0 is a pinhole."""
+    def height(theta: Array) -> Array:
+        return np.asarray(np.sin(theta) / (np.cos(theta) + xi))
+
+    return Base(height, float(np.arccos(-xi if xi <= 1 else -1 / xi)) * _ANGLE_MARGIN)
+
+
+def double_sphere(xi: float, alpha: float) -> Base:
+    """Return the double sphere's heights (Usenko, Demmel, Cremers, 3DV 2018)."""
+    def height(theta: Array) -> Array:
+        z = np.cos(theta) + xi
+        return np.asarray(np.sin(theta) / (alpha * np.hypot(np.sin(theta), z) + (1 - alpha) * z))
+
+    return Base(height, np.pi * _ANGLE_MARGIN)
+
+
+def unified_heights(alpha: float, beta: float) -> Base:
+    """Return the heights of the extended unified model (Khomutenko et al., RA-L 2016)."""
+    def height(theta: Array) -> Array:
+        sin, cos = np.sin(theta), np.cos(theta)
+        return np.asarray(sin / (alpha * np.sqrt(beta * sin**2 + cos**2) + (1 - alpha) * cos))
+
+    return Base(height, np.pi * _ANGLE_MARGIN)
+
+
+def field_of_view_model(omega: float) -> Base:
+    """Return the heights of the FOV model (Devernay and Faugeras, MVA 2001); omega in rad."""
+    def height(theta: Array) -> Array:
+        return np.asarray(np.arctan(2 * np.tan(theta) * np.tan(omega / 2)) / omega)
+
+    return PERSPECTIVE if not omega else Base(height, np.pi / 2 * _ANGLE_MARGIN)
+
+
+def division(k: float) -> Base:
+    """Return the heights of the division model (Fitzgibbon, CVPR 2001), of one coefficient."""
+    def height(theta: Array) -> Array:
+        slope = np.tan(theta)
+        return np.asarray(2 * slope / (1 + np.sqrt(1 - 4 * k * slope**2)))
+
+    return Base(height, np.pi / 2 * _ANGLE_MARGIN)
+
+
+EQUIDISTANT = Base(np.asarray, np.pi)
+EQUISOLID = Base(lambda theta: np.asarray(2 * np.sin(theta / 2)), np.pi * _ANGLE_MARGIN)
+PERSPECTIVE = Base(np.tan, np.pi / 2 * (1 - 1e-6))
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """A base height, and what it is distorted by; coefficients of powers of its square.
+
+    stretch, below: above and below the line of a ratio; tangential: p1, p2; growth: of these two;
+    prism: along u, along v; late: what moves sideways starts from the stretched image.
+    """
+
+    base: Base
+    stretch: Sequence[float] = ()
+    below: Sequence[float] = ()
+    tangential: Sequence[float] = (0.0, 0.0)
+    growth: Sequence[float] = ()
+    prism: tuple[Sequence[float], Sequence[float]] = ((), ())
+    late: bool = False
+
+    @property
+    def is_kannala_brandt(self) -> bool:
+        """Whether Kannala-Brandt has the same radial curve."""
+        return self.base is EQUIDISTANT and not any(self.below) and not any(
+            self.stretch[RADIAL_TERMS:])
+
+    @property
+    def sideways(self) -> bool:
+        """Whether image points move otherwise than along the radius."""
+        return any(self.tangential) or any(map(any, self.prism))
+
+    def height(self, theta: Array) -> Array:
+        """Return the image height for unit focal length, of incidence angles, rad."""
+        height = self.base.height(theta)
+        return np.asarray(height * self._stretch(height * height))
+
+    def project(self, theta: Array, azimuth: Array) -> Array:
+        """Return image points (..., 2) for unit focal length."""
+        around = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
+        stretched = self.height(theta)[..., None] * around
+        plane = stretched if self.late else self.base.height(theta)[..., None] * around
+        x, y = np.moveaxis(plane, -1, 0)
+        z, (p1, p2) = x * x + y * y, self.tangential
+        along_u, along_v = (_powers(coefficients, z) for coefficients in self.prism)
+        grown = 1 + _powers(self.growth, z)
+        return np.asarray(stretched + np.stack([
+            (2 * p1 * x * y + p2 * (z + 2 * x * x)) * grown + along_u,
+            (p1 * (z + 2 * y * y) + 2 * p2 * x * y) * grown + along_v], axis=-1))
+
+    def _stretch(self, z: Array) -> Array:
+        return np.asarray((1 + _powers(self.stretch, z)) / (1 + _powers(self.below, z)))
+
+
+def _powers(coefficients: Sequence[float], z: Array) -> Array:
+    """Return c1 z + c2 z^2 + ..."""
+    return np.asarray(sum((c * z**i for i, c in enumerate(coefficients, start=1)), 0.0 * z))
+
+
+def brown(base: Base, values: Mapping[str, float]) -> Distortion:
+    """Return the distortion of coefficients by their names in OpenCV: k1 to k6, p1, p2.
+
+    k4 to k6 stand below the line, as in OpenCV's rational model.
+    """
+    k1, k2, k3, *below = (values.get(f'k{i}', 0.0) for i in range(1, 7))
+    return Distortion(base, (k1, k2, k3), below, (values.get('p1', 0.0), values.get('p2', 0.0)))
+
+
+def opencv_distortion(d: Sequence[float], base: Base = PERSPECTIVE) -> Distortion:
+    """Return the distortion of coefficients in OpenCV's order, by default of a pinhole."""
+    return brown(base, dict(zip(OPENCV, d, strict=False)))
+
+
+def nearest_lens(
+    name: str, size: Sequence[float], intrinsics: Sequence[float], distortion: Distortion,
+    where: str,
+) -> tuple[Lens, float]:
+    """Return the lens nearest to a distorted image, and its worst deviation, px; 0: none.
+
+    size: width, height; intrinsics: fx, fy, cx, cy and, where there is one, the skew, px: u grows
+    with v by so much as v grows by the focal length.
+    Raises LensError, naming `where`, where there is none.
+    """
+    fx, fy, cx, cy, skew = (*intrinsics, 0.0)[:5]
+    if distortion.is_kannala_brandt:
+        k = (*distortion.stretch, *[0.0] * RADIAL_TERMS)[:RADIAL_TERMS]
+        lens, worst = kannala_brandt(name, size, (fx, fy, cx, cy), k, where), 0.0
+    else:
+        lens, worst = fit_curve(name, size, (fx, fy, cx, cy), distortion.height,
+                                    distortion.base.limit, where)
+    if distortion.sideways:
+        lens, worst = _fit_corrections(lens, (fx, fy), distortion, worst)
+    if skew:
+        shear = SkewEffect().to_dict(np.array([skew / fx]))
+        lens = replace(lens, corrections={**lens.corrections, SkewEffect.name: shear})
+    return lens, worst
+
+
+def camera_matrix(lens: Lens) -> Array:
+    """Return the camera matrix (3, 3) of a lens, px, with its skew."""
+    entry = lens.corrections.get(SkewEffect.name)
+    skew = 0.0 if entry is None else SkewEffect.from_dict(entry, lens.name)[1][0] * lens.fx
+    return np.array([[lens.fx, skew, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
+
+
+def _fit_corrections(
+    lens: Lens, focal: tuple[float, float], distortion: Distortion, worst: float
+) -> tuple[Lens, float]:
+    """Return a lens of the right curve with the corrections that move points sideways.
+
+    focal: of the distorted image, px; worst: deviation of the curve, px.
+    """
+    theta, azimuth = np.meshgrid(np.linspace(0, lens.max_incidence, _STEPS)[1:],
+                                 np.linspace(0, 2 * np.pi, _STEPS))
+    uv = distortion.project(theta, azimuth) * focal + (lens.cx, lens.cy)
+    sin = np.sin(theta)
+    points = np.stack([sin * np.cos(azimuth), sin * np.sin(azimuth), np.cos(theta)], axis=-1)
+    inside = ((uv >= 0) & (uv < (lens.width, lens.height))).all(axis=-1)
+    if not inside.any():
+        return lens, worst
+    points, uv = points[inside], uv[inside]
+    effects: list[Effect] = [DecenteringEffect()]
+    if any(map(any, distortion.prism)):
+        # A thin prism is both: (r^2, 0) = (3 x^2 + y^2, 2 x y) - 2 (x^2, x y).
+        effects.append(SensorTiltEffect())
+    ideal = project(lens, points).uv
+    scene = Scene(views_of(points[None], uv[None]), lens, identity(1), ideal[None])
+    columns = np.concatenate([effect.columns(scene) for effect in effects], axis=-1)[0]
+    found = np.linalg.lstsq(columns.reshape(len(points) * 2, -1), (uv - ideal).ravel(), rcond=None)
+    parts = np.split(found[0], range(2, 2 * len(effects), 2))
+    lens = replace(lens, corrections={
+        effect.name: effect.to_dict(part) for effect, part in zip(effects, parts, strict=True)})
+    return lens, float(np.abs(project(lens, points).uv - uv).max())
+
+
+def kannala_brandt(
+    name: str, size: Sequence[float], intrinsics: Sequence[float], k: Sequence[float],
+    where: str, shift: ViewpointShift | None = None,
+) -> Lens:
+    """Build a Kannala-Brandt lens: size (width, height); intrinsics fx, fy, cx, cy.
+
+    Raises LensError, naming `where`, where it is impossible.
+    """
+    try:
+        width, height, fx, fy, cx, cy = map(float, (*size, *intrinsics))
+        curve = KannalaBrandt(*map(float, k))
+    except (TypeError, ValueError, OverflowError) as cause:
+        raise LensError(f'{where}: size, fx, fy, cx, cy or k1 to k4 are incomplete') from cause
+    if not all(abs(value) < MAX_NUMBER for value in curve.coefficients):
+        raise LensError(f'{where}: k1 to k4 are {curve.coefficients}; no real lens has these')
+    if not (width.is_integer() and height.is_integer()):
+        raise LensError(f'{where}: the image size is {width} x {height}; whole numbers are needed')
+    lens = Lens(name, int(width), int(height), fx, fy, cx, cy, curve, np.nan, shift,
+                calibration={'source': where})
+    wrong = lens.check()
+    if wrong:
+        raise LensError(f'{where}: {wrong}')
+    return replace(lens, max_incidence=field_of_view(lens))
+
+
+def fit_curve(
+    name: str, size: Sequence[float], intrinsics: Sequence[float], curve: Curve, limit: float,
+    where: str, shift: ViewpointShift | None = None,
+) -> tuple[Lens, float]:
+    """Return the Kannala-Brandt lens nearest to a radial curve, and its worst deviation, px.
+
+    limit: angle, rad, up to which the curve grows; no further than the image's corner is fitted.
+    """
+    try:
+        width, height, fx, fy, cx, cy = map(float, (*size, *intrinsics))
+    except (TypeError, ValueError, OverflowError) as cause:
+        raise LensError(f'{where}: size, fx, fy, cx or cy are incomplete') from cause
+    if not (np.isfinite([width, height, cx, cy, limit]).all() and 0 < min(fx, fy) < np.inf):
+        raise LensError(f'{where}: image size or intrinsics are no valid numbers')
+    corner = np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy)
+    theta = np.linspace(0.0, limit, _GRID)[1:]
+    heights = curve(theta)
+    grows = np.concatenate([[True], np.diff(heights) > 0]) & np.isfinite(heights)
+    inside = np.logical_and.accumulate(grows) & (heights <= corner)
+    if inside.sum() < 20:
+        raise LensError(f'{where}: the projection does not grow with the incidence angle')
+    # Denser to the end, so that the worst deviation is near the least that there can be
+    theta = theta[inside][-1] * np.sin(np.linspace(0.0, np.pi / 2, _GRID)[1:])
+    heights = curve(theta)
+    powers = theta[:, None] ** np.arange(1, 10, 2)
+    scale, *rest = np.linalg.lstsq(powers, heights, rcond=None)[0].tolist()
+    if not scale > 0:
+        raise LensError(f'{where}: no fisheye curve fits the projection')
+    worst = float(np.abs(powers @ [scale, *rest] - heights).max() * max(fx, fy))
+    lens = kannala_brandt(name, size, (scale * fx, scale * fy, cx, cy),
+                          [value / scale for value in rest], where, shift)
+    return replace(lens, max_incidence=min(lens.max_incidence, float(theta[-1]))), worst
+
+
+def nearest_kannala_brandt(lens: Lens) -> Lens:
+    """Return a lens as Kannala-Brandt; raise LensError where that is off by a hundredth px."""
+    if isinstance(lens.image_height, KannalaBrandt):
+        return lens
+    value = lens.image_height.value_and_slope
+    found, worst = fit_curve(
+        lens.name, (lens.width, lens.height), (lens.fx, lens.fy, lens.cx, lens.cy),
+        lambda theta: value(theta)[0], lens.max_incidence, lens.name, lens.viewpoint_shift)
+    if worst > _TOLERANCE:
+        raise LensError(f'lens {lens.name!r}: its curve is {worst:.2g} px from any curve of this '
+                        'format; calibrate it as kannala_brandt')
+    return found
+
+
+def coefficients(lens: Lens) -> list[float]:
+    """Return k1 to k4 of a Kannala-Brandt lens."""
+    return list(lens.image_height.coefficients)
