@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.io.poses_csv import pose_columns
+from fisheye_svp_ros.io.csv_files import pose_columns
 from fisheye_svp_ros.io.result_files import Columns, Result
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import Pose

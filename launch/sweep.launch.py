@@ -7,7 +7,7 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch_ros.actions import Node
 
-from fisheye_svp_ros.commands.sweep_file import lens_folder, read_sweep
+from fisheye_svp_ros.commands.node_sweeps import lens_folder, read_sweep
 from fisheye_svp_ros.io.share import sweep_path
 from fisheye_svp_ros.nodes.launching import PACKAGE, fail, value
 

@@ -10,7 +10,7 @@ from helpers.robot import TRUTH, robot
 from helpers.surround import CAMERAS, LENS, RIG, photographs
 
 import fisheye_svp_ros as fsvp
-from fisheye_svp_ros.io.poses_csv import FramePoses, write_poses
+from fisheye_svp_ros.io.csv_files import FramePoses, write_poses
 from fisheye_svp_ros.pose import Pose
 
 LENSES = dict.fromkeys(CAMERAS, LENS)

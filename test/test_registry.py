@@ -66,7 +66,7 @@ class Trefoil(Effect):
 
 
 def read(path):
-    from fisheye_svp_ros.io.observations_csv import read as read_csv
+    from fisheye_svp_ros.io.csv_files import read as read_csv
     text = path.read_text().replace(';', ',')
     copy = path.with_suffix('.csv')
     copy.write_text(text)
@@ -102,7 +102,7 @@ from helpers.targets import cube, poses_around
 import fisheye_svp_ros as fsvp
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.io.observations_csv import write_observations
+from fisheye_svp_ros.io.csv_files import write_observations
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.simulate.scenario import model_of

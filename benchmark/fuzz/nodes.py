@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmark.fuzz.mutations import WORDS, mutated, nasty
 from benchmark.fuzz.surfaces import Surface, Trial
-from fisheye_svp_ros.commands.ros import missing_rclpy
+from fisheye_svp_ros.commands.processes import missing_rclpy
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.parameters import rows

@@ -18,8 +18,8 @@ import numpy as np
 
 from benchmark.fuzz.mutations import mutated, nasty
 from fisheye_svp_ros import library
-from fisheye_svp_ros.commands.ros import missing_rclpy
-from fisheye_svp_ros.commands.sweep_file import read_sweep
+from fisheye_svp_ros.commands.node_sweeps import read_sweep
+from fisheye_svp_ros.commands.processes import missing_rclpy
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import decode_image, exif_turned
 from fisheye_svp_ros.io.bags import Bag, BagWriter

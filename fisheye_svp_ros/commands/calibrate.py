@@ -34,8 +34,13 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.optics.lens import parameter_values
-from fisheye_svp_ros.reporting.calibration_text import STANDARD_ERRORS, CalibratedCamera
-from fisheye_svp_ros.reporting.hand_eye_text import HEADER, hand_eye_rows, hand_eye_sentence
+from fisheye_svp_ros.reporting.calibration_text import (
+    HEADER,
+    STANDARD_ERRORS,
+    CalibratedCamera,
+    hand_eye_rows,
+    hand_eye_sentence,
+)
 from fisheye_svp_ros.reporting.progress import progress, stages
 from fisheye_svp_ros.reporting.tables import print_table
 from fisheye_svp_ros.scene.observations import Observations

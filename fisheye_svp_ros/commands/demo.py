@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from fisheye_svp_ros.commands.lock_step import start_in_step, values
+from fisheye_svp_ros.commands.node_sweeps import start_in_step, values
 from fisheye_svp_ros.commands.notes import note_formats
 from fisheye_svp_ros.commands.outputs import output_folder
-from fisheye_svp_ros.commands.processes import Processes
-from fisheye_svp_ros.commands.ros import missing_rclpy
+from fisheye_svp_ros.commands.processes import Processes, missing_rclpy
 from fisheye_svp_ros.errors import OutputError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import write_columns

@@ -1,32 +1,41 @@
-"""`fisheye-svp localize`: a pose a frame from the image points of known landmarks."""
+"""`fisheye-svp localize`: a pose a frame from the image points of known landmarks.
+
+Of one camera, of each of several, or with `--rig` of the first camera of a rig from all of them.
+"""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.commands.lenses import add_lens_argument, lenses_of, load_lenses
-from fisheye_svp_ros.commands.localize_rig import AXES, MAX_TABLE_ROWS, localize_cameras
-from fisheye_svp_ros.commands.notes import note_doubtful, note_left_out
+from fisheye_svp_ros.commands.notes import note_doubtful, note_gross_errors, note_left_out, say
 from fisheye_svp_ros.commands.outputs import output_folder
-from fisheye_svp_ros.commands.photographs import add_observation_arguments
-from fisheye_svp_ros.commands.photographs import read_input as read
+from fisheye_svp_ros.commands.photographs import add_observation_arguments, read_input
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.csv_table import write_table
 from fisheye_svp_ros.io.detect_files import check_sizes
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.readers import write_poses
+from fisheye_svp_ros.io.rig_files import load_cameras
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.reporting.tables import noise_text, print_table
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import frame_name, photograph_entry
 from fisheye_svp_ros.solve.localization import sight
 from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measured, rms_px
+from fisheye_svp_ros.solve.rig_localization import RigLocalization, localize_rig
 
 _Parts = dict[str, dict[str, float]]  # root mean squares by quantity and part
+_MAX_ROWS = 40  # frames in the table for people
+_AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,11 +60,11 @@ def run(args: argparse.Namespace) -> None:
     if args.rig and args.model_error:
         raise ParameterError('--model-error works for one camera at a time; leave --rig out')
     given = load_lenses(args.lens)
-    observations, sizes = read(args.observations, args)
+    observations, sizes = read_input(args.observations, args)
     lenses = lenses_of(observations.cameras, given)
     check_sizes(args.observations, sizes, lenses)
     if args.rig:
-        localize_cameras(observations, lenses, args.rig, args.output)
+        _localize_rig(observations, lenses, args)
         return
     for camera, (name, lens) in enumerate(lenses.items()):
         model, uncertainty = ForwardModel(lens), None
@@ -78,38 +87,69 @@ def run(args: argparse.Namespace) -> None:
                 _write(args.output / name, model, table, measured, uncertainty)
 
 
+def _localize_rig(
+    table: Observations, lenses: Mapping[str, Lens], args: argparse.Namespace
+) -> None:
+    """Localize every frame of a rig, print the poses of its first camera, write the results."""
+    cameras, places = load_cameras(args.rig)
+    with progress('localizing'):
+        found = localize_rig(table, lenses, cameras, places)
+    note_left_out(table, found.left_out)
+    note_gross_errors(found.table, found.outliers)
+    if found.contradicted:
+        say(f'{args.rig}: the relative poses of the cameras differ; calibrate the rig again')
+    if args.output:
+        with write_together():
+            _write_rig(args.output, cameras, found)
+    _print_rig(table, cameras, found)
+
+
 def _print(
     table: Observations, measured: MeasuredPoses, uncertainty: _Parts | None, source: str
 ) -> None:
-    views, result = measured.views, measured.result
-    worst = [
-        np.sqrt(np.linalg.eigvalsh(result.covariance[:, part, part])[:, -1])
-        for part in (slice(0, 3), slice(3, 6))
-    ]
-    rows = []
-    for i, frame in enumerate(views.frame[:MAX_TABLE_ROWS]):
-        place = (f'{1000 * value:.3f}' for value in result.pose.position[i])
-        rows.append((
-            _frame_label(table, int(frame)), str(int(views.used[i].sum())),
-            f'{rms_px(measured.inlier_residual[i]):.4f}', *place,
-            f'{1000 * worst[0][i]:.3f}', f'{np.degrees(worst[1][i]):.4f}',
-        ))
-    header = ('frame', 'points', 'rms px', 'x mm', 'y mm', 'z mm', 'std. error mm',
-              'std. error deg')
-    print_table(
+    views, residual = measured.views, measured.inlier_residual
+    labels = [(frame_name(table, frame).removeprefix('frame '), str(count)) for frame, count in
+              zip(views.frame[:_MAX_ROWS].tolist(), views.used.sum(axis=1), strict=False)]
+    _print_poses(
         f'{source}: {int(views.used.sum())} points in {len(views.frame)} frames, '
-        f'rms {rms_px(measured.inlier_residual):.4f} px',
-        header, rows,
-    )
-    if len(views.frame) > MAX_TABLE_ROWS:
-        print(f'  and {len(views.frame) - MAX_TABLE_ROWS} more frames')
-    said = noise_text(measured.sigma) if uncertainty is None else _parts_text(uncertainty)
-    print(f'  {said}, largest over all directions')
+        f'rms {rms_px(residual):.4f} px',
+        labels, [rms_px(one) for one in residual[:_MAX_ROWS]], measured.result.pose,
+        measured.result.covariance,
+        noise_text(measured.sigma) if uncertainty is None else _parts_text(uncertainty))
 
 
-def _frame_label(table: Observations, frame: int) -> str:
-    """Return the photograph's name, or the number of a frame without one."""
-    return frame_name(table, frame).removeprefix('frame ')
+def _print_rig(table: Observations, cameras: tuple[str, ...], found: RigLocalization) -> None:
+    data, labels, rms = found.data, [], []
+    for i, frame in enumerate(found.frame[:_MAX_ROWS].tolist()):
+        mine = data.frame_of == i
+        names = [found.table.cameras[camera] for camera in data.camera_of[mine]]
+        labels.append((str(frame), ' '.join(names), str(int(data.views.used[mine].sum()))))
+        rms.append(rms_px(found.residual[mine]))
+    _print_poses(
+        f'{table.source}: {cameras[0]} in the world, from {int(data.views.used.sum())} points of '
+        f'{len(found.table.cameras)} cameras in {len(found.frame)} frames, rms '
+        f'{rms_px(found.residual):.4f} px',
+        labels, rms, found.pose, found.covariance, noise_text(found.sigma))
+
+
+def _print_poses(
+    title: str, labels: Sequence[tuple[str, ...]], rms: Sequence[float], pose: Pose,
+    covariance: Array, errors: str,
+) -> None:
+    """Print poses (F,), the first with labels: frame, cameras of a rig, number of points."""
+    worst = [np.sqrt(np.linalg.eigvalsh(covariance[:, part, part])[:, -1])
+             for part in (slice(0, 3), slice(3, 6))]
+    rows = [
+        (*label, f'{rms[i]:.4f}', *(f'{1000 * value:.3f}' for value in pose.position[i]),
+         f'{1000 * worst[0][i]:.3f}', f'{np.degrees(worst[1][i]):.4f}')
+        for i, label in enumerate(labels)
+    ]
+    cameras = ('cameras',) if len(labels[0]) > 2 else ()
+    print_table(title, ('frame', *cameras, 'points', 'rms px', 'x mm', 'y mm', 'z mm',
+                        'std. error mm', 'std. error deg'), rows, words=cameras)
+    if more := len(pose.position) - len(rows):
+        print(f'  and {more} more frames')
+    print(f'  {errors}, largest over all directions')
 
 
 def _parts_text(uncertainty: _Parts) -> str:
@@ -120,12 +160,20 @@ def _parts_text(uncertainty: _Parts) -> str:
     return f'standard errors with those of the lens (rms of positions: {shares})'
 
 
+def _write_poses(folder: Path, frame: Index, pose: Pose, covariance: Array) -> None:
+    """Write poses (F,) and their covariances (F, 6, 6)."""
+    write_poses(folder / 'poses.csv', frame, pose)
+    names = [f'{a}_{b}' for a in _AXES for b in _AXES]
+    write_table(folder / 'covariance.csv', {
+        'frame': frame, **dict(zip(names, covariance.reshape(-1, 36).T, strict=True))})
+
+
 def _write(
     folder: Path, model: ForwardModel, table: Observations, measured: MeasuredPoses,
     uncertainty: _Parts | None,
 ) -> None:
     views, result = measured.views, measured.result
-    write_poses(folder / 'poses.csv', views.frame, result.pose)
+    _write_poses(folder, views.frame, result.pose, result.covariance)
     used = views.used
     frame = np.broadcast_to(views.frame[:, None], used.shape)
     theta, distance = sight(model, result.pose, views)
@@ -135,12 +183,6 @@ def _write(
         'du': result.residual[used][:, 0], 'dv': result.residual[used][:, 1],
         'theta': theta[used], 'range': distance[used],
     })
-    names = [f'{a}_{b}' for a in AXES for b in AXES]
-    entries = result.covariance.reshape(-1, 36).T
-    write_table(
-        folder / 'covariance.csv',
-        {'frame': views.frame, **dict(zip(names, entries, strict=True))},
-    )
     write_json(folder / 'localize.json', {
         'rms_px': rms_px(measured.inlier_residual),
         'frames': len(views.frame),
@@ -158,4 +200,31 @@ def _write(
             for frame, reason in zip(views.frame, measured.reasons, strict=True) if reason
         ],
         **({} if uncertainty is None else {'uncertainty': uncertainty}),
+    })
+
+
+def _write_rig(folder: Path, cameras: tuple[str, ...], found: RigLocalization) -> None:
+    data, views, residual = found.data, found.data.views, found.residual
+    _write_poses(folder, found.frame, found.pose, found.covariance)
+    used = views.used
+    frame, camera = (np.broadcast_to(part[:, None], used.shape)[used]
+                     for part in (views.frame, data.camera_of))
+    write_table(folder / 'residuals.csv', {
+        'frame': frame, 'camera': np.array(found.table.cameras)[camera],
+        'landmark': views.landmark[used], 'u': views.uv[used][:, 0], 'v': views.uv[used][:, 1],
+        'du': residual[used][:, 0], 'dv': residual[used][:, 1],
+    })
+    write_json(folder / 'localize.json', {
+        'rms_px': rms_px(residual), 'frames': len(found.frame), 'observations': int(used.sum()),
+        'left_out': found.left_out, 'sigma_px': found.sigma, 'frame_id': cameras[0],
+        'rig_contradicted': found.contradicted,
+        'cameras': {name: {'rms_px': rms_px(residual[data.camera_of == i]),
+                           'frames': int((data.camera_of == i).sum())}
+                    for i, name in enumerate(found.table.cameras)},
+        'gross': [
+            {'frame': int(found.table.frame[row]),
+             **photograph_entry(found.table, int(found.table.frame[row])),
+             'camera': found.table.cameras[found.table.camera[row]],
+             'landmark': int(found.table.landmark[row]), 'px': float(px), 'why': why}
+            for row, px, why in zip(*found.outliers, strict=True)],
     })

@@ -7,6 +7,7 @@ import re
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,22 +38,16 @@ def note_formats() -> None:
     from fisheye_svp_ros.io.columns import arrow
 
     _, problem = arrow()
-    if problem and _first_today('no_parquet'):
-        say(problem)
-
-
-def _first_today(name: str) -> bool:
-    """Return whether this is the first call of the day with a name; True where none is kept."""
+    if not problem:
+        return
     home = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache')
-    mark = home / 'fisheye_svp_ros' / f'{name}.said'
-    try:
+    mark = home / 'fisheye_svp_ros' / 'no_parquet.said'
+    with suppress(OSError):  # said each time where no mark can be kept
         if mark.exists() and time.time() - mark.stat().st_mtime < _DAY:
-            return False
+            return
         mark.parent.mkdir(parents=True, exist_ok=True)
         mark.touch()
-    except OSError:
-        pass
-    return True
+    say(problem)
 
 
 def note_left_out(table: Observations, frames: Sequence[int]) -> None:

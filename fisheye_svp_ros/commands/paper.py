@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.commands.outputs import output_folder
-
-if TYPE_CHECKING:
-    from fisheye_svp_ros.paper.results import Results
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,20 +23,13 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.paper.report import write_report
     from fisheye_svp_ros.paper.results import compute, tasks
     from fisheye_svp_ros.reporting.progress import progress
+    from fisheye_svp_ros.reporting.tables import print_table
 
     with process_pool(os.cpu_count() or 1) as workers:
         with progress('evaluating', tasks()) as step:
             results = compute(workers.executor, step)
         with progress('drawing'):
             written = write_report(results, args.output, workers.executor)
-    _print(results)
-    for path in written:
-        print(f'  {path}')
-
-
-def _print(results: Results) -> None:
-    from fisheye_svp_ros.reporting.tables import print_table
-
     print_table(
         f'Tables 1 and 2: {results.agreeing(0.10)} of 36 z and residual cells within 10 % of the '
         f'published ones, {results.agreeing(0.05)} within 5 %',
@@ -54,3 +43,5 @@ def _print(results: Results) -> None:
     )
     verdicts = ', '.join(f'{verdict}: {count}' for verdict, count in results.verdicts().items())
     print(f'  {len(results.claims)} statements of the text; {verdicts}')
+    for path in written:
+        print(f'  {path}')

@@ -1,27 +1,64 @@
-"""Commands of this package as processes of their own: started together, ended in order."""
+"""Commands as processes of their own: with ROS 2, started together, ended in order.
+
+A process that is killed leaves shared memory of Fast DDS behind, which goes with the others.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
+import fcntl
 import os
 import random
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
+from contextlib import suppress
 from pathlib import Path
 
-from fisheye_svp_ros.commands.ros import LOCALHOST, RANGE
-from fisheye_svp_ros.commands.shared_memory import remove_orphans, segments
 from fisheye_svp_ros.errors import GraphError
 
+_RANGE, _LOCALHOST = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST'
+# Of a ROS 2 that is sourced, or of a user who has said how far its nodes are to be seen.
+_ENVIRONMENT = {'ROS_DISTRO', _RANGE, 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS'}
+_WAYS = (
+    'source ROS 2 Jazzy (Ubuntu 24.04: apt install ros-jazzy-ros-base) or, on x86-64 Linux with '
+    'Python 3.11 to 3.14, install the extra `ros` of this package'
+)
 _POLL = 0.05  # s
 _PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of <sys/prctl.h>
 _END = 4000  # bytes
 _GRACE = 10.0  # s to end after a signal
+_SHARED_MEMORY = Path('/dev/shm')
+# A segment of a participant or the port of a transport; locks and a semaphore lie beside them.
+_SEGMENT = re.compile(r'fastrtps_([0-9a-f]{16}|port\d+)')
+_SETTLING_TIME = 0.2  # s, more than a process takes from making a segment to locking it
+
+
+def missing_rclpy() -> str:
+    """Return why rclpy cannot be imported; empty where it can."""
+    try:
+        import rclpy.node  # noqa: F401 - it loads the C library, too
+    except ImportError as error:
+        # Of a C library that was built for another Python, the first line says enough.
+        return str(error).partition('\n')[0]
+    return ''
+
+
+def prepare_ros() -> None:
+    """Keep nodes on this machine where no environment of ROS says otherwise.
+
+    Raises GraphError, with the ways to get it, where rclpy cannot be imported.
+    """
+    if reason := missing_rclpy():
+        version = '.'.join(map(str, sys.version_info[:2]))
+        raise GraphError(f'nodes need ROS 2, which Python {version} does not have ({reason}); '
+                         f'{_WAYS}')
+    if not _ENVIRONMENT & os.environ.keys():
+        os.environ[_RANGE] = _LOCALHOST
 
 
 class Processes:
@@ -30,7 +67,7 @@ class Processes:
     def __init__(self, logs: Path) -> None:
         self._logs = logs
         self._environment = {**os.environ, 'ROS_DOMAIN_ID': domain(), 'PYTHONUNBUFFERED': '1'}
-        self._environment.setdefault(RANGE, LOCALHOST)
+        self._environment.setdefault(_RANGE, _LOCALHOST)
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._segments = segments()
 
@@ -104,7 +141,7 @@ class Processes:
 
 def _end_with_parent() -> None:
     """Have the kernel end this new process when its parent dies, however that happens."""
-    with contextlib.suppress(OSError, AttributeError):  # of Linux
+    with suppress(OSError, AttributeError):  # of Linux
         ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGTERM)
 
 
@@ -122,3 +159,52 @@ def domain() -> str:
                 continue
         return str(number)
     raise GraphError('all ROS domains from 1 to 101 are in use; set ROS_DOMAIN_ID')
+
+
+def segments() -> set[str]:
+    """Return the names of all segments and ports of shared memory that are there."""
+    with suppress(OSError):  # of Linux
+        return {path.name for path in _SHARED_MEMORY.iterdir() if _SEGMENT.fullmatch(path.name)}
+    return set()
+
+
+def remove_orphans(before: Set[str]) -> None:
+    """Remove shared memory that was not there before and that no process holds."""
+    found = segments() - before
+    if found:
+        time.sleep(_SETTLING_TIME)
+    held = _locked_inodes()
+    for name in found:
+        locks = [_SHARED_MEMORY / f'{name}{lock}' for lock in ('_el', '_sl')]
+        # To try a lock is to take it for a moment, in which its process might want it.
+        if any(_inode(lock) in held for lock in locks) or any(map(_is_locked, locks)):
+            continue
+        for path in (_SHARED_MEMORY / name, *locks, _SHARED_MEMORY / f'sem.{name}_mutex'):
+            with suppress(OSError):  # gone, or somebody else's
+                path.unlink()
+
+
+def _locked_inodes() -> set[int]:
+    """Return the inodes of all files that processes of this namespace hold locked."""
+    with suppress(OSError):  # of Linux
+        return {int(inode) for inode in re.findall(
+            r'FLOCK .* [0-9a-f]+:[0-9a-f]+:(\d+) ', Path('/proc/locks').read_text())}
+    return set()
+
+
+def _inode(path: Path) -> int:
+    with suppress(OSError):
+        return path.stat().st_ino
+    return 0
+
+
+def _is_locked(path: Path) -> bool:
+    """Say whether a living process holds the lock of a file; it may be of another namespace."""
+    try:
+        with path.open('rb') as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # there is none
+        return False
+    return False

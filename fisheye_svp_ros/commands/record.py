@@ -9,6 +9,10 @@ from pathlib import Path
 from shutil import rmtree
 
 from fisheye_svp_ros.commands.outputs import output_path
+from fisheye_svp_ros.commands.processes import prepare_ros
+from fisheye_svp_ros.errors import BagError
+from fisheye_svp_ros.io.share import sweep_path
+from fisheye_svp_ros.nodes.executables import ending_quietly
 
 # What the nodes tell, and what they were told; markers and diagnostics are left out.
 TOPICS = (
@@ -40,13 +44,9 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _sweep(name: str, bag: Path) -> None:
-    from fisheye_svp_ros.commands.lock_step import record_sweep
+    from fisheye_svp_ros.commands.node_sweeps import read_sweep, record_sweep
     from fisheye_svp_ros.commands.notes import counted, say
-    from fisheye_svp_ros.commands.ros import prepare_ros
-    from fisheye_svp_ros.commands.sweep_file import read_sweep
-    from fisheye_svp_ros.errors import BagError
     from fisheye_svp_ros.io.bags import Bag
-    from fisheye_svp_ros.io.share import sweep_path
     from fisheye_svp_ros.reporting.progress import progress
 
     path = sweep_path(name)
@@ -54,19 +54,15 @@ def _sweep(name: str, bag: Path) -> None:
     if bag.exists():
         raise BagError(f'{bag}: it exists; choose a new folder')
     prepare_ros()
-    logs = bag.with_name(f'{bag.name}_logs')
     with progress('sweeping', len(plan.sweep)) as advance:
-        record_sweep(path, plan, bag, logs, advance)
+        record_sweep(path, plan, bag, bag.with_name(f'{bag.name}_logs'), advance)
     count = sum(1 for _ in Bag(bag).records(lambda topic, _: topic == '/scenario'))
     say(f'{count} sets of {counted(len(plan.sweep), "scenario")} are in {bag}')
 
 
 def _record(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.notes import say
-    from fisheye_svp_ros.commands.ros import prepare_ros
-    from fisheye_svp_ros.errors import BagError
     from fisheye_svp_ros.io.bags import BagWriter
-    from fisheye_svp_ros.nodes.executables import ending_quietly
 
     with ending_quietly():
         prepare_ros()

@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Mapping
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
@@ -15,7 +14,8 @@ from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.errors import GeometryError, LensError, ParameterError
-from fisheye_svp_ros.io.files import write_bytes, write_together
+from fisheye_svp_ros.io.files import write_together
+from fisheye_svp_ros.io.image_files import write_png
 from fisheye_svp_ros.io.lens_files import cameras_in
 from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses
 from fisheye_svp_ros.io.rig_files import cameras_in_first, rigs_of_lenses
@@ -185,8 +185,7 @@ def write_photographs(
                 rng = np.random.default_rng([seed, number, *([camera] if camera else [])])
                 image = render(lens, boards, poses.take(number).compose(place), exposure, rng,
                                rays=rays)
-                write_bytes(folder / name / f'{number:03d}.png',
-                            cv2.imencode('.png', image)[1].tobytes())
+                write_png(folder / name / f'{number:03d}.png', image)
                 done()
     view, board, corner = np.nonzero(seen)
     frame, camera_of = np.divmod(view, len(cameras))

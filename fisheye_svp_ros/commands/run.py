@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from itertools import takewhile
 
-from fisheye_svp_ros.commands.ros import prepare_ros
+from fisheye_svp_ros.commands.processes import prepare_ros
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.nodes import NODES, executables
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from fisheye_svp_ros.commands.lenses import Lenses, lenses_of, load_lenses
@@ -16,15 +15,14 @@ from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.photographs import image_size
 from fisheye_svp_ros.detect.photographs import (
     IMAGES,
-    Photograph,
     count_photographs,
     doubtful_folders,
     find_photographs,
 )
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.io.files import write_bytes, write_json, write_text, write_together
+from fisheye_svp_ros.io.files import write_json, write_text, write_together
+from fisheye_svp_ros.io.image_files import save_maps, write_png
 from fisheye_svp_ros.io.lens_formats.ros import camera_info_text
-from fisheye_svp_ros.io.map_files import save_maps
 from fisheye_svp_ros.io.rig_files import load_pair, pair_of_lenses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
@@ -176,11 +174,12 @@ def _write_photographs(
     first: dict[str, tuple[str, Any]] = {}
     for photograph in find_photographs(paths):
         try:
-            pixels = photograph.pixels(color=True)
+            image = sides[photograph.camera].remap(photograph.pixels(color=True))
         except ObservationError as error:
             say(str(error))
             continue
-        image = _remap(sides[photograph.camera], photograph, pixels)
+        except ParameterError as error:
+            raise ParameterError(f'{photograph.name}: {error}') from error
         key = Path(photograph.key).name
         path = folder / photograph.camera / f'{key}.png'
         if path in written:
@@ -190,7 +189,7 @@ def _write_photographs(
             raise ParameterError(f'{photograph.name}: another photograph is also called {key}; '
                                  'give one folder at a time')
         written.add(path)
-        write_bytes(path, cv2.imencode('.png', image)[1].tobytes())
+        write_png(path, image)
         counts[photograph.camera] += 1
         first.setdefault(photograph.camera, (key, image))
         done()
@@ -201,13 +200,6 @@ def _write_photographs(
     return counts
 
 
-def _remap(side: Rectification, photograph: Photograph, pixels: Any) -> Any:
-    try:
-        return side.remap(pixels)
-    except ParameterError as error:
-        raise ParameterError(f'{photograph.name}: {error}') from error
-
-
 def _write_camera(
     side: Rectification, name: str, left: Remaining | None, folder: Path
 ) -> dict[str, Any]:
@@ -215,8 +207,7 @@ def _write_camera(
     camera, maps = side.camera, side.maps
     size = camera.width, camera.height
     save_maps(folder, *maps, side.k, side.rotation, side.p)
-    write_bytes(folder / 'mask.png',
-                cv2.imencode('.png', 255 * maps.mask.astype(np.uint8))[1].tobytes())
+    write_png(folder / 'mask.png', 255 * maps.mask.astype(np.uint8))
     if camera.projection in _CAMERA_INFO:
         model, count = _CAMERA_INFO[camera.projection]
         write_text(folder / 'camera_info.yaml', camera_info_text(

@@ -7,6 +7,9 @@ import math
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from fisheye_svp_ros.commands.processes import prepare_ros
+from fisheye_svp_ros.nodes.executables import ending_quietly
+
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
@@ -24,9 +27,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Follow every result topic until interrupted."""
-    from fisheye_svp_ros.commands.ros import prepare_ros
-    from fisheye_svp_ros.nodes.executables import ending_quietly
-
     with ending_quietly():
         prepare_ros()
         from rich.live import Live

@@ -25,8 +25,13 @@ from rosbags.rosbag2.storage_mcap import McapWriter, write_channel, write_string
 from rosbags.typesys import Stores, get_typestore
 
 from fisheye_svp_ros.errors import BagError
-from fisheye_svp_ros.io.databases import database_messages, database_topics
-from fisheye_svp_ros.io.mcap import RawMessage, listed_topics, whole_messages
+from fisheye_svp_ros.io.mcap import (
+    RawMessage,
+    database_messages,
+    database_topics,
+    listed_topics,
+    whole_messages,
+)
 from fisheye_svp_ros.io.recording_files import (
     decompress_file,
     metadata_topics,

@@ -12,9 +12,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.csv_files import (
+    FramePoses,
+    read_poses,
+    write_observations,
+    write_poses,
+)
 from fisheye_svp_ros.io.files import path_of
-from fisheye_svp_ros.io.observations_csv import write_observations
-from fisheye_svp_ros.io.poses_csv import FramePoses, read_poses, write_poses
 from fisheye_svp_ros.io.recording_files import is_recording
 from fisheye_svp_ros.registry import Registry
 from fisheye_svp_ros.scene.observations import Observations
@@ -41,7 +45,7 @@ _PACKAGE = 'fisheye_svp_ros.io'
 READERS: Registry[Reader] = Registry('readers', {
     reader.form: reader for reader in (
         Reader('a .csv file', lambda path: path.suffix.lower() == '.csv',
-               f'{_PACKAGE}.observations_csv'),
+               f'{_PACKAGE}.csv_files'),
         Reader('an .orpc file', lambda path: path.suffix == '.orpc', f'{_PACKAGE}.orpc'),
         Reader('a folder of .orpc files', _holds('*.orpc'), f'{_PACKAGE}.orpc'),
         Reader('a rosbag2 recording', is_recording, f'{_PACKAGE}.observations_bag'),

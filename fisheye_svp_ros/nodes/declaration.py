@@ -15,8 +15,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.parameter import Parameter
 
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.parameter_files import read_parameter_file
-from fisheye_svp_ros.io.parameters import Row, rows, with_values
+from fisheye_svp_ros.io.parameters import Row, read_parameter_file, rows, with_values
 from fisheye_svp_ros.study.settings import Settings
 
 S = TypeVar('S', bound=Settings)

@@ -20,9 +20,9 @@ from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.detect.points import Points
 from fisheye_svp_ros.detect.workers import BoundedCalls, TimedOut
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, OutputError, ParameterError
+from fisheye_svp_ros.io.csv_files import write_observations
 from fisheye_svp_ros.io.files import replacing
 from fisheye_svp_ros.io.lens_files import load_lens
-from fisheye_svp_ros.io.observations_csv import write_observations
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode

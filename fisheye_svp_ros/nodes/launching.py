@@ -14,7 +14,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from fisheye_svp_ros.errors import GraphError, ParameterError
-from fisheye_svp_ros.io.parameter_files import parameters_of, read_parameter_file
+from fisheye_svp_ros.io.parameters import parameters_of, read_parameter_file
 
 PACKAGE = 'fisheye_svp_ros'
 PROGRAM = 'fisheye-svp'

@@ -1,4 +1,4 @@
-"""A calibrated lens in words: its parameters as rows, and what there is to say against it."""
+"""A calibration in words and rows: of a lens, and of the robot that carried the camera."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.reporting.hand_eye_text import hand_eye_warnings
+from fisheye_svp_ros.pose import Pose, vector_from_rotation
 from fisheye_svp_ros.reporting.tables import UNITS, interval, with_error
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import list_frames
+from fisheye_svp_ros.solve.hand_eye import HandEye
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured_poses import rms_px
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.solve.hand_eye import HandEye
     from fisheye_svp_ros.solve.lens_calibration import Calibration
     from fisheye_svp_ros.study.lens_trust import LensTrust
 
@@ -28,6 +29,11 @@ _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens s
 _MODEL_ERROR_RATIO = 2.0  # times the noise, from which residuals show a model error
 _MAX_CENTER_OFFSET = 0.1  # of the image, by which a principal point is seldom off its centre
 _MIN_COVERED_RADIUS = 0.7  # of the way to the nearest edge; less is poor coverage
+HEADER = ('transform', 'x, mm', 'y, mm', 'z, mm', 'rx, deg', 'ry, deg', 'rz, deg')
+_LARGE_SHARE = 0.5  # of the squares of all frames: such a pose is wrong
+_MIN_FRAMES = 6
+_MAX_SCALE = 2.0  # of lengths, either way: more is another unit, or the size of another board
+_MIN_MM = 100.0  # such a factor, too large for a mistaken board, is that of mm
 
 
 @dataclass(frozen=True)
@@ -114,3 +120,53 @@ class CalibratedCamera:
                 f'image points reach {out:.0f} px from the center, the nearest edge is at '
                 f'{edge:.0f} px; photograph the target near the edges too')
         return found
+
+
+def hand_eye_sentence(found: HandEye) -> str:
+    """Return how many poses there are, the noise of the robot, and the scale."""
+    scale, error = found.scale, found.stderr[-1]
+    return (f'{len(found.frame)} poses of the flange; noise of the robot '
+            f'{1e3 * found.noise_m:.3f} mm and {np.degrees(found.noise_rad):.4f} deg an axis; '
+            f'lengths of the target are {scale:.5f} ± {error:.5f} times those of the robot')
+
+
+def hand_eye_rows(found: HandEye) -> list[tuple[str, ...]]:
+    """Return both transforms as HEADER has them, each with its standard errors below it."""
+    return [*_rows('camera in flange', found.camera, found.stderr[:6]),
+            *_rows('target in base', found.target, found.stderr[6:12])]
+
+
+def hand_eye_warnings(found: HandEye) -> list[str]:
+    """Return what there is to say against the poses."""
+    return [*_unit_warnings(found.scale), *_pose_warnings(found)]
+
+
+def _unit_warnings(scale: float) -> list[str]:
+    """Return that lengths of robot and target are in different units, if it seems so."""
+    if 1 / _MAX_SCALE <= scale <= _MAX_SCALE:
+        return []
+    factor = max(scale, 1 / scale)
+    longer = 'the poses' if scale < 1 else 'the target'
+    likely = f': {longer} may be in mm' if factor > _MIN_MM else ''
+    return [f'lengths of robot and target differ by a factor of {factor:.4g}{likely}; both are '
+            'needed in m']
+
+
+def _pose_warnings(found: HandEye) -> list[str]:
+    noise = np.repeat((found.noise_m, found.noise_rad), 3)
+    squares = ((found.residual / noise) ** 2).sum(axis=1)
+    worst = int(np.argmax(squares))
+    if len(squares) < _MIN_FRAMES or squares[worst] < _LARGE_SHARE * squares.sum():
+        return []
+    off, turn = np.linalg.norm(found.residual[worst].reshape(2, 3), axis=1)
+    return [f'the pose of frame {found.frame[worst]} is {1e3 * off:.1f} mm and '
+            f'{np.degrees(turn):.2f} deg off the others: correct it, or remove it from the poses']
+
+
+def _rows(name: str, pose: Pose, stderr: Array) -> list[tuple[str, ...]]:
+    turn = np.degrees(vector_from_rotation(pose.rotation))
+    values = [*(f'{1e3 * value:.3f}' for value in pose.position),
+              *(f'{value:.4f}' for value in turn)]
+    errors = [*(f'± {1e3 * value:.3f}' for value in stderr[:3]),
+              *(f'± {value:.4f}' for value in np.degrees(stderr[3:]))]
+    return [(name, *values), ('', *errors)]

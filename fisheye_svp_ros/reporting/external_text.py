@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fisheye_svp_ros.diagnosis import Comparison, Diagnosis, Transfer, TwoCameras, TwoDatasets
-from fisheye_svp_ros.reporting.cause_text import quantity
-from fisheye_svp_ros.reporting.diagnosis_text import compared_row, join_names
-from fisheye_svp_ros.reporting.hand_eye_text import (
+from fisheye_svp_ros.reporting.calibration_text import (
     HEADER,
     hand_eye_rows,
     hand_eye_sentence,
     hand_eye_warnings,
 )
+from fisheye_svp_ros.reporting.cause_text import quantity
+from fisheye_svp_ros.reporting.diagnosis_text import compared_row, join_names
 from fisheye_svp_ros.solve.hand_eye import HandEye
 
 CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'less by (95 %)')

@@ -1,9 +1,10 @@
-"""Rows of the tables of a diagnosis: the variance budget, what is uncertain, the intrinsics."""
+"""Rows of the tables of a diagnosis: variance budget, uncertainty, intrinsics, outliers."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from fisheye_svp_ros.diagnosis import Diagnosis
 from fisheye_svp_ros.reporting.cause_text import bare_probability, percent
@@ -32,6 +33,7 @@ COMPONENTS = {
     'frame_sag': 'bend of the board that follows its tilt',
     'frame_similar': 'landmarks in similar views', 'noise': 'noise of image points',
 }
+_MAX_LANDMARKS = 6  # landmarks named in a row
 
 
 def budget_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str, str, str]]:
@@ -58,3 +60,38 @@ def intrinsic_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str]]:
             ' ± '.join(with_error(value.before, value.before_stderr)),
             ' ± '.join(with_error(value.after, value.after_stderr)),
         )
+
+
+class OutlierRow(NamedTuple):
+    """Outliers of one view for one reason: its name, camera, landmarks, largest error in px."""
+
+    where: str
+    camera: str
+    landmarks: str
+    points: int
+    px: float
+    why: str
+
+
+def outlier_rows(gross: Sequence[Mapping[str, Any]]) -> list[OutlierRow]:
+    """Return one row for each view and reason, the most points first.
+
+    gross: as in diagnosis.json, one entry a point.
+    """
+    groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
+    for one in gross:
+        where = one.get('photograph') or f'frame {one["frame"]}'
+        groups.setdefault((where, one.get('camera', ''), one['why']), []).append(one)
+    rows = [
+        OutlierRow(where, camera, _numbers([one['landmark'] for one in points]), len(points),
+                   max(one['px'] for one in points), why)
+        for (where, camera, why), points in groups.items()
+    ]
+    return sorted(rows, key=lambda row: (-row.points, -row.px))
+
+
+def _numbers(landmarks: Sequence[int]) -> str:
+    """Return landmark numbers, ascending, at most so many and the count of the others."""
+    names = [str(number) for number in sorted(landmarks)]
+    more = f' and {len(names) - _MAX_LANDMARKS} more' if len(names) > _MAX_LANDMARKS else ''
+    return ', '.join(names[:_MAX_LANDMARKS]) + more

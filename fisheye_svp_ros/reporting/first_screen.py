@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -209,31 +209,3 @@ def _thumbnail(path: str | None) -> str:
     zoom = _THUMBNAIL / max(image.shape)
     small = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA)
     return image_uri(cv2.imencode('.jpg', small)[1].tobytes(), 'jpeg')
-
-
-def next_command(
-    d: Diagnosis, observations: str, options: str, lenses: Sequence[str], settings: str = '',
-    planned: bool = False,
-) -> str:
-    """Return the command to go on with, as a shell takes it.
-
-    observations: with the options that find the board; options: of the extended lenses; lenses:
-    as given; settings: further options of this diagnosis; planned: whether the photographs to
-    take next are listed already.
-    """
-    if d.decision['lens'].say == 'undecided' and d.problem.plannable and not planned:
-        words = ['fisheye-svp diagnose', observations, *lenses, settings, '--next 6 -o next']
-        return ' '.join(filter(None, words))
-    if d.is_lens_off and not d.offers_extended:
-        return f'fisheye-svp calibrate {observations} {_image_sizes(d)} -o recalibrated' + (
-            '' if len(d.lenses) > 1 else '.yaml')
-    used = options if d.offers_extended else ' '.join(lenses)
-    return f'fisheye-svp localize {observations} {used} -o poses'
-
-
-def _image_sizes(d: Diagnosis) -> str:
-    """Return the option of `calibrate` that tells the image size of each camera."""
-    sizes = {camera: f'{lens.width}x{lens.height}' for camera, lens in d.lenses.items()}
-    if len({*sizes.values()}) == 1:
-        return f'--image-size {next(iter(sizes.values()))}'
-    return '--image-size ' + ','.join(f'{camera}={size}' for camera, size in sizes.items())

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fisheye_svp_ros.detect.photographs import Pixels
+from fisheye_svp_ros.io.image_files import to_color
 from fisheye_svp_ros.optics.lens import INTRINSICS
 from fisheye_svp_ros.planning.guide import MIN_SCORE, DetectedBoard, Guide
 from fisheye_svp_ros.reporting.shot_list import instruction
@@ -57,17 +58,13 @@ def _score_text(guide: Guide) -> str:
 def draw_guide(pixels: Pixels, guide: Guide, seen: DetectedBoard | None) -> NDArray[np.uint8]:
     """Return the picture (H, W, 3), blue, green, red, of an image with the guide over it."""
     zoom = min(1.0, _MAX_WIDTH / max(pixels.shape))
-    scale = 255 / max(float(pixels.max()), 1.0) if pixels.dtype != np.uint8 else 1.0
-    grey = cv2.resize(cv2.convertScaleAbs(pixels, alpha=scale), None, fx=zoom, fy=zoom,
-                      interpolation=cv2.INTER_AREA)
-    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
-    outline = guide.outline
+    picture, outline = to_color(pixels, zoom), guide.outline
     if outline is not None:
         colour = _READY if guide.score >= MIN_SCORE else _WANTED
         wanted = _to_fixed_point(outline[np.isfinite(outline).all(axis=1)], zoom)
         hull = cv2.convexHull(wanted)
         filled = cv2.fillConvexPoly(picture.copy(), hull, colour, cv2.LINE_AA, _FRACTION_BITS)
-        picture = cv2.addWeighted(filled, 0.25, picture, 0.75, 0)
+        picture = np.asarray(cv2.addWeighted(filled, 0.25, picture, 0.75, 0))
         cv2.polylines(picture, [hull], True, colour, 2, cv2.LINE_AA, _FRACTION_BITS)
         _dots(picture, wanted, colour, 2)
         cv2.circle(picture, wanted[0].tolist(), 9 << _FRACTION_BITS, colour, 2, cv2.LINE_AA,
@@ -78,7 +75,7 @@ def draw_guide(pixels: Pixels, guide: Guide, seen: DetectedBoard | None) -> NDAr
         first = found[int(np.argmin(seen.ids))].tolist()
         cv2.circle(picture, first, 9 << _FRACTION_BITS, _SEEN, 2, cv2.LINE_AA, _FRACTION_BITS)
     _draw_texts(picture, guide)
-    return np.asarray(picture)
+    return picture
 
 
 def _to_fixed_point(uv: NDArray[np.float64], zoom: float) -> NDArray[np.int32]:

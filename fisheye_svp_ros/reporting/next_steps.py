@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from fisheye_svp_ros.diagnosis import Diagnosis
 from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE
-from fisheye_svp_ros.reporting.first_screen import next_command
 
 
 class ReportInputs(NamedTuple):
@@ -32,10 +31,18 @@ class ReportInputs(NamedTuple):
 
 def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
     """Return the command to go on with, as a shell takes it."""
-    words = follow_up_files(diagnosis, inputs)
-    lenses = [shlex.join(['--lens', lens]) for lens in inputs.lens]
-    return next_command(diagnosis, words['observations'], words['options'], lenses,
-                        shlex.join(inputs.settings), inputs.planned)
+    d, files = diagnosis, follow_up_files(diagnosis, inputs)
+    observations, lenses = files['observations'], [
+        shlex.join(['--lens', lens]) for lens in inputs.lens]
+    if d.decision['lens'].say == 'undecided' and d.problem.plannable and not inputs.planned:
+        words = ['fisheye-svp diagnose', observations, *lenses, shlex.join(inputs.settings),
+                 '--next 6 -o next']
+        return ' '.join(filter(None, words))
+    if d.is_lens_off and not d.offers_extended:
+        return f'fisheye-svp calibrate {observations} {_image_sizes(d)} -o recalibrated' + (
+            '' if len(d.lenses) > 1 else '.yaml')
+    used = files['options'] if d.offers_extended else ' '.join(lenses)
+    return f'fisheye-svp localize {observations} {used} -o poses'
 
 
 def follow_up_files(diagnosis: Diagnosis, inputs: ReportInputs) -> dict[str, str]:
@@ -48,3 +55,11 @@ def follow_up_files(diagnosis: Diagnosis, inputs: ReportInputs) -> dict[str, str
         'options': shlex.join(options), 'search': shlex.join(inputs.search),
         'first': shlex.quote(str(next(iter(files.values())))),
     }
+
+
+def _image_sizes(d: Diagnosis) -> str:
+    """Return the option of `calibrate` that tells the image size of each camera."""
+    sizes = {camera: f'{lens.width}x{lens.height}' for camera, lens in d.lenses.items()}
+    if len({*sizes.values()}) == 1:
+        return f'--image-size {next(iter(sizes.values()))}'
+    return '--image-size ' + ','.join(f'{camera}={size}' for camera, size in sizes.items())

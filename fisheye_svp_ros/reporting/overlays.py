@@ -11,7 +11,7 @@ import numpy as np
 from fisheye_svp_ros.detect.detection import Detection, SearchedPhotograph
 from fisheye_svp_ros.detect.photographs import Photograph
 from fisheye_svp_ros.errors import FisheyeSvpError
-from fisheye_svp_ros.io.files import write_bytes
+from fisheye_svp_ros.io.image_files import to_color, write_png
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, picture
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
@@ -30,27 +30,21 @@ def write_overlays(photographs: Iterable[Photograph], detection: Detection, fold
         except FisheyeSvpError:
             continue
         name = '_'.join(filter(None, (searched.camera, photograph.key.replace('/', '_'))))
-        drawn = cv2.imencode('.png', _overlay(np.asarray(pixels), searched))[1]
-        write_bytes(folder / f'{name}.png', drawn.tobytes())
+        write_png(folder / f'{name}.png', _overlay(np.asarray(pixels), searched))
 
 
 def _overlay(pixels: np.ndarray, searched: SearchedPhotograph) -> np.ndarray:
-    scale = 255 / max(float(pixels.max()), 1.0) if pixels.dtype != np.uint8 else 1.0
-    grey = cv2.convertScaleAbs(pixels, alpha=scale)
-    zoom = _MAX_SIZE / max(grey.shape)
-    image = cv2.cvtColor(
-        cv2.resize(grey, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR
-    )
-    points = searched.points
+    zoom = _MAX_SIZE / max(pixels.shape)
+    image, points = to_color(pixels, zoom), searched.points
     if points is None:
         cv2.putText(image, searched.reason, (20, 40), cv2.FONT_HERSHEY_SIMPLEX, 1.0, _ORANGE, 2)
-        return np.asarray(image)
+        return image
     # In sixteenths of a pixel; the centre of the first pixel is at half a pixel of the picture.
     places = np.round(((points.uv + 0.5) * zoom - 0.5) * 16).astype(int)
     cv2.polylines(image, [places.astype(np.int32)], False, _BLUE, 1, cv2.LINE_AA, 4)
     for i, (u, v) in enumerate(places.tolist()):
         cv2.circle(image, (u, v), 16 * (14 if i == 0 else 5), _ORANGE, 2, cv2.LINE_AA, 4)
-    return np.asarray(image)
+    return image
 
 
 def write_coverage(detection: Detection, path: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.io.files import write_bytes
+from fisheye_svp_ros.io.image_files import to_color, write_png
 from fisheye_svp_ros.rectify.errors import (
     LIMIT,
     ImageError,
@@ -135,18 +135,12 @@ def draw_remaining(path: Path, side: Rectification, left: Remaining, what: str) 
 
 def draw_pair(path: Path, left: NDArray[Any], right: NDArray[Any]) -> None:
     """Draw two rectified images side by side, with rows across both."""
-    both = np.concatenate([_in_color(left), _in_color(right)], axis=1)
+    both = np.concatenate([to_color(left), to_color(right)], axis=1)
     zoom = min(_MAX_SIZE / both.shape[1], 1.0)
     both = cv2.resize(both, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA)
     for row in np.linspace(0, both.shape[0] - 1, _LINES + 2)[1:-1].round().astype(int).tolist():
         cv2.line(both, (0, row), (both.shape[1] - 1, row), _ORANGE, 1)
-    write_bytes(path, cv2.imencode('.png', both)[1].tobytes())
-
-
-def _in_color(image: NDArray[Any]) -> NDArray[np.uint8]:
-    if image.dtype != np.uint8:
-        image = cv2.convertScaleAbs(image, alpha=255 / max(float(image.max()), 1.0))
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image)
+    write_png(path, both)
 
 
 def _number(value: float, decimals: int) -> str:

@@ -14,10 +14,9 @@ import pytest
 from helpers.nodes import need_ros, until
 
 from fisheye_svp_ros.cli import main
-from fisheye_svp_ros.commands import shared_memory
-from fisheye_svp_ros.commands.processes import Processes
-from fisheye_svp_ros.commands.shared_memory import remove_orphans, segments
-from fisheye_svp_ros.commands.sweep_file import lens_folder, read_sweep
+from fisheye_svp_ros.commands import processes
+from fisheye_svp_ros.commands.node_sweeps import lens_folder, read_sweep
+from fisheye_svp_ros.commands.processes import Processes, remove_orphans, segments
 from fisheye_svp_ros.errors import GraphError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.share import lens_path
@@ -90,8 +89,8 @@ def test_shared_memory_of_a_living_process_is_left_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nor is its lock tried, which it might want at that moment; new segments have none yet."""
-    monkeypatch.setattr(shared_memory, '_FOLDER', tmp_path)
-    monkeypatch.setattr(shared_memory, '_is_locked', lambda lock: False)
+    monkeypatch.setattr(processes, '_SHARED_MEMORY', tmp_path)
+    monkeypatch.setattr(processes, '_is_locked', lambda lock: False)
     held, orphan = (tmp_path / f'fastrtps_port{number}' for number in (1, 2))
     for file in (held, orphan):
         file.touch()

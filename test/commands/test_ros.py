@@ -11,7 +11,7 @@ import pytest
 from helpers.nodes import ROOT, need_ros
 
 from fisheye_svp_ros.cli import main
-from fisheye_svp_ros.commands import ros
+from fisheye_svp_ros.commands import processes
 
 SWEEP = 'synthetic_camera: {ros__parameters: {sweep.radius: [1.0, 2.0]}}'
 
@@ -38,7 +38,7 @@ def test_a_ros_of_another_python_is_none(tmp_path: Path) -> None:
     (tmp_path / 'rclpy' / '__init__.py').touch()
     (tmp_path / 'rclpy' / 'node.py').write_text(
         'raise ImportError("no C extension for this Python\\nPlease refer to ...")')
-    code = 'from fisheye_svp_ros.commands import ros; print(ros.missing_rclpy())'
+    code = 'from fisheye_svp_ros.commands import processes; print(processes.missing_rclpy())'
     env = os.environ | {'PYTHONPATH': f'{tmp_path}{os.pathsep}{ROOT}'}
     done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True, text=True)
     assert done.stdout == 'no C extension for this Python\n', done.stderr
@@ -53,5 +53,5 @@ def test_nodes_stay_on_this_machine_where_no_environment_says_otherwise(
 ) -> None:
     need_ros()
     monkeypatch.setattr(os, 'environ', dict(given))
-    ros.prepare_ros()
+    processes.prepare_ros()
     assert os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE') == taken

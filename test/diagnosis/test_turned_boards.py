@@ -18,7 +18,7 @@ from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
-from fisheye_svp_ros.scene.board_turns import board_turns
+from fisheye_svp_ros.scene.boards import board_turns
 from fisheye_svp_ros.scene.observations import Observations, make_observations, views_of
 
 pytestmark = pytest.mark.usefixtures('undrawn')

@@ -12,7 +12,7 @@ import pytest
 from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError
 from fisheye_svp_ros.io.documents import dump_yaml, parse_json, parse_yaml, read_yaml
 from fisheye_svp_ros.io.files import read_bytes
-from fisheye_svp_ros.io.parameter_files import parameters_of, read_parameter_file
+from fisheye_svp_ros.io.parameters import parameters_of, read_parameter_file
 
 BOMB = 'a: &a [1, 1]\n' + ''.join(
     f'{n}: &{n} [*{m}, *{m}, *{m}, *{m}]\n' for m, n in zip('abcdefgh', 'bcdefghi', strict=True))

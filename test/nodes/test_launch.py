@@ -18,9 +18,9 @@ from helpers.graph import Graph
 from helpers.photographs import BOARD, LENS, poses
 
 from fisheye_svp_ros.io.bags import Bag
+from fisheye_svp_ros.io.csv_files import write_observations
 from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.io.lens_files import save_lens
-from fisheye_svp_ros.io.observations_csv import write_observations
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.pose import quaternion_from_rotation
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario

@@ -22,7 +22,7 @@ from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 from std_msgs.msg import Float64  # isort: skip
 
 from fisheye_svp_ros import cli
-from fisheye_svp_ros.commands.lock_step import values
+from fisheye_svp_ros.commands.node_sweeps import values
 from fisheye_svp_ros.commands.processes import Processes
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens

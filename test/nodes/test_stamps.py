@@ -15,10 +15,10 @@ from geometry_msgs.msg import PoseStamped  # isort: skip
 from sensor_msgs.msg import PointCloud2  # isort: skip
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.io.csv_files import write_observations
 from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
-from fisheye_svp_ros.io.observations_csv import write_observations
 from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages

@@ -11,7 +11,7 @@ from helpers.robot import LENS, TRUTH, robot
 
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
-from fisheye_svp_ros.reporting.hand_eye_text import hand_eye_warnings
+from fisheye_svp_ros.reporting.calibration_text import hand_eye_warnings
 from fisheye_svp_ros.solve.hand_eye import (
     HandEye,
     Transforms,

@@ -20,7 +20,7 @@ from helpers.nodes import ROOT, until
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.commands.executors import process_pool
-from fisheye_svp_ros.commands.sweep_file import read_sweep
+from fisheye_svp_ros.commands.node_sweeps import read_sweep
 from fisheye_svp_ros.errors import OutputError, ParameterError
 from fisheye_svp_ros.io import columns as tables
 from fisheye_svp_ros.io.columns import read_columns

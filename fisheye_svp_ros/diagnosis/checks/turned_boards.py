@@ -20,7 +20,7 @@ from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import Problem
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.effects.target_map import KnownTarget
-from fisheye_svp_ros.scene.board_turns import BoardTurn, board_turns
+from fisheye_svp_ros.scene.boards import BoardTurn, board_turns
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import frame_name

@@ -1,9 +1,13 @@
-"""Observations as CSV: frame,landmark,u,v,x,y,z and, optional, camera,board,t,sigma."""
+"""Observations and poses as CSV.
+
+Observations: frame,landmark,u,v,x,y,z and, optional, camera,board,t,sigma; poses:
+frame,x,y,z,qx,qy,qz,qw, the camera in the world (or target) frame.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +15,16 @@ from numpy.typing import NDArray
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.csv_table import CsvTable, write_table
+from fisheye_svp_ros.io.files import path_of
+from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_quaternion
 from fisheye_svp_ros.scene.landmarks import MOST_LANDMARK
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
 _MIN_UNSEEN_ROWS = 5
 
 REQUIRED_COLUMNS = ('frame', 'landmark', 'u', 'v', 'x', 'y', 'z')
+COLUMNS = ('frame', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
+_NORM_SLACK = 1e-3  # printed digits are forgiven, another convention is not
 
 
 def read(path: str | Path) -> Observations:
@@ -100,3 +108,41 @@ def write_observations(path: str | Path, observations: Observations) -> None:
         if known.any():
             columns[name] = values
     write_table(path, columns)
+
+
+class FramePoses(NamedTuple):
+    """Frames (F,), ascending, and the camera's poses (F,) in them."""
+
+    frame: Index
+    pose: Pose
+
+    def by_frame(self) -> dict[int, Pose]:
+        """Return the pose of each frame."""
+        return {number: self.pose.take(i) for i, number in enumerate(self.frame.tolist())}
+
+
+def read_poses(path: str | Path) -> FramePoses:
+    """Read poses: m and unit quaternions.
+
+    Raises ObservationError, naming file, line and column.
+    """
+    table = CsvTable(path_of(path), COLUMNS)
+    frame = table.integers('frame')
+    table.refuse_repeats(frame[:, None], 'frame')
+    quaternion = table.numbers('qx', 'qy', 'qz', 'qw')
+    norm = np.linalg.norm(quaternion, axis=-1)
+    table.refuse(np.abs(norm - 1) > _NORM_SLACK, 'qw', 'a quaternion of norm 1')
+    order = np.argsort(frame)
+    pose = Pose(rotation_from_quaternion(quaternion), table.numbers('x', 'y', 'z'))
+    return FramePoses(frame[order], pose.take(order))
+
+
+def write_poses(path: str | Path, frame: Index, pose: Pose) -> None:
+    """Write frames (F,) and poses (F,).  Raises OutputError where the file cannot be written."""
+    write_table(path, pose_columns(frame, pose))
+
+
+def pose_columns(frame: Index, pose: Pose) -> dict[str, NDArray[Any]]:
+    """Return frames (F,) and poses (F,) as COLUMNS."""
+    numbers = np.concatenate([pose.position, quaternion_from_rotation(pose.rotation)], axis=-1)
+    return dict(zip(COLUMNS, (frame, *numbers.T), strict=True))
