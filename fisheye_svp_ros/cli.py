@@ -106,7 +106,11 @@ def _run(arguments: Sequence[str]) -> None:
         module.add_arguments(commands.choices[named])
         commands.choices[named].set_defaults(run=module.run)
     if named in _SOLVING:
-        _add_engine(commands.choices[named])
+        commands.choices[named].add_argument(
+            '--engine', choices=('auto', 'numpy', 'numba'),
+            help='numpy, or numba (extra `fast`), which compiles for about a minute at its first '
+            'use on a machine; auto: numba for long work, numpy otherwise; default: '
+            'FISHEYE_SVP_ENGINE, or auto')
     parsed, unknown = parser.parse_known_args(arguments)
     if unknown:
         _refuse(commands.choices[named], unknown[0])
@@ -141,15 +145,6 @@ def _refuse(parser: argparse.ArgumentParser, word: str) -> NoReturn:
 
     near = get_close_matches(word.partition('=')[0], parser.format_help().split(), 1, 0.8)
     parser.error(f'unknown argument {word}' + (f'; did you mean {near[0]}?' if near else ''))
-
-
-def _add_engine(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        '--engine', choices=('auto', 'numpy', 'numba'),
-        help='numpy, or numba (extra `fast`), which compiles for about a minute at its first use '
-        'on a machine; auto: numba for long work, numpy otherwise; default: '
-        'FISHEYE_SVP_ENGINE, or auto',
-    )
 
 
 if __name__ == '__main__':

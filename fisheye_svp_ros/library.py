@@ -365,10 +365,7 @@ def _check_names(node: str, values: Mapping[str, Any]) -> None:
 
 
 def table_of(given: AnyObservations) -> Observations:
-    """Return a table of observations, read where a path is given.
-
-    Raises ParameterError for what is neither.
-    """
+    """Return a table, read where a path is given; raise ParameterError for what is neither."""
     if not isinstance(given, Observations | str | Path):
         raise ParameterError(f'observations are of type {type(given).__name__}; a table or a path '
                              'is needed')

@@ -15,12 +15,12 @@ from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_formats import write_foreign
 from fisheye_svp_ros.library import AnyLens, load_lens, save_lens
 from fisheye_svp_ros.library_checks import (
-    check_above,
     check_count,
     check_numbers,
     check_pair,
     check_pose,
     check_whole_numbers,
+    is_at_most,
 )
 from fisheye_svp_ros.planning import MAX_VIEWS
 from fisheye_svp_ros.pose import Pose
@@ -105,7 +105,8 @@ def plan(
         raise ParameterError(f'room is {room!r}; two distances above 0, m, are needed, the nearer '
                              'first')
     count = check_count(count, MAX_VIEWS, 'count')
-    check_above(noise_px, 0, 'noise_px', ' px')
+    if not is_at_most(noise_px, np.finfo(float).max) or not noise_px > 0:
+        raise ParameterError(f'noise_px is {noise_px!r}; a number above 0 px is needed')
     return choose(load_lens(lens), parse_pattern(board).points, ViewLimits(near, far), count,
                   number, noise_px)
 

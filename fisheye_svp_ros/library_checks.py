@@ -94,9 +94,3 @@ def check_pair(values: Any, name: str, needed: str) -> tuple[float, float]:
 def is_at_most(value: Any, most: float) -> bool:
     """Say whether a value is a number of at most `most`."""
     return isinstance(value, int | float | np.number) and bool(value <= most)
-
-
-def check_above(value: float, limit: float, name: str, unit: str = '') -> None:
-    """Raise ParameterError for what is not a finite number above a limit."""
-    if not is_at_most(value, np.finfo(float).max) or not limit < value:
-        raise ParameterError(f'{name} is {value!r}; a number above {limit:g}{unit} is needed')

@@ -58,7 +58,9 @@ def run(args: argparse.Namespace) -> None:
 
     lens = load_with_notes(lens_path(args.lens))
     spread = default_spread(lens) if args.spread is None else np.radians(args.spread).item()
-    limits = _limits(args)
+    limits = {
+        name: (value := getattr(args, option[2:].replace('-', '_'))) and factor * value
+        for name, (option, _, factor, _) in _LIMITS.items()}
     with progress('solving'):
         budget = make_budget(Setup(lens, rig(args.style, args.baseline), args.noise))
     points = at_point(budget, spread, args.working_range, limits)
@@ -74,11 +76,3 @@ def run(args: argparse.Namespace) -> None:
         with write_together():
             draw(args.output / 'budget.png', budget, points, asked)
             write_json(args.output / 'budget.json', document(budget, points, asked))
-
-
-def _limits(args: argparse.Namespace) -> dict[str, float | None]:
-    limits: dict[str, float | None] = {}
-    for name, (option, _, factor, _) in _LIMITS.items():
-        value = getattr(args, option.removeprefix('--').replace('-', '_'))
-        limits[name] = None if value is None else factor * value
-    return limits

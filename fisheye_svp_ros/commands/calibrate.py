@@ -111,7 +111,8 @@ def run(args: argparse.Namespace) -> None:
             for camera, one in found.items():
                 alone = not camera or (len(found) == 1 and args.output.suffix)
                 paths[camera] = args.output if alone else args.output / f'{camera}.yaml'
-                _write(one, paths[camera])
+                save_lens(one.lens, paths[camera])
+                write_json(paths[camera].with_suffix('.calibrate.json'), _document(one))
             report = (args.output / 'calibration.html' if len(paths) > 1 else
                       next(iter(paths.values())).with_suffix('.calibrate.html'))
             write_calibration_report(report, found, _next_command(args, paths))
@@ -201,26 +202,16 @@ def _calibrate_camera(
     if args.poses:
         with progress('fitting the robot'):
             result, hand_eye = calibrate_hand_eye(result, kept, read_poses(args.poses).by_frame())
-    try:
-        with stages(_fit_line(result)):  # the lens is there in a second, its errors take longer
+    known = [*result.adjusted.lens.parameters.items()][:4]
+    values = ', '.join(f'{name} {value:.6g}' for name, value in known)
+    try:  # the lens is there in a second, its errors take longer
+        with stages(f'{values}; computing their standard errors'):
             trusted = assess_lens(kept, result.adjusted.lens, result.adjusted.names)
     except np.linalg.LinAlgError as cause:
         raise GeometryError(f'{table.source}: the fitted lens has no rays to some of the observed '
                             f'points ({cause}); check --port and --medium') from cause
     lens = with_covariance(result.adjusted.lens, trusted)
     return CalibratedCamera(lens, result, trusted, kept, args.model, hand_eye)
-
-
-def _fit_line(result: Calibration) -> str:
-    """Return the intrinsics as they were fitted, in a line."""
-    known = list(result.adjusted.lens.parameters.items())[:4]
-    values = ', '.join(f'{name} {value:.6g}' for name, value in known)
-    return f'{values}; computing their standard errors'
-
-
-def _write(found: CalibratedCamera, path: Path) -> None:
-    save_lens(found.lens, path)
-    write_json(path.with_suffix('.calibrate.json'), _document(found))
 
 
 def _print(found: CalibratedCamera) -> None:

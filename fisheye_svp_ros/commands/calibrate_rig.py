@@ -35,10 +35,7 @@ def check_names(table: Observations, where: str) -> None:
 
 
 def fit_rig(table: Observations, lenses: Mapping[str, Lens]) -> RigCalibration | None:
-    """Fit the rig of all cameras that frames hold together, None where there is none; say why.
-
-    lenses: from `calibrate`.
-    """
+    """Fit the rig of the cameras that frames hold together; None, with a note why, for none."""
     try:
         table, _ = posable_observations(table, lenses)
         groups = connected_cameras(table)

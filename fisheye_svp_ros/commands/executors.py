@@ -30,10 +30,7 @@ class Workers(NamedTuple):
 
 @contextmanager
 def process_pool(count: int) -> Iterator[Workers]:
-    """Yield processes on this machine; 0: this process itself.
-
-    Raises SweepError when one of them dies.
-    """
+    """Yield processes here, 0: this one itself; raise SweepError when one of them dies."""
     if not count:
         yield Workers(InProcess(), 1)
         return
@@ -71,7 +68,10 @@ class _Processes(ProcessPoolExecutor):
 
         def pass_on(written: Future[Path]) -> None:
             try:
-                result.set_result(_load_and_delete(written.result()))
+                path = written.result()
+                value = pickle.loads(path.read_bytes())
+                path.unlink()
+                result.set_result(value)
             except Exception as error:
                 result.set_exception(error)
 
@@ -83,12 +83,6 @@ def _written(folder: str, fn: Callable[..., Any], *args: Any, **kwargs: Any) -> 
     with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
         pickle.dump(fn(*args, **kwargs), file)
     return Path(file.name)
-
-
-def _load_and_delete(path: Path) -> Any:
-    value = pickle.loads(path.read_bytes())
-    path.unlink()
-    return value
 
 
 @contextmanager

@@ -28,10 +28,7 @@ def add_lens_argument(parser: argparse.ArgumentParser, purpose: str = '') -> Non
 
 
 def load_with_notes(path: str | Path) -> Lens:
-    """Return the lens of a file; say what is odd about it.
-
-    Raises LensError for one that cannot be read.
-    """
+    """Return the lens of a file, or raise LensError; say what is odd about it."""
     lens, foreign = load_lens(path), read_lens_file(path)
     note_odd(lens, path, foreign.deviation_px(lens) if foreign else 0.0)
     return lens
@@ -67,10 +64,7 @@ class Lenses(dict[str, 'Lens']):
 
 
 def load_lenses(given: Sequence[str]) -> Lenses:
-    """Return the lenses of --lens.
-
-    Raises LensError for a lens that cannot be read, and for two of one camera.
-    """
+    """Return the lenses of --lens; raise LensError for a bad one, and for two of a camera."""
     lenses = Lenses()
     for text in given:
         camera, equals, path = text.partition('=')

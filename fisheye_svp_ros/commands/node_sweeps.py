@@ -19,10 +19,7 @@ _PATIENCE = 3600.0  # s, of a solver for the other topics of a set: nothing is l
 
 
 def read_sweep(path: Path) -> Plan:
-    """Return the sweep of a parameter file.
-
-    Raises ParameterError, naming the file, for whatever cannot be used.
-    """
+    """Return the sweep of a parameter file; raise ParameterError, naming it, for any fault."""
     try:
         given = read_parameter_file(path)
         for pattern, values in given.items():

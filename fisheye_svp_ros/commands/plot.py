@@ -37,9 +37,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Draw what the source is good for."""
+    from fisheye_svp_ros.reporting.sweep_plots import draw_table
+
     table = _table_in(args.source)
     with write_together():
-        files = _of_table(table, args.output) if table else _of_bag(args)
+        if table:
+            with progress('drawing'):
+                files = draw_table(read_columns(table), args.output)
+        else:
+            files = _of_bag(args)
     if not files:
         raise OutputError(f'{args.source}: nothing to draw; it needs residuals, or results of '
                           'different scenarios')
@@ -52,13 +58,6 @@ def _table_in(source: Path) -> Path | None:
         return source
     names = ['sweep.csv'] if is_recording(source) else ['sweep.csv', 'table.csv']
     return next((source / name for name in names if (source / name).exists()), None)
-
-
-def _of_table(path: Path, folder: Path) -> list[Path]:
-    from fisheye_svp_ros.reporting.sweep_plots import draw_table
-
-    with progress('drawing'):
-        return draw_table(read_columns(path), folder)
 
 
 def _of_bag(args: argparse.Namespace) -> list[Path]:

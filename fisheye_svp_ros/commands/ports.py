@@ -30,7 +30,12 @@ def port_of(args: argparse.Namespace) -> Port | None:
     """
     if args.medium is None and args.port is None:
         return None
-    index = _index(args.medium or 'water')
+    medium = args.medium or 'water'
+    try:
+        index = MEDIA.get(medium) or float(medium)
+    except ValueError as cause:
+        raise ParameterError(f'--medium {medium}: known are {", ".join(MEDIA)}, and refractive '
+                             'indices') from cause
     kind, *numbers = (args.port or 'flat').split(':')
     try:
         if kind == 'flat' and len(numbers) <= 2:
@@ -82,17 +87,6 @@ def dome_of(args: argparse.Namespace, lenses: Mapping[str, Lens]) -> tuple[DomeP
     if len(lenses) > 1 or any(lens.port is not None for lens in lenses.values()):
         raise ParameterError(f'{option}: one lens without a port of its own is needed')
     return (DomePortEffect(port.radius, port.thickness, port.glass_index),)
-
-
-def _index(medium: str) -> float:
-    if medium in MEDIA:
-        return MEDIA[medium]
-    try:
-        return float(medium)
-    except ValueError as cause:
-        known = ', '.join(MEDIA)
-        raise ParameterError(
-            f'--medium {medium}: known are {known}, and refractive indices') from cause
 
 
 def _glass(numbers: list[str]) -> dict[str, float]:

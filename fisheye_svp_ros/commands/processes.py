@@ -99,10 +99,7 @@ class Processes:
     def wait(
         self, names: Sequence[str], patience: float, look: Callable[[], None] = lambda: None
     ) -> None:
-        """Wait until some have ended well; `look` is called now and then meanwhile.
-
-        Raises GraphError where one does not end in time.
-        """
+        """Wait until some end well, and `look` meanwhile; raise GraphError for one too late."""
         end = time.monotonic() + patience
         waiting = set(names)
         while waiting:

@@ -55,7 +55,9 @@ def run(args: argparse.Namespace) -> None:
                              'run them all')
     parts = TableParts(args.output / _PARTS, column_types(plan))
     mine = fingerprint(plan)
-    if args.resume and _is_complete(args.output, mine):
+    summary = args.output / _SUMMARY
+    if args.resume and summary.exists() and (
+            read_json(summary, OutputError).get('fingerprint') == mine):
         say(f'{args.output} already holds this sweep')
     else:
         engine = _claim(parts, mine, args.resume, work(plan))
@@ -68,12 +70,6 @@ def run(args: argparse.Namespace) -> None:
             _report(path, args.output, plan, mine)
         note_formats()
     shutil.rmtree(parts.folder, ignore_errors=True)
-
-
-def _is_complete(folder: Path, mine: str) -> bool:
-    """Say whether a folder holds the whole table of a sweep."""
-    summary = folder / _SUMMARY
-    return summary.exists() and read_json(summary, OutputError).get('fingerprint') == mine
 
 
 def _claim(parts: TableParts, mine: str, resume: bool, points: int) -> str:

@@ -204,10 +204,7 @@ class Bag:
                            + '; '.join(notes[:_MAX_LISTED]) + more)
 
     def topics(self) -> set[tuple[str, str]]:
-        """Return what topics there are, and of which types.
-
-        Raises BagError where nothing can be read.
-        """
+        """Return the topics and their types; raise BagError where nothing can be read."""
         listed = [_list_topics(file) for file in self._files()]
         if all(listed):
             return set().union(*listed)

@@ -75,10 +75,7 @@ class TableParts:
             {name: list(columns[name]) for name in self._types}, default=np.generic.item))
 
     def join(self, path: Path) -> list[Path]:
-        """Write all parts, in the order of their numbers, as `write_columns` does.
-
-        Raises OutputError for a part that is damaged.
-        """
+        """Write all parts in order as `write_columns` does; raise OutputError for a bad one."""
         parts = map(self._read, sorted(self.numbers()))
         return _write(path, list(self._types), self._types, parts)
 
@@ -112,10 +109,7 @@ def as_numbers(cells: Sequence[float | None]) -> Array:
 
 
 def read_columns(path: Path) -> dict[str, list[Any]]:
-    """Return the columns of a CSV or Parquet table; an empty cell is None.
-
-    Raises OutputError for a file that is no such table.
-    """
+    """Return the columns of a CSV or Parquet table, None = empty cell; raise OutputError."""
     if path.suffix == '.csv':
         try:
             return {name: parse_cells(cells) for name, cells in CsvTable(path, ()).items()}

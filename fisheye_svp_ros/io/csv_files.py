@@ -122,10 +122,7 @@ class FramePoses(NamedTuple):
 
 
 def read_poses(path: str | Path) -> FramePoses:
-    """Read poses: m and unit quaternions.
-
-    Raises ObservationError, naming file, line and column.
-    """
+    """Read poses: m, unit quaternions; raise ObservationError, naming file, line and column."""
     table = CsvTable(path_of(path), COLUMNS)
     frame = table.integers('frame')
     table.refuse_repeats(frame[:, None], 'frame')

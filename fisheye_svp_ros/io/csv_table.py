@@ -175,10 +175,7 @@ def _is_number(cell: str) -> bool:
 
 
 def write_table(path: str | Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write columns (N,) as CSV; numbers read back to the same bits.
-
-    Raises OutputError where the file cannot be written.
-    """
+    """Write columns (N,) as CSV, which reads back to the same bits; raise OutputError."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
     writer.writerow(columns)

@@ -37,10 +37,7 @@ class ImagePoints(NamedTuple):
 
 
 class CameraModel(NamedTuple):
-    """A CameraInfo: distortion model; width, height, px; intrinsics; coefficients.
-
-    intrinsics: fx, fy, cx, cy and skew, px.
-    """
+    """A CameraInfo: size: width, height, px; intrinsics: fx, fy, cx, cy, skew, px; d as it is."""
 
     model: str
     size: tuple[int, int]
@@ -123,9 +120,10 @@ def read_camera_info(message: Any, topic: str = 'camera_info') -> CameraModel:
 
 def statuses(message: Any) -> list[Status]:
     """Return the statuses of a DiagnosticArray."""
-    return [
-        Status(_level(status.level), str(status.message), {p.key: p.value for p in status.values})
-        for status in message.status
+    return [  # the level is a byte: rclpy gives bytes, a bag reader a number
+        Status(one.level[0] if isinstance(one.level, bytes) else int(one.level), str(one.message),
+               {pair.key: pair.value for pair in one.values})
+        for one in message.status
     ]
 
 
@@ -147,8 +145,3 @@ def _pose(position: Any, orientation: Any, topic: str) -> Pose:
     if np.abs(quaternion).max() > 2 or abs(np.linalg.norm(quaternion) - 1) > 1e-3:
         raise ObservationError(f'{topic}: the orientation is not a unit quaternion')
     return Pose(rotation_from_quaternion(quaternion), place)
-
-
-def _level(level: Any) -> int:
-    """Return a level, which is a byte: rclpy gives bytes, a bag reader a number."""
-    return level[0] if isinstance(level, bytes) else int(level)

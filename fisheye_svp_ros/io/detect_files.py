@@ -60,10 +60,7 @@ def check_sizes(path: str, sizes: Sizes, lenses: Mapping[str, Lens]) -> None:
 
 
 def check_size_given(path: str, sizes: Sizes, given: Sizes, name: str) -> None:
-    """Raise ParameterError where images are of another size than an argument of a name says.
-
-    sizes: as in `check_sizes`.
-    """
+    """Raise ParameterError where images have another size than an argument; sizes: as above."""
     for camera, (width, height) in (sizes or sizes_beside(Path(path))).items():
         size = given.get(camera) or given.get('') or (width, height)
         if size != (width, height):

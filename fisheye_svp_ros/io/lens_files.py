@@ -99,10 +99,7 @@ def save_lens(lens: Lens, path: str | Path, note: str = '') -> None:
 
 
 def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
-    """Build a lens from the mapping of its YAML; corrections go to their places in the lens.
-
-    Raises LensError naming `where` and field.
-    """
+    """Build a lens from the mapping of its YAML; raise LensError, naming `where` and field."""
     _refuse_unknown(document, _FIELDS, where, {_LEGACY_KEY})
     image = _section(document, 'image', where)
     target = _effects(document, 'target', where)

@@ -227,10 +227,7 @@ def database_topics(path: Path) -> set[tuple[str, str]]:
 
 
 def _connect(path: Path) -> sqlite3.Connection:
-    """Open a database; raise BagError for cells that are computed.
-
-    A few bytes of SQL can stand for gigabytes.
-    """
+    """Open a database; raise BagError for computed cells, of which few bytes make gigabytes."""
     database = sqlite3.connect(f'file:{quote(str(path.absolute()))}?mode=ro', uri=True)
     try:
         _refuse_unless(not database.execute(_COMPUTED_CELLS).fetchone())

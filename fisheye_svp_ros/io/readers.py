@@ -37,17 +37,14 @@ class Reader(NamedTuple):
     module: str
 
 
-def _holds(pattern: str) -> Callable[[Path], bool]:
-    return lambda path: path.is_dir() and any(path.glob(pattern))
-
-
 _PACKAGE = 'fisheye_svp_ros.io'
 READERS: Registry[Reader] = Registry('readers', {
     reader.form: reader for reader in (
         Reader('a .csv file', lambda path: path.suffix.lower() == '.csv',
                f'{_PACKAGE}.csv_files'),
         Reader('an .orpc file', lambda path: path.suffix == '.orpc', f'{_PACKAGE}.orpc'),
-        Reader('a folder of .orpc files', _holds('*.orpc'), f'{_PACKAGE}.orpc'),
+        Reader('a folder of .orpc files',
+               lambda path: path.is_dir() and any(path.glob('*.orpc')), f'{_PACKAGE}.orpc'),
         Reader('a rosbag2 recording', is_recording, f'{_PACKAGE}.observations_bag'),
     )
 }, Reader)

@@ -51,17 +51,13 @@ def tabulate(records: Iterable[Any]) -> Columns:
     bases = {base for base, _ in tags}
     rows = {key: dict(values) for key, values in tags.items()}
     for node, stamp, values in results:
-        base = _base_of(node, bases)
+        # A node belongs to the scenario of the longest namespace that holds it.
+        base = max((base for base in bases if node.startswith(f'{base}/')), key=len,
+                   default=node.rpartition('/')[0])
         prefix = node.removeprefix(f'{base}/')
         row = rows.setdefault((base, stamp), {})
         row.update({f'{prefix}.{key}': value for key, value in values.items()})
     return _columns(rows)
-
-
-def _base_of(node: str, bases: set[str]) -> str:
-    """Return the namespace of the scenario a node belongs to: the longest that holds it."""
-    holding = [base for base in bases if node.startswith(f'{base}/')]
-    return max(holding, key=len, default=node.rpartition('/')[0])
 
 
 def _columns(rows: Mapping[tuple[str, int], Mapping[str, str]]) -> Columns:

@@ -40,7 +40,8 @@ class Columns(dict[str, list[Any]]):
         return write_columns(Path(path), self)
 
     def __str__(self) -> str:
-        cells = [list(self), *([_format_cell(cell) for cell in row] for row in self.rows())]
+        cells = [list(self), *([f'{cell:.6g}' if isinstance(cell, float) else str(cell)
+                                for cell in row] for row in self.rows())]
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         return '\n'.join(
             '  '.join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
@@ -81,10 +82,7 @@ class Result(ABC):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what `save` wrote.
-
-        Raises ObservationError, naming the file, for one that holds no such result.
-        """
+        """Read what `save` wrote; raise ObservationError, naming the file, for anything else."""
         document = read_json(path, ObservationError)
         try:
             if document.pop(_KIND_KEY) != cls.__name__:
@@ -131,7 +129,3 @@ def _from_json(value: Any, hint: Any) -> Any:
     if len(kinds) == 1 and get_origin(hint) is not list:
         return _from_json(value, kinds[0])
     return value
-
-
-def _format_cell(cell: Any) -> str:
-    return f'{cell:.6g}' if isinstance(cell, float) else str(cell)

@@ -25,18 +25,12 @@ def config_path(name: str) -> Path:
 
 
 def lens_path(name: str) -> Path:
-    """Return the path of a lens: a file as given, or the name of one in config/lenses.
-
-    Raises LensError for a name that is neither.
-    """
+    """Return a lens file as given, or by its name in config/; raise LensError for neither."""
     return _given_or_named(name, 'lenses', LensError)
 
 
 def sweep_path(name: str) -> Path:
-    """Return the path of a sweep file: a file as given, or the name of one in config/sweeps.
-
-    Raises ParameterError for a name that is neither.
-    """
+    """Return a sweep file as given, or that in config/sweeps; raise ParameterError for neither."""
     return _given_or_named(name, 'sweeps', ParameterError)
 
 

@@ -48,10 +48,7 @@ Block = Heading | Text | TableBlock | Picture
 
 
 def write_blocks(folder: Path, name: str, blocks: Sequence[Block]) -> list[Path]:
-    """Write NAME.md and NAME.html into a folder that holds the pictures; return both.
-
-    Raises OutputError where one cannot be written.
-    """
+    """Write NAME.md and NAME.html beside the pictures; return both, or raise OutputError."""
     pictures = {block.file: data_uri(folder / block.file)
                 for block in blocks if isinstance(block, Picture)}
     pages = [folder / f'{name}.{suffix}' for suffix in ('md', 'html')]

@@ -73,14 +73,12 @@ class CalibratedCamera:
     @cached_property
     def warnings(self) -> tuple[str, ...]:
         """What there is to say against the lens, a sentence each."""
-        return (*self._shift_warnings(), *self._fit_warnings(), *self._image_warnings(),
-                *(hand_eye_warnings(self.hand_eye) if self.hand_eye else ()))
-
-    def _shift_warnings(self) -> list[str]:
-        return [
+        shifts = [
             f'{name} is undetermined: {1e3 * range_.low:.2f} to {1e3 * range_.high:.2f} mm, since '
             'the shape of the target is confounded with it; run `fisheye-svp diagnose`'
             for name, range_ in self.trust.doubtful_shift.items()]
+        return (*shifts, *self._fit_warnings(), *self._image_warnings(),
+                *(hand_eye_warnings(self.hand_eye) if self.hand_eye else ()))
 
     def _fit_warnings(self) -> list[str]:
         found, result = [], self.result

@@ -153,10 +153,7 @@ def _grid(
 
 
 def _plot_bins(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> float:
-    """Draw points, and of bins of equal count the means, their errors and the scatter.
-
-    Returns the largest mean with its error, px.
-    """
+    """Draw points and bins: means, errors, scatter; return the largest mean and error, px."""
     axis.plot(x, y, '.', ms=1.5, color=colour, alpha=0.15, zorder=1)
     order = np.argsort(x, kind='stable')
     parts = np.array_split(order, max(min(_BINS, len(x) // 8), 1))
@@ -186,10 +183,7 @@ def draw_groups(
     path: Path, shown: PlotData, group: Index, x: Array | None, label: str,
     ticks: Sequence[str] = (),
 ) -> None:
-    """Rms of the residuals of each group (K,): landmark or frame, or over a variable (K,).
-
-    ticks: names of the groups 0, 1, ...
-    """
+    """Rms of the residuals of each group (K,), or over a variable (K,); ticks: their names."""
     names, label_of, count = np.unique(group, return_inverse=True, return_counts=True)
     place = names if x is None else np.bincount(label_of, weights=x) / count
     order = np.argsort(place, kind='stable')

@@ -81,7 +81,10 @@ def write_report(
                   **{p.stem: data_uri(p) for p in pictures}},
         shown=_CAPTIONS.items(),
         **_causes(diagnosis), **_budget(diagnosis), **_evidence(diagnosis),
-        **_remaining_structures(diagnosis), next=_next_views(wanted),
+        **_remaining_structures(diagnosis),
+        next={} if wanted is None else {
+            'purpose': shot_list.purpose(wanted), 'header': shot_list.HEADER,
+            'rows': shot_list.rows(wanted)},
         uncertainty=list(figure_rows.uncertainty_rows(diagnosis)),
         known=list(text.known_rows(diagnosis, known)), free=_free(inputs, diagnosis),
         external=external_text.sections(diagnosis), carried_header=external_text.CARRIED_HEADER,
@@ -89,13 +92,6 @@ def write_report(
         extended=follow_up_files(diagnosis, inputs), not_offered=text.refusal_reason(diagnosis),
     ))
     return [report, *pictures]
-
-
-def _next_views(wanted: NextViews | None) -> dict[str, Any]:
-    if wanted is None:
-        return {}
-    return {'purpose': shot_list.purpose(wanted), 'header': shot_list.HEADER,
-            'rows': shot_list.rows(wanted)}
 
 
 def _draw(diagnosis: Diagnosis, points: PointResiduals, folder: Path) -> Iterator[Path]:

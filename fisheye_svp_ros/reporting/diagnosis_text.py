@@ -336,10 +336,7 @@ def _remedy(cause: Cause) -> str:
 def known_rows(
     d: Diagnosis, known: Mapping[str, Comparison]
 ) -> Iterable[tuple[str, str, str, str]]:
-    """Yield name, mean error before and after, and by how much it is less.
-
-    Without a cause in the model nothing comes after.
-    """
+    """Yield name, mean error before, after ('-': no cause), and by how much it is less."""
     changed = any(cause.effect_class.stage != 'noise' for cause in d.causes)
     for name, compared in known.items():
         label, before, *rest = compared_row(name, compared)

@@ -74,10 +74,7 @@ class OutlierRow(NamedTuple):
 
 
 def outlier_rows(gross: Sequence[Mapping[str, Any]]) -> list[OutlierRow]:
-    """Return one row for each view and reason, the most points first.
-
-    gross: as in diagnosis.json, one entry a point.
-    """
+    """Return a row for each view and reason, most points first; gross: as in diagnosis.json."""
     groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for one in gross:
         where = one.get('photograph') or f'frame {one["frame"]}'

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from fisheye_svp_ros.diagnosis import NAMED_P, Cause, Diagnosis
 from fisheye_svp_ros.reporting.cause_text import describe_effect, most_significant, size
 from fisheye_svp_ros.reporting.diagnosis_text import (
@@ -123,7 +125,8 @@ def _sentence(d: Diagnosis, cause: Cause) -> str:
 def _statement(d: Diagnosis, cause: Cause) -> str:
     if cause.effect == 'target_shape':
         worst = max(d.board_maps((cause.effect,)), key=lambda one: one.peak_to_valley)
-        which = f'Board {worst.board}' if len(_boards(d)) > 1 else 'The board'
+        several = len(np.unique(d.problem.observations.board)) > 1
+        which = f'Board {worst.board}' if several else 'The board'
         return f'{which} is bent by {1e3 * worst.peak_to_valley:.2g} mm'
     words = _HEADLINES.get(cause.effect, _capital(describe_effect(cause.effect)))
     if cause.effect == 'landmark_scale' and 'relative' not in cause.parameters:
@@ -131,10 +134,6 @@ def _statement(d: Diagnosis, cause: Cause) -> str:
     # Of several parameters, the most significant one.
     how = size(d, cause) if cause.effect_class.target_map else most_significant(cause.parameters)
     return f'{words} ({how})' if how else words
-
-
-def _boards(d: Diagnosis) -> set[int]:
-    return {*d.problem.observations.board.tolist()}
 
 
 def _capital(text: str) -> str:

@@ -20,10 +20,7 @@ _MAX_SIZE = 1600  # px, of an overlay
 
 
 def write_overlays(photographs: Iterable[Photograph], detection: Detection, folder: Path) -> None:
-    """Draw each photograph with its corners in their order, the first of them ringed.
-
-    Raises OutputError where a picture cannot be written.
-    """
+    """Draw each photograph with its corners in order, the first ringed, or raise OutputError."""
     for photograph, searched in zip(photographs, detection.searched, strict=True):
         try:
             pixels = photograph.pixels()

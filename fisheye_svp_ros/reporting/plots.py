@@ -41,10 +41,7 @@ _COMPRESSION = {'compress_level': 3}  # files 6 % larger than at 6, in a third o
 
 @contextmanager
 def picture(path: Path, width: float, height: float, tight: bool = False) -> Iterator[Figure]:
-    """Yield a figure of a size in inches; write it whole when the block succeeds.
-
-    tight: see `drawing`.
-    """
+    """Yield a figure of a size, in; write it when the block succeeds; tight: see `drawing`."""
     drawn = BytesIO()
     with drawing(drawn, width, height, path.suffix[1:], tight) as figure:
         yield figure

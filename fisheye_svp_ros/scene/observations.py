@@ -56,10 +56,7 @@ class Observations:
         return np.unique(self.frame)
 
     def landmarks(self) -> Landmarks:
-        """Return the landmarks that the rows mention, each once.
-
-        Raises ObservationError where two rows disagree on a landmark's place.
-        """
+        """Return each landmark once; raise ObservationError where rows disagree on its place."""
         ids, first, inverse = np.unique(self.landmark, return_index=True, return_inverse=True)
         off = np.abs(self.xyz - self.xyz[first][inverse]).max(axis=-1) > 1e-9
         if np.any(off):
@@ -138,10 +135,7 @@ class Views(_Views, Batch):
 
 
 def group_views(observations: Observations) -> Views:
-    """Group a table into views, ordered by frame and camera; sigma where unknown is 1 px.
-
-    Raises ObservationError for an empty table.
-    """
+    """Group a table by frame and camera, unknown sigma 1 px; raise ObservationError for none."""
     if not len(observations):
         raise ObservationError(f'{observations.source}: it holds no observation')
     keys = np.stack([observations.frame, observations.camera], axis=-1)

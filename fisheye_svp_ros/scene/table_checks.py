@@ -18,10 +18,7 @@ _MANY_POINTS, _MIN_POINTS = 1500, 24  # of a thinned table, and of a view that s
 
 
 def order_cameras(table: Observations, cameras: tuple[str, ...]) -> Observations:
-    """Return other observations of a rig with its cameras in the order of these.
-
-    Raises ObservationError where they are of other cameras.
-    """
+    """Return observations of a rig in the order of these cameras, or raise ObservationError."""
     if len(cameras) == 1:
         return table
     if set(table.cameras) != set(cameras):

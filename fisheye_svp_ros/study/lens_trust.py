@@ -78,10 +78,7 @@ def calibrate_without_outliers(
 
 
 def assess_lens(observations: Observations, lens: Lens, names: Sequence[str]) -> LensTrust:
-    """Return what the null model of a diagnosis says of a lens fitted to one camera's views.
-
-    names: the parameters that were fitted.
-    """
+    """Return what the null model says of a lens fitted to one camera's views, names being free."""
     data = group_by_frame(observations)
     null = NullModel.estimate(data, adjust(data, initial_state(data, lens), names), names)
     # What else the lens has, its corrections, is fitted along and follows them.

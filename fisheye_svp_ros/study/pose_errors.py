@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import ErrorParts, LensErrors
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.pose import Pose, identity
@@ -38,7 +37,8 @@ def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) 
     where a point is NaN or a camera does not see it.
     """
     found = [np.full((len(points), 3, 3), np.nan) for _ in ErrorParts._fields]
-    for rows in _split_rows(np.flatnonzero(np.isfinite(points).all(axis=1))):
+    known = np.flatnonzero(np.isfinite(points).all(axis=1))
+    for rows in (known[i:i + _MAX_POINTS] for i in range(0, len(known), _MAX_POINTS)):
         views = views_of(points[rows, None], np.zeros((len(rows), 1, 2)))
         pairs = [(errors, errors.linearize(views, pose)) for errors, pose in (
             (left, rig.broadcast_to(len(rows))), (right, identity(len(rows))))]
@@ -57,8 +57,3 @@ def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) 
         for whole in found:
             whole[rows[~seen]] = np.nan
     return ErrorParts(*found)
-
-
-def _split_rows(rows: Index) -> Iterator[Index]:
-    for first in range(0, len(rows), _MAX_POINTS):
-        yield rows[first:first + _MAX_POINTS]

@@ -97,10 +97,7 @@ def residual_points(model: ForwardModel, views: Views, solution: Localization) -
 def solve_rigs(
     models: Pair, left: Views, right: Views, systems: int = 1, true: Pose | None = None
 ) -> SetSolutions[StereoCalibration]:
-    """Calibrate S rigs from S * V views; models: left, right; true: rigs (S,).
-
-    Raises GeometryError as `calibrate_stereo` does.
-    """
+    """Calibrate S rigs of S * V views; models: left, right; true (S,); raise GeometryError."""
     found = calibrate_stereo(*models, left, right, systems)
     metrics = stereo_calibration_metrics(
         found.rig, found.left_residual, found.right_residual, true

@@ -56,10 +56,7 @@ def values(mapping: Mapping[str, Any], names: Sequence[str], where: str) -> list
 def coefficients(
     mapping: Mapping[str, Any], name: str, counts: Sequence[int], where: str
 ) -> list[float]:
-    """Return as many numbers of a list as one of `counts`, ascending; zeros may follow the last.
-
-    Raises LensError naming the field.
-    """
+    """Return as many numbers of a list as one of `counts`, or raise LensError; zeros follow."""
     given = mapping.get(name)
     count = len(given) if isinstance(given, list) else 0
     numbers_given = numbers(mapping, name, count or counts[0], where)

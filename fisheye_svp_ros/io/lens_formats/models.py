@@ -118,7 +118,8 @@ class Distortion:
     def height(self, theta: Array) -> Array:
         """Return the image height for unit focal length, of incidence angles, rad."""
         height = self.base.height(theta)
-        return np.asarray(height * self._stretch(height * height))
+        above, below = (1 + _powers(one, height * height) for one in (self.stretch, self.below))
+        return np.asarray(height * (above / below))
 
     def project(self, theta: Array, azimuth: Array) -> Array:
         """Return image points (..., 2) for unit focal length."""
@@ -132,9 +133,6 @@ class Distortion:
         return np.asarray(stretched + np.stack([
             (2 * p1 * x * y + p2 * (z + 2 * x * x)) * grown + along_u,
             (p1 * (z + 2 * y * y) + 2 * p2 * x * y) * grown + along_v], axis=-1))
-
-    def _stretch(self, z: Array) -> Array:
-        return np.asarray((1 + _powers(self.stretch, z)) / (1 + _powers(self.below, z)))
 
 
 def _powers(coefficients: Sequence[float], z: Array) -> Array:
@@ -222,10 +220,7 @@ def kannala_brandt(
     name: str, size: Sequence[float], intrinsics: Sequence[float], k: Sequence[float],
     where: str, shift: ViewpointShift | None = None,
 ) -> Lens:
-    """Build a Kannala-Brandt lens: size (width, height); intrinsics fx, fy, cx, cy.
-
-    Raises LensError, naming `where`, where it is impossible.
-    """
+    """Build a lens: size (width, height); intrinsics fx, fy, cx, cy; raise LensError for none."""
     try:
         width, height, fx, fy, cx, cy = map(float, (*size, *intrinsics))
         curve = KannalaBrandt(*map(float, k))

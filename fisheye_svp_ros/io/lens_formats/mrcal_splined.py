@@ -62,10 +62,7 @@ def read(model: str, values: Sequence[float], size: Sequence[int], where: str) -
 
 
 def fit_model(lens: Lens) -> tuple[str, list[float]]:
-    """Return model and intrinsics of the nearest splined lens.
-
-    Raises LensError where none is within a hundredth of a pixel.
-    """
+    """Return model and intrinsics of the nearest splined lens; raise LensError above 0.01 px."""
     worst = np.inf
     for columns in _NODES:
         model, field, worst = _fit_nodes(replace(lens, target={}), columns)

@@ -72,8 +72,9 @@ def _urdf(text: str, where: str) -> Iterator[_Joint]:
             given = {} if origin is None else origin.attrib
             place, turn = (_numbers(given.get(name, '0 0 0'), f'{where}: {joint.get("name")}')
                            for name in ('xyz', 'rpy'))
+            roll, pitch, yaw = rotation_from_vector(np.diag(turn))  # about fixed axes
             yield (str(ends[0].get('link')), str(ends[1].get('link')),
-                   Pose(_from_rpy(turn), place))
+                   Pose(np.asarray(yaw @ pitch @ roll), place))
 
 
 def _numbers(text: str, where: str) -> Array:
@@ -81,12 +82,6 @@ def _numbers(text: str, where: str) -> Array:
     with suppress(ValueError):
         words = [float(word) for word in words]
     return np.array(fields.numbers({'origin': words}, 'origin', 3, where))
-
-
-def _from_rpy(angles: Array) -> Array:
-    """Roll, pitch and yaw about fixed axes, as URDF has them."""
-    roll, pitch, yaw = rotation_from_vector(np.diag(angles))
-    return np.asarray(yaw @ pitch @ roll)
 
 
 def _messages(text: str, where: str) -> Iterator[_Joint]:
