@@ -35,7 +35,7 @@ from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.terminal import progress
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.simulate.render import Exposure, Field, Print, render
 from fisheye_svp_ros.simulate.targets import board_views

@@ -26,7 +26,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.terminal import progress
 
 _DOC = Path(__file__).parents[1] / 'docs' / 'results' / 'reliability.md'
 _BEGIN, _END = '<!-- kills -->', '<!-- end of kills -->'

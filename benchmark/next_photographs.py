@@ -42,7 +42,7 @@ from fisheye_svp_ros.planning.optimal_design import (
     information,
 )
 from fisheye_svp_ros.pose import identity
-from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.terminal import progress
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.simulation import blank_views

@@ -27,7 +27,7 @@ from fisheye_svp_ros.io.lens_formats import write_foreign
 from fisheye_svp_ros.optics.curves import Equidistant, Gennery
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector, vector_from_rotation
-from fisheye_svp_ros.reporting.tables import range_text
+from fisheye_svp_ros.reporting.terminal import range_text
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 
 _DOC = Path(__file__).parents[1] / 'docs' / 'results' / 'rectification.md'

@@ -73,7 +73,7 @@ def same_engine(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def no_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     """Print no line of progress among those of a command, however busy the machine is."""
-    monkeypatch.setattr('fisheye_svp_ros.reporting.progress._INTERVAL', math.inf)
+    monkeypatch.setattr('fisheye_svp_ros.reporting.terminal._INTERVAL', math.inf)
 
 
 @pytest.fixture(scope='session', autouse=True)

@@ -27,7 +27,6 @@ from fisheye_svp_ros.io.columns import TableParts, arrow, read_columns, write_co
 from fisheye_svp_ros.io.landmark_files import environment, load_landmarks
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.lens_formats import WRITABLE, write_foreign
-from fisheye_svp_ros.io.observations_bag import read as read_observations_bag
 from fisheye_svp_ros.io.parameters import rows, sweep_of, with_values
 from fisheye_svp_ros.io.readers import (
     read_observations,
@@ -36,6 +35,7 @@ from fisheye_svp_ros.io.readers import (
     write_poses,
 )
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
+from fisheye_svp_ros.io.recording import read as read_observations_bag
 from fisheye_svp_ros.io.share import config_path, lens_path
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import KannalaBrandt

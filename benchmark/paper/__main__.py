@@ -31,7 +31,7 @@ from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_files import lens_from_dict, load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.paper.tables import LENSES
-from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.terminal import progress
 
 
 def search(executor: Executor) -> dict[str, Any]:

@@ -18,7 +18,7 @@ os.environ.setdefault('ROS_DOMAIN_ID', '77')
 
 from benchmark.soak import answers
 from benchmark.soak.victims import KINDS, Victim, Watch, Wire
-from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.terminal import progress
 
 _AHEAD = 1000  # messages that a node has not counted, and sets that wait, in the first round
 _CHUNK = 100

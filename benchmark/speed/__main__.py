@@ -24,7 +24,7 @@ from benchmark.speed import (  # noqa: E402
 from benchmark.speed.report import document  # noqa: E402
 from benchmark.speed.scenes import NOISE_PX  # noqa: E402
 from fisheye_svp_ros.io.files import write_text  # noqa: E402
-from fisheye_svp_ros.reporting.progress import progress  # noqa: E402
+from fisheye_svp_ros.reporting.terminal import progress  # noqa: E402
 
 _PARTS = {
     'projection': projection.rows,

@@ -51,8 +51,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.files import write_json
     from fisheye_svp_ros.io.share import lens_path
     from fisheye_svp_ros.reporting.budget_report import BudgetRequest, answer, document, draw, rows
-    from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.reporting.tables import print_table
+    from fisheye_svp_ros.reporting.terminal import print_table, progress
     from fisheye_svp_ros.scene.rigs import rig
     from fisheye_svp_ros.study.budget import Setup, at_point, default_spread, make_budget
 

@@ -36,8 +36,7 @@ from fisheye_svp_ros.paper.demonstration import (
     residual_fields,
 )
 from fisheye_svp_ros.paper.tables import LENSES
-from fisheye_svp_ros.reporting.progress import progress
-from fisheye_svp_ros.reporting.tables import print_table, range_text
+from fisheye_svp_ros.reporting.terminal import print_table, progress, range_text
 from fisheye_svp_ros.reporting.undistort_report import (
     draw_pair,
     print_remaining,

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fisheye_svp_ros.commands.lenses import Lenses, add_lens_argument, lenses_of, load_lenses
+from fisheye_svp_ros.commands.lenses import (
+    Lenses,
+    add_dome_arguments,
+    add_lens_argument,
+    dome_of,
+    lenses_of,
+    load_lenses,
+)
 from fisheye_svp_ros.commands.notes import (
     note_copies,
     note_huge,
@@ -23,7 +30,6 @@ from fisheye_svp_ros.commands.photographs import (
     search_options,
 )
 from fisheye_svp_ros.commands.plan import view_count, view_limits
-from fisheye_svp_ros.commands.ports import add_dome_arguments, dome_of
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.csv_table import write_table
 from fisheye_svp_ros.io.detect_files import check_sizes
@@ -32,8 +38,7 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.scene.observations import Observations
-from fisheye_svp_ros.scene.photograph_names import photograph_names
+from fisheye_svp_ros.scene.observations import Observations, photograph_names
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis import Comparison, Diagnosis
@@ -89,10 +94,10 @@ def run(args: argparse.Namespace) -> None:
     """Diagnose, say what is wrong, write report and extended lens."""
     from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose, diagnose_against
     from fisheye_svp_ros.planning.plan import check_number
-    from fisheye_svp_ros.reporting.progress import stages
+    from fisheye_svp_ros.reporting.terminal import stages
     from fisheye_svp_ros.solve.measured_poses import poses_by_frame, rig_lenses
     from fisheye_svp_ros.solve.rig_state import free_parameters
-    from fisheye_svp_ros.study.known_errors import known_errors
+    from fisheye_svp_ros.study.pose_errors import known_errors
 
     _check_options(args)
     given = load_lenses(args.lens)
@@ -209,7 +214,7 @@ def _print(
     from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE
     from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
     from fisheye_svp_ros.reporting.next_steps import command_to_go_on
-    from fisheye_svp_ros.reporting.tables import print_lines, print_table
+    from fisheye_svp_ros.reporting.terminal import print_lines, print_table
 
     command = command_to_go_on(diagnosis, _inputs(args, bool(diagnosis.intrinsics)))
     print_lines([

@@ -24,7 +24,7 @@ from fisheye_svp_ros.optics.lens import IMAGE_FIELD, PORT, Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.maps import MAX_RANGE
 from fisheye_svp_ros.rectify.svp import nearest_svp_lens
-from fisheye_svp_ros.reporting.tables import print_table, range_text
+from fisheye_svp_ros.reporting.terminal import print_table, range_text
 from fisheye_svp_ros.scene.observations import STEREO
 
 _ANGLES, _RANGES = (20, 40, 60, 75, 85, 95), (0.1, 0.2, 0.5, 2.0)  # deg, m

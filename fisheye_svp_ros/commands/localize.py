@@ -25,10 +25,8 @@ from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.io.rig_files import load_cameras
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.reporting.progress import progress
-from fisheye_svp_ros.reporting.tables import noise_text, print_table
-from fisheye_svp_ros.scene.observations import Observations
-from fisheye_svp_ros.scene.photograph_names import frame_name, photograph_entry
+from fisheye_svp_ros.reporting.terminal import noise_text, print_table, progress
+from fisheye_svp_ros.scene.observations import Observations, frame_name, photograph_entry
 from fisheye_svp_ros.solve.localization import sight
 from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measured, rms_px
 from fisheye_svp_ros.solve.rig_localization import RigLocalization, localize_rig

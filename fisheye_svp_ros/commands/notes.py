@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fisheye_svp_ros.scene.photograph_names import frame_name, list_frames
+from fisheye_svp_ros.scene.observations import frame_name, list_frames
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.scene.observations import Observations

@@ -22,8 +22,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.executors import process_pool
     from fisheye_svp_ros.paper.report import write_report
     from fisheye_svp_ros.paper.results import compute, tasks
-    from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.reporting.tables import print_table
+    from fisheye_svp_ros.reporting.terminal import print_table, progress
 
     with process_pool(os.cpu_count() or 1) as workers:
         with progress('evaluating', tasks()) as step:

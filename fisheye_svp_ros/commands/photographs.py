@@ -108,7 +108,7 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
         doubtful_folders,
         find_photographs,
     )
-    from fisheye_svp_ros.reporting.progress import progress
+    from fisheye_svp_ros.reporting.terminal import progress
 
     pattern = parse_pattern(args.board)
     if args.detector and pattern.kind not in DETECTORS[args.detector][0]:

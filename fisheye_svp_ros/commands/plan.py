@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> None:
     """Choose, print, draw."""
     from fisheye_svp_ros.planning.plan import plan
     from fisheye_svp_ros.reporting import shot_list
-    from fisheye_svp_ros.reporting.tables import UNITS, print_table
+    from fisheye_svp_ros.reporting.terminal import UNITS, print_table
 
     if not args.noise > 0:
         raise ParameterError('--noise must be above 0')

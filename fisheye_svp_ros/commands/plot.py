@@ -21,7 +21,7 @@ from fisheye_svp_ros.io.recording import (
     tabulate,
 )
 from fisheye_svp_ros.io.recording_files import is_recording
-from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.terminal import progress
 
 _FIELDS = 4  # residual fields a lens
 _TABLES = ('.csv', '.parquet')

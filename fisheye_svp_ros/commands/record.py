@@ -47,7 +47,7 @@ def _sweep(name: str, bag: Path) -> None:
     from fisheye_svp_ros.commands.node_sweeps import read_sweep, record_sweep
     from fisheye_svp_ros.commands.notes import counted, say
     from fisheye_svp_ros.io.bags import Bag
-    from fisheye_svp_ros.reporting.progress import progress
+    from fisheye_svp_ros.reporting.terminal import progress
 
     path = sweep_path(name)
     plan = read_sweep(path)

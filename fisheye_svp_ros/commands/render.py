@@ -22,7 +22,7 @@ from fisheye_svp_ros.io.rig_files import cameras_in_first, rigs_of_lenses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
-from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.terminal import progress
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.simulate.render import BoardPose, Exposure, Field, Print, pixel_rays, render
 from fisheye_svp_ros.simulate.targets import TARGETS, board, board_views, target_views, visible

@@ -16,8 +16,7 @@ from fisheye_svp_ros.io.documents import read_json
 from fisheye_svp_ros.io.files import read_text, write_json, write_text, write_together, written
 from fisheye_svp_ros.io.share import sweep_path
 from fisheye_svp_ros.optics import engines
-from fisheye_svp_ros.reporting.progress import progress
-from fisheye_svp_ros.reporting.tables import print_table
+from fisheye_svp_ros.reporting.terminal import print_table, progress
 from fisheye_svp_ros.study.metrics import summarise
 from fisheye_svp_ros.study.sweep import Plan, column_types, fingerprint, solve_sweep, tasks, work
 

@@ -13,8 +13,7 @@ from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import write_columns
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.recording import STAMP, Columns, is_tabulated, tabulate
-from fisheye_svp_ros.reporting.progress import progress
-from fisheye_svp_ros.reporting.tables import console, print_table
+from fisheye_svp_ros.reporting.terminal import console, print_table, progress
 
 Cells = dict[str, list[str]]  # by column
 _MAX_ROWS = 40  # rows for people

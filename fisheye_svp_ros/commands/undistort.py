@@ -29,8 +29,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.cameras import PROJECTIONS, STEREO_PROJECTIONS, camera_for
 from fisheye_svp_ros.rectify.maps import RANGE, Rectification, RectifiedPair, rectify_pair
-from fisheye_svp_ros.reporting.progress import progress
-from fisheye_svp_ros.reporting.tables import range_text
+from fisheye_svp_ros.reporting.terminal import progress, range_text
 from fisheye_svp_ros.reporting.undistort_report import (
     Remaining,
     draw_pair,

@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> None:
 
         from fisheye_svp_ros.nodes.session import ros_session
         from fisheye_svp_ros.nodes.watcher import Watcher
-        from fisheye_svp_ros.reporting.tables import console
+        from fisheye_svp_ros.reporting.terminal import console
 
     with ros_session(args.ros_args) as signals, suppress(KeyboardInterrupt):
         signals.begin()

@@ -15,8 +15,7 @@ from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.fitted_model import RepeatedErrors
 from fisheye_svp_ros.diagnosis.random_effects import SAG
 from fisheye_svp_ros.diagnosis.variance_budget import Component
-from fisheye_svp_ros.scene.observations import Observations
-from fisheye_svp_ros.scene.photograph_names import frame_names
+from fisheye_svp_ros.scene.observations import Observations, frame_names
 from fisheye_svp_ros.solve.outliers import FRAME, VIEW, Outliers
 
 DIAGNOSE_AIR = ('diagnose the photographs in air first, then these with the extended lens of that '

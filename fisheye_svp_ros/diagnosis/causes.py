@@ -15,8 +15,7 @@ from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.mixed_model import group_basis, pseudo_inverse
-from fisheye_svp_ros.scene.observations import Observations
-from fisheye_svp_ros.scene.photograph_names import photograph_entry
+from fisheye_svp_ros.scene.observations import Observations, photograph_entry
 from fisheye_svp_ros.solve.outliers import Outliers
 from fisheye_svp_ros.solve.rig_state import rms_px
 

@@ -40,8 +40,7 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
 from fisheye_svp_ros.effects.target_map import BoardMap, board_maps
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scene.observations import rig_cameras
-from fisheye_svp_ros.scene.photograph_names import photograph_names
+from fisheye_svp_ros.scene.observations import photograph_names, rig_cameras
 from fisheye_svp_ros.solve.hand_eye import HandEye
 from fisheye_svp_ros.solve.rig_calibration import connected_cameras
 from fisheye_svp_ros.solve.rig_checks import has_no_rig

@@ -45,7 +45,7 @@ READERS: Registry[Reader] = Registry('readers', {
         Reader('an .orpc file', lambda path: path.suffix == '.orpc', f'{_PACKAGE}.orpc'),
         Reader('a folder of .orpc files',
                lambda path: path.is_dir() and any(path.glob('*.orpc')), f'{_PACKAGE}.orpc'),
-        Reader('a rosbag2 recording', is_recording, f'{_PACKAGE}.observations_bag'),
+        Reader('a rosbag2 recording', is_recording, f'{_PACKAGE}.recording'),
     )
 }, Reader)
 

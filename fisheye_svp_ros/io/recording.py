@@ -1,18 +1,40 @@
-"""What a recording tells: a table, one row an input stamp; residuals, with their scenarios."""
+"""What a recording tells: a table, one row an input stamp; residuals; observations.
+
+Residuals come with their scenarios, landmarks and image points are joined by stamp.
+"""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from fisheye_svp_ros.io.clouds import Points
+import numpy as np
+
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import parse_cells
-from fisheye_svp_ros.io.decoding import read_key_values, read_residuals, stamp_of, statuses
+from fisheye_svp_ros.io.decoding import (
+    ImagePoints,
+    Points,
+    read_image_points,
+    read_key_values,
+    read_landmarks,
+    read_residuals,
+    stamp_of,
+    statuses,
+)
+from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Observations, make_observations
 
 STAMP = 'stamp_ns'
 NAMESPACE = 'namespace'
 
 Columns = dict[str, list[Any]]
+_CLOUD = 'sensor_msgs/msg/PointCloud2'
+_IMAGES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
+_NAMES = ('landmarks', 'image_points')
 
 
 class ResidualSet(NamedTuple):
@@ -91,3 +113,78 @@ def residual_sets(records: Iterable[Any]) -> list[ResidualSet]:
                     tags.get((topic.removesuffix('/localizer/residuals'), when), {}))
         for (topic, when), points in sorted(clouds.items(), key=lambda item: item[0])
     ]
+
+
+class _PointSet(NamedTuple):
+    stamp: int
+    camera: str
+    points: ImagePoints
+
+
+def read(path: str | Path) -> Observations:
+    """Read a recording; a frame is a stamp, a camera the namespace of its image points.
+
+    t is the stamp, s.  Raises BagError for a recording that cannot be read and
+    ObservationError, naming the topic, where it does not hold one world's observations.
+    """
+    bag = Bag(path)
+    landmarks: dict[int, Landmarks] = {}
+    worlds: set[str] = set()
+    sets: list[_PointSet] = []
+    for record in bag.records(
+            lambda topic, kind: topic.rpartition('/')[2] in _NAMES and kind == _CLOUD):
+        namespace, _, name = record.topic.rpartition('/')
+        where = f'{path}, {record.topic}'
+        stamp = stamp_of(record.message, where)
+        if name == 'landmarks':
+            worlds.add(namespace)
+            landmarks[stamp] = read_landmarks(record.message, where).landmarks
+        else:
+            sets.append(_PointSet(stamp, namespace, read_image_points(record.message, where)))
+    if len(worlds) != 1 or not sets:
+        raise ObservationError(f'{path}: observations need image_points and landmarks of one '
+                               f'namespace; {_topics_present(bag, worlds)}')
+    return _table(sorted(sets, key=lambda one: one[:2]), landmarks, worlds.pop(), str(path))
+
+
+def _topics_present(bag: Bag, worlds: set[str]) -> str:
+    """Return what a recording has in place of one world's observations, and what to do."""
+    images = {topic for topic, kind in bag.topics() if kind in _IMAGES}
+    if images and not worlds:
+        return f'it has images, on {min(images)}: add --board, for example chessboard:9x6:24mm'
+    found = ', '.join(world or '/' for world in sorted(worlds)) or 'none'
+    wanted = f'{max(worlds)}/.*' if len(worlds) > 1 else '.*/(landmarks|image_points)'
+    return f"landmarks are in: {found}; record with --topics '{wanted}'"
+
+
+def _table(
+    sets: list[_PointSet], landmarks: dict[int, Landmarks], world: str, source: str
+) -> Observations:
+    stamps = sorted({one.stamp for one in sets})
+    frames = {stamp: frame for frame, stamp in enumerate(stamps)}
+    cameras = tuple(dict.fromkeys(one.camera.removeprefix(world).lstrip('/') for one in sets))
+    counts = [len(one.points.landmark) for one in sets]
+    names = [cameras.index(one.camera.removeprefix(world).lstrip('/')) for one in sets]
+    return make_observations(
+        np.repeat([frames[one.stamp] for one in sets], counts),
+        np.concatenate([one.points.landmark for one in sets]),
+        np.concatenate([one.points.uv for one in sets]),
+        np.concatenate([_landmark_points(one, landmarks, source) for one in sets]),
+        camera=np.repeat(names, counts),
+        t=np.repeat([one.stamp / 1e9 for one in sets], counts),
+        cameras=cameras,
+        source=source,
+    )
+
+
+def _landmark_points(one: _PointSet, landmarks: dict[int, Landmarks], source: str) -> Any:
+    """Return the landmarks (N, 3) of a set: those of its stamp, or the latest before it."""
+    known = sorted(landmarks)
+    place = max(bisect_right(known, one.stamp) - 1, 0)
+    points, found = landmarks[known[place]].lookup(one.points.landmark)
+    if not found.all():
+        missing = one.points.landmark[~found][0]
+        raise ObservationError(
+            f'{source}: landmark {missing} of {one.camera}/image_points is not in the landmarks'
+        )
+    return points

@@ -66,7 +66,7 @@ def _node_class(name: str) -> type[BaseNode]:
 
 def print_parameters(name: str) -> None:
     """Print the table of a node's parameters; rclpy must be there."""
-    from fisheye_svp_ros.reporting.tables import print_table
+    from fisheye_svp_ros.reporting.terminal import print_table
 
     def meaning(row: Row) -> str:
         unit, allowed = row.unit and f' [{row.unit}]', row.constraint()

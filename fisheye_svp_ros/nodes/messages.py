@@ -29,7 +29,7 @@ from std_msgs.msg import ColorRGBA, Float64, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.io.clouds import (
+from fisheye_svp_ros.io.decoding import (
     DATATYPES,
     IMAGE_POINTS,
     LANDMARKS,

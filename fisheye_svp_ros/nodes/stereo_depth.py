@@ -13,7 +13,7 @@ from visualization_msgs.msg import MarkerArray
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError
 from fisheye_svp_ros.io import decoding
-from fisheye_svp_ros.io.clouds import LANDMARKS, structured_array
+from fisheye_svp_ros.io.decoding import LANDMARKS, structured_array
 from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.messages import camera_shape, epipolar_shapes, landmarks_shape

@@ -15,7 +15,7 @@ from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.reporting.blocks import page, png_uri
 from fisheye_svp_ros.reporting.calibration_text import STANDARD_ERRORS, CalibratedCamera
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, drawing, round_number
-from fisheye_svp_ros.scene.photograph_names import frame_name
+from fisheye_svp_ros.scene.observations import frame_name
 from fisheye_svp_ros.solve.ray_errors import RANGES, RayModel, ray_model, typical_points
 
 _WIDTH = 9.2  # in

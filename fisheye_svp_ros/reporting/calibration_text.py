@@ -12,9 +12,8 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, vector_from_rotation
-from fisheye_svp_ros.reporting.tables import UNITS, interval, with_error
-from fisheye_svp_ros.scene.observations import Observations
-from fisheye_svp_ros.scene.photograph_names import list_frames
+from fisheye_svp_ros.reporting.terminal import UNITS, interval, with_error
+from fisheye_svp_ros.scene.observations import Observations, list_frames
 from fisheye_svp_ros.solve.hand_eye import HandEye
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured_poses import rms_px

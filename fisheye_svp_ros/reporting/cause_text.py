@@ -10,7 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.diagnosis import Cause, Diagnosis
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.reporting.tables import with_error, without_minus_zero
+from fisheye_svp_ros.reporting.terminal import with_error, without_minus_zero
 
 HUMAN_UNITS = {
     'm': (1e3, 'mm'), 'm^2': (1e6, 'mm²'), 'rad': (180 / math.pi, 'deg'), 's': (1e3, 'ms'),

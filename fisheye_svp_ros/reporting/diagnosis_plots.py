@@ -17,8 +17,7 @@ from fisheye_svp_ros.diagnosis import Diagnosis
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.plots import picture, round_number
 from fisheye_svp_ros.reporting.point_residuals import PointResiduals
-from fisheye_svp_ros.scene.observations import Observations
-from fisheye_svp_ros.scene.photograph_names import frame_name
+from fisheye_svp_ros.scene.observations import Observations, frame_name
 from fisheye_svp_ros.solve.measured_poses import rms_px
 
 BEFORE, AFTER, NOISE, INK = '#c2410c', '#1d4ed8', '#94a3b8', '#334155'

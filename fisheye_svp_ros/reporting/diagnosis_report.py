@@ -19,8 +19,7 @@ from fisheye_svp_ros.reporting.blocks import data_uri, page
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
 from fisheye_svp_ros.reporting.figure_rows import outlier_rows
-from fisheye_svp_ros.reporting.first_screen import first_screen
-from fisheye_svp_ros.reporting.headline import verdict_words
+from fisheye_svp_ros.reporting.first_screen import first_screen, verdict_words
 from fisheye_svp_ros.reporting.next_steps import (
     ReportInputs,
     command_to_go_on,

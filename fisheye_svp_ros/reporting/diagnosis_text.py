@@ -21,7 +21,7 @@ from fisheye_svp_ros.reporting.cause_text import (
     probability,
     size,
 )
-from fisheye_svp_ros.scene.photograph_names import frame_name
+from fisheye_svp_ros.scene.observations import frame_name
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
 
 LENS_FILE = 'extended_lens.yaml'

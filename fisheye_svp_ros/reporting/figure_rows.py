@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from fisheye_svp_ros.diagnosis import Diagnosis
 from fisheye_svp_ros.reporting.cause_text import bare_probability, percent
-from fisheye_svp_ros.reporting.tables import UNITS, with_error
+from fisheye_svp_ros.reporting.terminal import UNITS, with_error
 
 _UNCERTAIN = {
     'image_px': ('an image point, u or v', 1.0, 'px'),

@@ -12,7 +12,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.ticker import LogLocator
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.io.clouds import Points
+from fisheye_svp_ros.io.decoding import Points
 from fisheye_svp_ros.io.recording import STAMP
 from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, legend_below, picture
 from fisheye_svp_ros.study.dependence import (

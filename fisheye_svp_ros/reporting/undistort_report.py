@@ -23,7 +23,7 @@ from fisheye_svp_ros.rectify.errors import (
     tolerated_ranges,
 )
 from fisheye_svp_ros.rectify.maps import Rectification, RectifiedPair
-from fisheye_svp_ros.reporting.tables import print_table, range_text
+from fisheye_svp_ros.reporting.terminal import print_table, range_text
 
 _LINES = 16  # across a drawn pair
 _MAX_SIZE = 1600  # px, of a drawn pair

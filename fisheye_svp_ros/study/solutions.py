@@ -12,7 +12,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Mask, scatter
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.io.clouds import RESIDUALS, Points, structured_array
+from fisheye_svp_ros.io.decoding import RESIDUALS, Points, structured_array
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.localization import Localization, localize, sight

@@ -35,13 +35,13 @@ from fisheye_svp_ros.reporting.cause_text import cause_rows
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
 from fisheye_svp_ros.reporting.diagnosis_text import advice_text, verdict_sentences
 from fisheye_svp_ros.reporting.figure_rows import intrinsic_rows
-from fisheye_svp_ros.reporting.headline import headline
+from fisheye_svp_ros.reporting.first_screen import headline
 from fisheye_svp_ros.reporting.point_residuals import point_residuals
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
 from fisheye_svp_ros.solve.rig_state import Linearization, with_effect
-from fisheye_svp_ros.study.known_errors import known_errors
+from fisheye_svp_ros.study.pose_errors import known_errors
 
 # Rays beyond 90 degrees: no plane window can be mistaken for a viewpoint shift.
 LENS = Lens('made', 1280, 960, 300.0, 300.0, 650.0, 470.0, KannalaBrandt(-0.03), 2.0)

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from fisheye_svp_ros.cli import main
-from fisheye_svp_ros.io.clouds import RESIDUALS, structured_array
 from fisheye_svp_ros.io.columns import arrow, write_columns
+from fisheye_svp_ros.io.decoding import RESIDUALS, structured_array
 from fisheye_svp_ros.reporting.sweep_plots import draw_residuals, draw_table
 from fisheye_svp_ros.study.dependence import curves, grid, noise_spreads, swept_parameters
 from fisheye_svp_ros.study.sweep import plan_sweep, sweep_rows

@@ -14,8 +14,7 @@ from sensor_msgs.msg import PointCloud2, PointField  # isort: skip
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io import decoding
-from fisheye_svp_ros.io.clouds import IMAGE_POINTS, RESIDUALS, structured_array, unpack
-from fisheye_svp_ros.io.decoding import stamp_of
+from fisheye_svp_ros.io.decoding import IMAGE_POINTS, RESIDUALS, stamp_of, structured_array, unpack
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path

@@ -25,9 +25,8 @@ from fisheye_svp_ros.diagnosis import LensErrors
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.bags import BagWriter
-from fisheye_svp_ros.io.clouds import LANDMARKS, RESIDUALS, unpack
 from fisheye_svp_ros.io.csv_files import write_observations
-from fisheye_svp_ros.io.decoding import stamp_of
+from fisheye_svp_ros.io.decoding import LANDMARKS, RESIDUALS, stamp_of, unpack
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.rig_files import save_rig

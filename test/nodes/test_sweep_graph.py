@@ -64,7 +64,7 @@ def test_every_scenario_once_and_with_the_offline_numbers(
         yield bars.append
 
     with monkeypatch.context() as patched:
-        patched.setattr('fisheye_svp_ros.reporting.progress.progress', progress)
+        patched.setattr('fisheye_svp_ros.reporting.terminal.progress', progress)
         assert main(['record', '--sweep', str(path), '-o', str(tmp_path / 'bag')]) == 0
     assert bars and min(bars) > 0 and sum(bars) <= scenarios
     assert main(['sweep', str(path), '-o', str(tmp_path / 'out')]) == 0

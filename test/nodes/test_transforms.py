@@ -16,8 +16,14 @@ from sensor_msgs.msg import PointCloud2  # isort: skip
 from visualization_msgs.msg import MarkerArray  # isort: skip
 
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.clouds import LANDMARKS, unpack
-from fisheye_svp_ros.io.decoding import columns, read_pose, read_transform, stamp_of
+from fisheye_svp_ros.io.decoding import (
+    LANDMARKS,
+    columns,
+    read_pose,
+    read_transform,
+    stamp_of,
+    unpack,
+)
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator

@@ -18,8 +18,8 @@ from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.commands.processes import Processes
 from fisheye_svp_ros.errors import BagError, GraphError, ObservationError
 from fisheye_svp_ros.io.bags import Bag
-from fisheye_svp_ros.io.clouds import RESIDUALS
 from fisheye_svp_ros.io.columns import read_columns
+from fisheye_svp_ros.io.decoding import RESIDUALS
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.io.recording import has_residuals, is_tabulated, tabulate
 from fisheye_svp_ros.paper.demonstration import TASKS, compute_demo, demo_rows, residual_fields

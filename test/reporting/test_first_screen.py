@@ -28,8 +28,15 @@ from fisheye_svp_ros.diagnosis.decision import Bound, Figure
 from fisheye_svp_ros.reporting.cause_text import percent, size
 from fisheye_svp_ros.reporting.diagnosis_report import write_report
 from fisheye_svp_ros.reporting.diagnosis_text import refusal_reason, verdict_sentences
-from fisheye_svp_ros.reporting.first_screen import Photo, first_screen, terminal_lines
-from fisheye_svp_ros.reporting.headline import headline, largest_cause, target_words, verdict_words
+from fisheye_svp_ros.reporting.first_screen import (
+    Photo,
+    first_screen,
+    headline,
+    largest_cause,
+    target_words,
+    terminal_lines,
+    verdict_words,
+)
 from fisheye_svp_ros.reporting.next_steps import ReportInputs, command_to_go_on
 from fisheye_svp_ros.reporting.point_residuals import point_residuals
 

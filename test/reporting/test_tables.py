@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fisheye_svp_ros.reporting.tables import interval, print_table, with_error
+from fisheye_svp_ros.reporting.terminal import interval, print_table, with_error
 
 
 @pytest.mark.parametrize('count', [8, 30])

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from fisheye_svp_ros.scene.observations import Observations, make_observations
-from fisheye_svp_ros.scene.photograph_names import (
+from fisheye_svp_ros.scene.observations import (
+    Observations,
     frame_name,
     list_frames,
+    make_observations,
     photograph_entry,
     photograph_names,
 )
