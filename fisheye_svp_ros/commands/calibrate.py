@@ -316,20 +316,8 @@ def _warnings(
 def write_rig(found: RigCalibration, folder: Path) -> None:
     """Write a rig as tools read it, its lenses apart."""
     save_rig(found.steps(), folder / 'rig.yaml', found.cameras)
-    write_json(folder / 'rig.json', _rig_document(found))
-    write_text(folder / 'rig.urdf', transforms.urdf_text(found.cameras, found.rig))
-    write_text(folder / 'tf_static.yaml',
-               transforms.static_transforms_text(found.cameras, found.rig))
-    try:
-        write_text(folder / 'camchain.yaml', kalibr.write_chain(found.lenses, found.steps()))
-    except FisheyeSvpError as cause:
-        say(f'camchain.yaml of Kalibr is not written: {cause}')
-
-
-def _rig_document(found: RigCalibration) -> dict[str, Any]:
-    """Return the mapping of rig.json: cameras in the first one, with covariances."""
     turns = quaternion_from_rotation(found.rig.rotation)
-    return {
+    write_json(folder / 'rig.json', {  # cameras in the first one, with covariances
         'frame': found.cameras[0], 'frames': len(found.frame), 'sigma_px': found.sigma_px,
         'left_out': list(found.left_out),
         'cameras': {name: {
@@ -338,7 +326,14 @@ def _rig_document(found: RigCalibration) -> dict[str, Any]:
             'rms_px': float(found.rms_px[i]), 'frames': int(found.shared[i]),
             'board': found.boards[i] if found.boards else 0,
         } for i, name in enumerate(found.cameras)},
-    }
+    })
+    write_text(folder / 'rig.urdf', transforms.urdf_text(found.cameras, found.rig))
+    write_text(folder / 'tf_static.yaml',
+               transforms.static_transforms_text(found.cameras, found.rig))
+    try:
+        write_text(folder / 'camchain.yaml', kalibr.write_chain(found.lenses, found.steps()))
+    except FisheyeSvpError as cause:
+        say(f'camchain.yaml of Kalibr is not written: {cause}')
 
 
 def print_rig(found: RigCalibration) -> None:

@@ -70,7 +70,12 @@ def _of_bag(args: argparse.Namespace) -> list[Path]:
     if bag.damage:
         say(f'{args.source}: {bag.damage}')
     with progress('drawing'):
-        files = draw_table(_main_namespace(columns), args.output)
+        # Rows of the namespace with most of them: others have other metrics.
+        names = columns[NAMESPACE]
+        most = max(set(names), key=names.count, default=None)
+        files = draw_table({
+            name: [cell for cell, of in zip(cells, names, strict=True) if of == most]
+            for name, cells in columns.items()}, args.output)
         if found:
             files.append(args.output / 'residuals.png')
             draw_residuals([one.points for one in found],
@@ -93,11 +98,3 @@ def _fields(found: list[ResidualSet], path: Path) -> list[Path]:
 
     draw_residual_fields(list(named.values()), path)
     return [path]
-
-
-def _main_namespace(columns: dict[str, list[Any]]) -> dict[str, list[Any]]:
-    """Return the rows of the namespace with most of them: others have other metrics."""
-    names = columns[NAMESPACE]
-    most = max(set(names), key=names.count, default=None)
-    kept = [i for i, name in enumerate(names) if name == most]
-    return {name: [cells[i] for i in kept] for name, cells in columns.items()}

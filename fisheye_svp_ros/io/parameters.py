@@ -87,19 +87,14 @@ class Row(NamedTuple):
 
 
 def parameter(
-    default: Any,
-    description: str,
-    unit: str = '',
-    span: tuple[float, float] | None = None,
-    choices: tuple[str, ...] = (),
-    *,
-    fixed: bool = False,
-    file: bool = False,
-    frame: bool = False,
+    default: Any, description: str, unit: str = '', span: tuple[Any, Any] = (None, None),
+    choices: tuple[str, ...] = (), **flags: bool
 ) -> Any:
-    """Return a dataclass field that is a row of the table; span: smallest and largest value."""
-    low, high = span or (None, None)
-    row = Row('', default, description, unit, low, high, choices, fixed, file, frame)
+    """Return a dataclass field that is a row of the table; span: smallest and largest value.
+
+    flags: fixed, file and frame, as of `Row`.
+    """
+    row = Row('', default, description, unit, *span, choices, **flags)
     return field(default=default, metadata={'row': row})
 
 

@@ -135,29 +135,21 @@ def hand_eye_rows(found: HandEye) -> list[tuple[str, ...]]:
 
 def hand_eye_warnings(found: HandEye) -> list[str]:
     """Return what there is to say against the poses."""
-    return [*_unit_warnings(found.scale), *_pose_warnings(found)]
-
-
-def _unit_warnings(scale: float) -> list[str]:
-    """Return that lengths of robot and target are in different units, if it seems so."""
-    if 1 / _MAX_SCALE <= scale <= _MAX_SCALE:
-        return []
-    factor = max(scale, 1 / scale)
-    longer = 'the poses' if scale < 1 else 'the target'
-    likely = f': {longer} may be in mm' if factor > _MIN_MM else ''
-    return [f'lengths of robot and target differ by a factor of {factor:.4g}{likely}; both are '
-            'needed in m']
-
-
-def _pose_warnings(found: HandEye) -> list[str]:
+    warnings, factor = [], max(found.scale, 1 / found.scale)
+    if factor > _MAX_SCALE:
+        longer = 'the poses' if found.scale < 1 else 'the target'
+        likely = f': {longer} may be in mm' if factor > _MIN_MM else ''
+        warnings.append(f'lengths of robot and target differ by a factor of {factor:.4g}{likely}; '
+                        'both are needed in m')
     noise = np.repeat((found.noise_m, found.noise_rad), 3)
     squares = ((found.residual / noise) ** 2).sum(axis=1)
     worst = int(np.argmax(squares))
-    if len(squares) < _MIN_FRAMES or squares[worst] < _LARGE_SHARE * squares.sum():
-        return []
-    off, turn = np.linalg.norm(found.residual[worst].reshape(2, 3), axis=1)
-    return [f'the pose of frame {found.frame[worst]} is {1e3 * off:.1f} mm and '
-            f'{np.degrees(turn):.2f} deg off the others: correct it, or remove it from the poses']
+    if len(squares) >= _MIN_FRAMES and squares[worst] >= _LARGE_SHARE * squares.sum():
+        off, turn = np.linalg.norm(found.residual[worst].reshape(2, 3), axis=1)
+        warnings.append(
+            f'the pose of frame {found.frame[worst]} is {1e3 * off:.1f} mm and '
+            f'{np.degrees(turn):.2f} deg off the others: correct it, or remove it from the poses')
+    return warnings
 
 
 def _rows(name: str, pose: Pose, stderr: Array) -> list[tuple[str, ...]]:

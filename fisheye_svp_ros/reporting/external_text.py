@@ -88,20 +88,17 @@ def _agreement(pair: TwoCameras) -> str:
         f'{one.to} from {one.without_px:.3g} to {one.with_px:.3g} px' for one in pair.target
     ])
     carried = f'the shape estimated from one camera changes the held-out error of {tried}'
-    alike = '' if pair.maps is None else f'; their maps correlate by {_map_correlation(pair)}'
+    alike = ''
+    if pair.maps is not None:
+        alike = '; their maps correlate by ' + (
+            f'{pair.maps.correlation:.2f}' if _has_height(pair) else
+            f'{pair.maps.correlation_along:.2f} along the board')
     if pair.verdict == 'agree':
         return f'{both} agree: {carried}{alike}'
     if pair.verdict == 'undecided':
         return f'{both} are undecided: {carried}, not significant in both{alike}'
     gone = f', so that {join_names(pair.withdrawn)} is withdrawn' if pair.withdrawn else ''
     return f'{both} contradict each other about the target: {carried}{alike}{gone}'
-
-
-def _map_correlation(pair: TwoCameras) -> str:
-    """Return how alike two maps are; where landmarks moved along the board only, along it."""
-    assert pair.maps is not None
-    return (f'{pair.maps.correlation:.2f}' if _has_height(pair) else
-            f'{pair.maps.correlation_along:.2f} along the board')
 
 
 def _has_height(pair: TwoCameras) -> bool:

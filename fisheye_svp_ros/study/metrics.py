@@ -109,9 +109,8 @@ def known_mean(values: Array) -> Array:
 
 
 def _nanmax(values: Array) -> Array:
-    known = np.isfinite(values)
-    largest = np.where(known, values, -np.inf).max(axis=-1, initial=-np.inf)
-    return np.asarray(np.where(known.any(axis=-1), largest, np.nan))
+    known = np.where(np.isfinite(values), values, np.nan)
+    return np.asarray(np.fmax.reduce(known, axis=-1, initial=np.nan))
 
 
 def summarise(values: Array) -> Summary:

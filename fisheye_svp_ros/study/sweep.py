@@ -34,7 +34,7 @@ from fisheye_svp_ros.study.settings import (
     StereoDepthSettings,
     SyntheticCameraSettings,
 )
-from fisheye_svp_ros.study.sweep_solvers import SOLVERS, Outcome
+from fisheye_svp_ros.study.sweep_solvers import SOLVERS
 
 CAMERA = 'synthetic_camera'
 TABLES: Mapping[str, type[Any]] = {
@@ -206,18 +206,10 @@ def _columns(plan: Plan, scenarios: list[Scenario], first: int, batch: Batch) ->
     tags = [scalars(scenarios[row]) for row in batch.row]
     columns |= {name: [tag[name] for tag in tags for _ in range(sets)] for name in SCALARS}
     for node, settings in plan.solvers.items():
-        columns |= _result_columns(node, SOLVERS[node].solve(batch, settings))
+        outcome = SOLVERS[node].solve(batch, settings)
+        notes = outcome.note.tolist()
+        for name, values in outcome.metrics.items():
+            columns[f'{node}.{name}'] = [
+                None if note else v for v, note in zip(values.tolist(), notes, strict=True)]
+        columns[f'{node}.note'] = [note or None for note in notes]
     return columns
-
-
-def _result_columns(node: str, outcome: Outcome) -> Columns:
-    notes = outcome.note.tolist()
-    return {
-        **{
-            f'{node}.{name}': [
-                None if note else value for value, note in zip(values.tolist(), notes, strict=True)
-            ]
-            for name, values in outcome.metrics.items()
-        },
-        f'{node}.note': [note or None for note in notes],
-    }

@@ -1,7 +1,7 @@
 """Lenses as other tools write them: recognised by their content, read and written.
 
-A new format is one module with `recognises`, `read` and, where it can be written, `write`, and one
-line in FORMATS.
+A new format is one module with `recognises` (true of the text of such a file), `read` and, where
+it can be written, `write`, and one line in FORMATS.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -13,6 +14,7 @@ from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
+recognises = re.compile(r'\s*\{.*"camera_type"', re.DOTALL).match
 # Coefficients of each model, and what they make
 _MODELS: dict[str, tuple[tuple[str, ...], Callable[..., models.Distortion]]] = {
     'kb4': (('k1', 'k2', 'k3', 'k4'), lambda *k: models.Distortion(models.EQUIDISTANT, k)),
@@ -24,11 +26,6 @@ _MODELS: dict[str, tuple[tuple[str, ...], Callable[..., models.Distortion]]] = {
     'pinhole-radtan8': (models.OPENCV, lambda *d: models.opencv_distortion(d)),
 }
 _NAMES = ('px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw')
-
-
-def recognises(text: str) -> bool:
-    """Say whether a text is such a file."""
-    return text.lstrip().startswith('{') and '"camera_type"' in text
 
 
 def read(text: str, where: str) -> Foreign:

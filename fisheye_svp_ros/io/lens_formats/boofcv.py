@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 
-
-def recognises(text: str) -> bool:
-    """Say whether a text is such a file."""
-    return 'omnidirectional_universal' in text
+recognises = re.compile('omnidirectional_universal').search
 
 
 def read(text: str, where: str) -> Foreign:

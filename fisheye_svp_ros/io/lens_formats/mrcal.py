@@ -28,6 +28,7 @@ from fisheye_svp_ros.optics.curves import Gennery, Stereographic
 from fisheye_svp_ros.optics.image_field import MAX_NODES, MIN_NODES, ImageField
 from fisheye_svp_ros.optics.lens import Lens
 
+recognises = re.compile('[\'"]LENSMODEL_').search
 _LINEARITY = re.compile(
     r'LENSMODEL_CAHVORE_linearity=([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)$')
 # Those of cv2.calibrateCamera, and how many coefficients follow fx, fy, cx and cy
@@ -44,11 +45,6 @@ _MARGIN_NODES = 3  # nodes that lie outside the field, along an axis
 _NODES = (24, 36, 54, 80)  # along x that are tried
 _SAMPLES = 4  # along each axis for a node
 _RIDGE = 1e-11  # of the weight of a sample: for nodes that none calls for
-
-
-def recognises(text: str) -> bool:
-    """Say whether a text is such a file."""
-    return "'LENSMODEL_" in text or '"LENSMODEL_' in text
 
 
 def read(text: str, where: str) -> Foreign:

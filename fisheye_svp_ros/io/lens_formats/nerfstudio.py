@@ -6,6 +6,7 @@ The image begins at 0, as COLMAP's does, of which most of these files come.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,15 +15,11 @@ from fisheye_svp_ros.io.documents import parse_json
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 
+recognises = re.compile(r'\s*\{.*"fl_x"', re.DOTALL).match
 _CORNER = 0.5  # px, of our first pixel's center from the corner where the image begins
 _FISHEYE, _PERSPECTIVE = 'OPENCV_FISHEYE', ('OPENCV', 'PINHOLE', 'SIMPLE_PINHOLE')
 _NAMES = ('k1', 'k2', 'k3', 'k4', 'p1', 'p2')
 _KEYS = ('camera_model', 'is_fisheye', 'w', 'h', 'fl_x', 'fl_y', 'cx', 'cy', *_NAMES)
-
-
-def recognises(text: str) -> bool:
-    """Say whether a text is such a file."""
-    return text.lstrip().startswith('{') and '"fl_x"' in text
 
 
 def read(text: str, where: str) -> Foreign:

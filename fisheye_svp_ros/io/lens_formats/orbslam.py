@@ -16,14 +16,9 @@ from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
-_FOCAL = re.compile(r'^Camera1?\.fx *:', re.MULTILINE)
+recognises = re.compile(r'^Camera1?\.fx *:', re.MULTILINE).search
 _CAMERAS = {'left': ('Camera1.', 'Camera.'), 'right': ('Camera2.',)}
 _STEREO = ('Stereo.T_c1_c2', 'Tlr')
-
-
-def recognises(text: str) -> bool:
-    """Say whether a text is such a file."""
-    return _FOCAL.search(text) is not None
 
 
 def read(text: str, where: str) -> Foreign:

@@ -100,30 +100,24 @@ def _fit_lens(
     name: str, where: str,
 ) -> tuple[Lens, float]:
     """Return the nearest lens, however far off: a file is read with a warning."""
-    try:
-        with np.errstate(all='ignore'):
-            return _nearest_lens(model, size, intrinsics, d, name, where)
-    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as cause:
-        raise LensError(f'{where}: its numbers are no valid lens ({cause})') from cause
-
-
-def _nearest_lens(
-    model: str, size: tuple[int, int], intrinsics: tuple[float, ...], d: tuple[float, ...],
-    name: str, where: str,
-) -> tuple[Lens, float]:
     if model in _EQUIDISTANT:
         if len(d) < 4 or any(d[4:]):
             raise LensError(f'{where}: {model} has {len(d)} coefficients; k1 to k4 are needed')
         distortion = models.Distortion(models.EQUIDISTANT, d[:4])
-        return models.nearest_lens(name, size, intrinsics, distortion, where)
-    if model not in _PERSPECTIVE:
+    elif model in _PERSPECTIVE:
+        counts = _PERSPECTIVE[model]
+        # rational_polynomial may carry coefficients of a thin prism and a tilt as well.
+        if len(d) not in counts and any(d[counts[-1]:] or d):
+            raise LensError(f'{where}: {model} has {len(d)} coefficients; {counts[-1]} are needed')
+        distortion = models.opencv_distortion(d)
+    else:
         raise LensError(f'{where}: distortion_model is {model!r}; known are '
                         f'{", ".join((*_EQUIDISTANT, *_PERSPECTIVE))}')
-    counts = _PERSPECTIVE[model]
-    # rational_polynomial may carry coefficients of a thin prism and a tilt as well.
-    if len(d) not in counts and any(d[counts[-1]:] or d):
-        raise LensError(f'{where}: {model} has {len(d)} coefficients; {counts[-1]} are needed')
-    return models.nearest_lens(name, size, intrinsics, models.opencv_distortion(d), where)
+    try:
+        with np.errstate(all='ignore'):
+            return models.nearest_lens(name, size, intrinsics, distortion, where)
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as cause:
+        raise LensError(f'{where}: its numbers are no valid lens ({cause})') from cause
 
 
 def write(lens: Lens) -> str:
