@@ -2,7 +2,6 @@ from fisheye_svp_ros.errors import FisheyeSvpError as FisheyeSvpError
 from fisheye_svp_ros.io.readers import read_observations as read_observations
 from fisheye_svp_ros.io.readers import read_poses as read_poses
 from fisheye_svp_ros.io.readers import write_observations as write_observations
-from fisheye_svp_ros.io.result_files import Columns as Columns
 from fisheye_svp_ros.io.rig_files import load_rig as load_rig
 from fisheye_svp_ros.library import back_project as back_project
 from fisheye_svp_ros.library import budget as budget
@@ -18,6 +17,8 @@ from fisheye_svp_ros.library import simulate_scenario as simulate_scenario
 from fisheye_svp_ros.library import stereo_depth as stereo_depth
 from fisheye_svp_ros.library import sweep as sweep
 from fisheye_svp_ros.library import undistort_maps as undistort_maps
+from fisheye_svp_ros.library_boards import calibrate_rig as calibrate_rig
+from fisheye_svp_ros.library_boards import localize_rig as localize_rig
 from fisheye_svp_ros.library_boards import observations as observations
 from fisheye_svp_ros.library_boards import plan as plan
 from fisheye_svp_ros.library_boards import render as render
@@ -25,8 +26,7 @@ from fisheye_svp_ros.library_boards import write_lens as write_lens
 from fisheye_svp_ros.library_plots import plot_budget as plot_budget
 from fisheye_svp_ros.library_plots import plot_lens as plot_lens
 from fisheye_svp_ros.library_plots import plot_residuals as plot_residuals
-from fisheye_svp_ros.library_rigs import calibrate_rig as calibrate_rig
-from fisheye_svp_ros.library_rigs import localize_rig as localize_rig
+from fisheye_svp_ros.library_results import Columns as Columns
 from fisheye_svp_ros.optics.lens import Lens as Lens
 from fisheye_svp_ros.pose import Pose as Pose
 from fisheye_svp_ros.scene.observations import Observations as Observations

@@ -19,9 +19,8 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io import lens_files
 from fisheye_svp_ros.io.csv_files import FramePoses
-from fisheye_svp_ros.io.detect_files import check_size_given, check_sizes
 from fisheye_svp_ros.io.parameters import SWEEP, rows, with_values
-from fisheye_svp_ros.io.readers import read_observations, read_poses
+from fisheye_svp_ros.io.readers import check_size_given, check_sizes, read_observations, read_poses
 from fisheye_svp_ros.io.rig_files import load_pair
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.library_checks import (

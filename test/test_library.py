@@ -19,8 +19,7 @@ from helpers.nodes import ROOT
 import fisheye_svp_ros as fsvp
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.io.result_files import Columns, Result
-from fisheye_svp_ros.library_results import Localized, Simulated
+from fisheye_svp_ros.library_results import Columns, Localized, Result, Simulated
 
 _BLOCK = re.compile(r'```python\n(.*?)```(?:\n\n```text\n(.*?)```)?', re.DOTALL)
 

@@ -21,16 +21,16 @@ from fisheye_svp_ros.commands.photographs import (
     search_options,
 )
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, ParameterError
-from fisheye_svp_ros.io.detect_files import (
-    Sizes,
-    check_size_given,
-    check_sizes,
-    sizes_beside,
-)
 from fisheye_svp_ros.io.files import write_json, write_text, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.lens_formats import kalibr, transforms
-from fisheye_svp_ros.io.readers import read_poses
+from fisheye_svp_ros.io.readers import (
+    Sizes,
+    check_size_given,
+    check_sizes,
+    read_poses,
+    sizes_beside,
+)
 from fisheye_svp_ros.io.rig_files import check_camera_names, save_rig
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.optics.lens import Lens, parameter_values

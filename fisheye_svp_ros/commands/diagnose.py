@@ -31,11 +31,10 @@ from fisheye_svp_ros.commands.photographs import (
 )
 from fisheye_svp_ros.commands.plan import view_count, view_limits
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
-from fisheye_svp_ros.io.csv_table import write_table
-from fisheye_svp_ros.io.detect_files import check_sizes
+from fisheye_svp_ros.io.csv_files import write_table
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
-from fisheye_svp_ros.io.readers import read_poses
+from fisheye_svp_ros.io.readers import check_sizes, read_poses
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations, photograph_names
@@ -43,8 +42,8 @@ from fisheye_svp_ros.scene.observations import Observations, photograph_names
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis import Comparison, Diagnosis
     from fisheye_svp_ros.planning.plan import NextViews
+    from fisheye_svp_ros.reporting.diagnosis_plots import PointResiduals
     from fisheye_svp_ros.reporting.next_steps import ReportInputs
-    from fisheye_svp_ros.reporting.point_residuals import PointResiduals
 
 _OF_DOTS = 'dot_centroid'  # corners have none
 
@@ -254,9 +253,9 @@ def _write(
     args: argparse.Namespace, diagnosis: Diagnosis, known: Mapping[str, Comparison], free: bool,
     wanted: NextViews | None,
 ) -> None:
+    from fisheye_svp_ros.reporting.diagnosis_plots import point_residuals
     from fisheye_svp_ros.reporting.diagnosis_report import write_report
     from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE, refusal_reason
-    from fisheye_svp_ros.reporting.point_residuals import point_residuals
 
     folder, points = args.output, point_residuals(diagnosis.simulation, diagnosis.cause_fit)
     truth = {name: compared.to_dict() for name, compared in known.items()}

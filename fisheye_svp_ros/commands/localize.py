@@ -18,10 +18,9 @@ from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.photographs import add_observation_arguments, read_input
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.csv_table import write_table
-from fisheye_svp_ros.io.detect_files import check_sizes
+from fisheye_svp_ros.io.csv_files import write_table
 from fisheye_svp_ros.io.files import write_json, write_together
-from fisheye_svp_ros.io.readers import write_poses
+from fisheye_svp_ros.io.readers import check_sizes, write_poses
 from fisheye_svp_ros.io.rig_files import load_cameras
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose

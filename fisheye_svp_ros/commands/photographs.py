@@ -16,8 +16,7 @@ from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.detect.finders import DETECTORS
 from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.detect_files import Sizes, photographs_beside
-from fisheye_svp_ros.io.readers import read_observations
+from fisheye_svp_ros.io.readers import Sizes, photographs_beside, read_observations
 from fisheye_svp_ros.scene.observations import Observations
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from fisheye_svp_ros.io.files import read_text, write_json, write_text, write_to
 from fisheye_svp_ros.io.share import sweep_path
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.reporting.terminal import print_table, progress
-from fisheye_svp_ros.study.metrics import summarise
+from fisheye_svp_ros.study.solutions import summarise
 from fisheye_svp_ros.study.sweep import Plan, column_types, fingerprint, solve_sweep, tasks, work
 
 _MAX_SCENARIOS = 1_000_000  # scenarios; more are rather a slip in the file than meant

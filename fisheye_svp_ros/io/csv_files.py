@@ -1,30 +1,196 @@
-"""Observations and poses as CSV.
+"""CSV tables with a header, whose errors name file, line and column; observations and poses.
 
+Cells are separated by commas, or by semicolons or tabs, as spreadsheets write them.  Comments may
+stand above the header, and the header in the last of them, as numpy.savetxt writes it.
 Observations: frame,landmark,u,v,x,y,z and, optional, camera,board,t,sigma; poses:
 frame,x,y,z,qx,qy,qz,qw, the camera in the world (or target) frame.
 """
 
 from __future__ import annotations
 
+import csv
+import io
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.io.csv_table import CsvTable, write_table
-from fisheye_svp_ros.io.files import path_of
+from fisheye_svp_ros.io.files import path_of, read_text, write_text
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_quaternion
 from fisheye_svp_ros.scene.landmarks import MOST_LANDMARK
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
+_MAX_HEADER = 60  # characters of a header
+_RECENT = 1e9  # s since 1970, in 2001
+_PER_SECOND = {'nanoseconds': 1e9, 'microseconds': 1e6, 'milliseconds': 1e3}
+_MAX_VALUE = 1e12  # m, px or s; squares and products of anything larger are soon no numbers
 _MIN_UNSEEN_ROWS = 5
 
 REQUIRED_COLUMNS = ('frame', 'landmark', 'u', 'v', 'x', 'y', 'z')
 COLUMNS = ('frame', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
 _NORM_SLACK = 1e-3  # printed digits are forgiven, another convention is not
+
+
+class CsvTable:
+    """The cells of a CSV file by column, in any column order."""
+
+    def __init__(self, path: Path, required: Sequence[str]) -> None:
+        """Read the file; raises ObservationError unless all required columns are there."""
+        self.path = path
+        self._lines: list[int] = []
+        rows = []
+        try:
+            lines = io.StringIO(read_text(path, ObservationError), newline='').readlines()
+            place = _uncomment(lines, required)
+            reader = csv.reader(lines, delimiter=_separator(lines[place:]))
+            self._header = [name.strip() for name in next(filter(None, reader), [])]
+            self._check_header(required)
+            for row in reader:
+                if not row:
+                    continue
+                if len(row) != len(self._header):
+                    raise ObservationError(
+                        f'{path}, line {reader.line_num}: {len(row)} fields where the header '
+                        f'has {len(self._header)}'
+                    )
+                rows.append(row)
+                self._lines.append(reader.line_num)
+        except csv.Error as cause:
+            raise ObservationError(f'{path}: not a CSV file ({cause})') from cause
+        if not rows:
+            raise ObservationError(f'{path}: no row below the header; at least one is needed')
+        self._columns = dict(zip(self._header, zip(*rows, strict=True), strict=True))
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._header
+
+    def items(self) -> Iterable[tuple[str, tuple[str, ...]]]:
+        """Return the names and cells of all columns."""
+        return self._columns.items()
+
+    def text(self, name: str) -> tuple[str, ...]:
+        """Return the cells of a column."""
+        return self._columns[name]
+
+    def numbers(self, *names: str) -> Array:
+        """Return columns as finite numbers (N, len(names)) of at most 1e12."""
+        values = np.stack([self._numbers(name) for name in names], axis=-1)
+        for name, column in zip(names, values.T, strict=True):
+            needed = f'a number of at most {_MAX_VALUE:g}'
+            if name == 't':
+                unit = _stamp_unit(column)
+                needed = 'a time in seconds' + (
+                    f' (these are {unit}: divide by {_PER_SECOND[unit]:g})' if unit else '')
+            self.refuse(np.abs(column) > _MAX_VALUE, name, needed)
+        return values
+
+    def integers(self, name: str, most: int = 2**53) -> Index:
+        """Return a column of whole numbers (N,) from 0 to `most`."""
+        values = self._numbers(name)
+        bad = (values != np.floor(values)) | (values < 0) | (values > most)
+        unit = _stamp_unit(values)
+        hint = f' (stamps in {unit} belong in t, in seconds)' if unit and name == 'frame' else ''
+        self.refuse(bad, name, f'a whole number from 0 to {most}{hint}')
+        return values.astype(np.int64)
+
+    def refuse(self, bad: Sequence[bool] | Mask, name: str, needed: str) -> None:
+        """Raise ObservationError for the first row that is bad: what the column needs there."""
+        rows = np.flatnonzero(bad)
+        if rows.size:
+            cell = self._columns[name][rows[0]]
+            raise ObservationError(
+                f'{self.path}, line {self.line(rows[0])}: {name} is {cell!r}; {needed} is needed'
+            )
+
+    def line(self, row: int) -> int:
+        """Return the line of the file on which a row ends."""
+        return self._lines[row]
+
+    def refuse_repeats(self, keys: Array | Index, what: str) -> None:
+        """Raise ObservationError where two rows have the same key (N, K)."""
+        _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        again = np.flatnonzero(first[inverse.reshape(-1)] != np.arange(len(keys)))
+        if again.size:
+            before = self.line(first[inverse.reshape(-1)[again[0]]])
+            raise ObservationError(
+                f'{self.path}, line {self.line(again[0])}: the same {what} as in line {before}; '
+                'remove one of them'
+            )
+
+    def _check_header(self, required: Sequence[str]) -> None:
+        wanted, there = ','.join(required), ','.join(self._header)
+        if not any(self._header):
+            raise ObservationError(
+                f'{self.path}: it is empty; a header with {wanted or "names"} is needed')
+        missing = [name for name in required if name not in self._header]
+        if missing and all(map(_is_number, self._header)):
+            raise ObservationError(
+                f'{self.path}: its first line holds numbers; a header with {wanted} is needed')
+        if missing:
+            names = ', '.join(map(repr, missing))
+            which = f'column {names} is' if len(missing) == 1 else f'columns {names} are'
+            raise ObservationError(f'{self.path}: {which} missing from its header, '
+                                   f'{there[:_MAX_HEADER]!r}; needed are {wanted}')
+        twice = [name for name, count in Counter(self._header).items() if name and count > 1]
+        if twice:
+            raise ObservationError(f'{self.path}: its header has {twice[0]!r} twice')
+
+    def _numbers(self, name: str) -> Array:
+        cells = self._columns[name]
+        try:
+            values = np.array(cells, dtype=float)
+        except ValueError:
+            comma = ', with a decimal point,' if any(',' in cell for cell in cells) else ''
+            self.refuse([not _is_number(cell) for cell in cells], name, f'a number{comma}')
+            raise
+        self.refuse(~np.isfinite(values), name, 'a finite number')
+        return values
+
+
+def _stamp_unit(values: Array) -> str:
+    """Return the unit that stamps since 1970 must be in, '' for seconds and small numbers."""
+    largest = np.abs(values).max(initial=0.0)
+    return next((unit for unit, scale in _PER_SECOND.items() if largest > _RECENT * scale), '')
+
+
+def _uncomment(lines: list[str], required: Sequence[str]) -> int:
+    """Empty the comments above the header, but for the header; return the place of that."""
+    for place, line in enumerate(lines):
+        bare = line.lstrip('#')
+        header = {name.strip() for name in bare.split(_separator([bare]))}
+        if bare.strip() and (bare == line or header.issuperset(required)):
+            lines[place] = bare
+            return place
+        lines[place] = '\n'
+    return len(lines)
+
+
+def _separator(lines: Sequence[str]) -> str:
+    """Return what separates the cells: a semicolon or tab where the header has no comma."""
+    header = lines[0] if lines else ''
+    return next((one for one in ';\t' if one in header and ',' not in header), ',')
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def write_table(path: str | Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write columns (N,) as CSV, which reads back to the same bits; raise OutputError."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator='\n')
+    writer.writerow(columns)
+    writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
+    write_text(path, text.getvalue())
 
 
 def read(path: str | Path) -> Observations:

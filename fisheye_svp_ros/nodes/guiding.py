@@ -39,7 +39,7 @@ from fisheye_svp_ros.planning.guide import (
     start_session,
 )
 from fisheye_svp_ros.planning.plan import nominal_lens
-from fisheye_svp_ros.reporting.guide_picture import draw_guide, guide_words
+from fisheye_svp_ros.reporting.shot_list import draw_guide, guide_words
 
 _PLANNING_TIMEOUT = 60.0  # s, to choose the next photograph
 _PICTURES = QoSProfile(depth=2)

@@ -22,9 +22,13 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.localization import Localization
-from fisheye_svp_ros.study.metrics import LOCALIZATION_METRICS
 from fisheye_svp_ros.study.settings import LocalizerSettings
-from fisheye_svp_ros.study.solutions import SetSolutions, localize_sets, residual_points
+from fisheye_svp_ros.study.solutions import (
+    LOCALIZATION_METRICS,
+    SetSolutions,
+    localize_sets,
+    residual_points,
+)
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis import LensErrors

@@ -14,9 +14,8 @@ from fisheye_svp_ros.nodes.solver import Items, SolverNode, true_rig
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.scene.observations import STEREO, stereo_views
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
-from fisheye_svp_ros.study.metrics import STEREO_CALIBRATION_METRICS
 from fisheye_svp_ros.study.settings import StereoCalibratorSettings
-from fisheye_svp_ros.study.solutions import SetSolutions, solve_rigs
+from fisheye_svp_ros.study.solutions import STEREO_CALIBRATION_METRICS, SetSolutions, solve_rigs
 
 
 class StereoCalibrator(SolverNode):

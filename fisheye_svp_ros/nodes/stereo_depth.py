@@ -28,9 +28,8 @@ from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import STEREO
 from fisheye_svp_ros.solve.reliability import doubt_of_pairs
 from fisheye_svp_ros.solve.stereo_depth import epipolar_curves
-from fisheye_svp_ros.study.metrics import STEREO_DEPTH_METRICS
 from fisheye_svp_ros.study.settings import SolverSettings, StereoDepthSettings
-from fisheye_svp_ros.study.solutions import Pair, measure_points
+from fisheye_svp_ros.study.solutions import STEREO_DEPTH_METRICS, Pair, measure_points
 
 
 class StereoDepth(SolverNode):

@@ -24,8 +24,7 @@ from fisheye_svp_ros.scene.observations import Views, views_of
 from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
 from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
-from fisheye_svp_ros.study.metrics import Metrics
-from fisheye_svp_ros.study.solutions import localize_sets, measure_points, solve_rigs
+from fisheye_svp_ros.study.solutions import Metrics, localize_sets, measure_points, solve_rigs
 
 
 class LocalizedSpread(NamedTuple):

@@ -1,4 +1,4 @@
-"""Pictures of residuals before and after the model was extended."""
+"""Residuals of every observation before and after the model was extended, and their pictures."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from scipy import special
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis import Diagnosis
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.plots import picture, round_number
-from fisheye_svp_ros.reporting.point_residuals import PointResiduals
 from fisheye_svp_ros.scene.observations import Observations, frame_name
 from fisheye_svp_ros.solve.measured_poses import rms_px
+from fisheye_svp_ros.solve.rig_state import Linearization
 
 BEFORE, AFTER, NOISE, INK = '#c2410c', '#1d4ed8', '#94a3b8', '#334155'
 _SIDES = (('before', BEFORE), ('after', AFTER))
@@ -30,6 +30,46 @@ _CELLS = 18  # of the mean field, along the image
 
 
 Picture = tuple[str, Callable[..., None], tuple[Any, ...]]
+
+
+class PointResiduals(NamedTuple):
+    """K observations by frame and camera.
+
+    frame, camera, landmark (K,); t (K,), s, NaN where unknown; uv (K, 2), px; before and after
+    (K, 2), px: measured minus predicted by the fitted base and the fitted extended model; theta
+    (K,), rad, and range (K,), m, under the latter; outlier (K,): an outlier, left out of fits.
+    """
+
+    frame: Index
+    camera: Index
+    landmark: Index
+    t: Array
+    uv: Array
+    before: Array
+    after: Array
+    theta: Array
+    range: Array
+    outlier: Mask
+
+
+def point_residuals(before: Linearization, after: Linearization) -> PointResiduals:
+    """Return the residuals of two states of the same data."""
+    views = after.data.views
+    seen = views.landmark >= 0
+    per_point = np.ones_like(seen, dtype=np.int64)
+    distance = np.linalg.norm(after.scene.pose.into_body(views.points), axis=-1)
+    return PointResiduals(
+        frame=(views.frame[:, None] * per_point)[seen],
+        camera=(views.camera[:, None] * per_point)[seen],
+        landmark=views.landmark[seen],
+        t=views.t[seen],
+        uv=views.uv[seen],
+        before=(views.uv - before.linear.uv)[seen],
+        after=(views.uv - after.linear.uv)[seen],
+        theta=after.scene.theta[seen],
+        range=distance[seen],
+        outlier=~views.used[seen],
+    )
 
 
 class PlotData(NamedTuple):

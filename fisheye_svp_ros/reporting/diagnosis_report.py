@@ -13,19 +13,18 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.planning.plan import NextViews
-from fisheye_svp_ros.reporting import cause_text, external_text, figure_rows, shot_list
+from fisheye_svp_ros.reporting import cause_text, external_text, shot_list
 from fisheye_svp_ros.reporting import diagnosis_text as text
 from fisheye_svp_ros.reporting.blocks import data_uri, page
-from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
+from fisheye_svp_ros.reporting.cause_text import outlier_rows
+from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, PointResiduals, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
-from fisheye_svp_ros.reporting.figure_rows import outlier_rows
 from fisheye_svp_ros.reporting.first_screen import first_screen, verdict_words
 from fisheye_svp_ros.reporting.next_steps import (
     ReportInputs,
     command_to_go_on,
     follow_up_files,
 )
-from fisheye_svp_ros.reporting.point_residuals import PointResiduals
 
 _CAPTIONS = {
     'field': 'Residual vectors over the image; the scale is above each panel; dotted: equal '
@@ -84,7 +83,7 @@ def write_report(
         next={} if wanted is None else {
             'purpose': shot_list.purpose(wanted), 'header': shot_list.HEADER,
             'rows': shot_list.rows(wanted)},
-        uncertainty=list(figure_rows.uncertainty_rows(diagnosis)),
+        uncertainty=list(cause_text.uncertainty_rows(diagnosis)),
         known=list(text.known_rows(diagnosis, known)), free=_free(inputs, diagnosis),
         external=external_text.sections(diagnosis), carried_header=external_text.CARRIED_HEADER,
         contents=text.lens_contents(diagnosis), count=text.count_frames(diagnosis),
@@ -183,8 +182,8 @@ def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
             for stage, (share, named) in shares.items()
         ],
         'total_px2': f'{total:.3g}',
-        'budget_rows': list(figure_rows.budget_rows(diagnosis)),
-        'intrinsics': list(figure_rows.intrinsic_rows(diagnosis)),
+        'budget_rows': list(cause_text.budget_rows(diagnosis)),
+        'intrinsics': list(cause_text.intrinsic_rows(diagnosis)),
         'advice': [(text.advice_text(one), cause_text.percent(one.gain) if one.gain > 0 else '')
                    for one in diagnosis.advice],
     }

@@ -1,16 +1,20 @@
-"""Wanted photographs, for people: in words, and drawn as the camera will see them."""
+"""Wanted photographs, for people: in words, drawn as the camera sees them, over live images."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.planning.guide import MIN_PROBABILITY
+from fisheye_svp_ros.io.image_files import to_color
+from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
+from fisheye_svp_ros.planning.guide import MIN_PROBABILITY, MIN_SCORE, DetectedBoard, Guide
 from fisheye_svp_ros.planning.optimal_design import Shots
 from fisheye_svp_ros.planning.plan import NextViews
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, picture
@@ -22,6 +26,10 @@ _SIDES = ('right', 'lower right', 'bottom', 'lower left', 'left', 'upper left', 
           'upper right')
 _COLUMNS, _PANEL = 3, 3.4  # inches
 _HUMAN = {'m': (1e3, 'mm'), 'rad': (180 / np.pi, 'deg')}
+_WANTED, _SEEN, _READY, _TEXT = (40, 123, 224), (230, 160, 60), (80, 200, 80), (245, 245, 245)
+_MAX_WIDTH = 1280  # px, of the picture
+_BAND, _LETTER = 0.034, 0.00075  # height of a line over the width of the picture; size of its text
+_FRACTION_BITS = 4  # binary places of a pixel that OpenCV draws to
 
 
 def rows(wanted: NextViews) -> list[tuple[str, ...]]:
@@ -107,3 +115,100 @@ def _frame(axis: Any, lens: Lens) -> None:
 
 def _side(turn: float) -> str:
     return _SIDES[round(turn / (np.pi / 4)) % len(_SIDES)]
+
+
+def guide_words(guide: Guide) -> tuple[str, str, str]:
+    """Return what to do, the wanted view in words, and where matters stand."""
+    stand, count = guide.stand, len(guide.session.taken)
+    where = ''
+    if stand is not None and guide.outline is not None:
+        away, place, tilt, turn = instruction(stand.wanted.shots, guide.place)
+        how = 'not tilted' if tilt == 'not' else f'tilted {tilt}'
+        where = f'{away} away, {place}; {how}; turned {turn} clockwise'
+    taken = f'{count} photograph{"" if count == 1 else "s"}'
+    if stand is not None and stand.stderr is not None:
+        taken += ', ' + _score_text(guide)
+    if stand is not None and stand.settled:
+        names = ' and '.join(stand.named) or 'no cause'
+        if stand.alike:
+            names += f', or {" or ".join(stand.alike)}: photographs cannot separate them'
+        return 'settled', f'diagnosis: {names}', taken
+    if guide.is_finished:
+        return 'not settled', 'these photographs do not determine it', taken
+    if guide.thinking:
+        return 'one moment', 'choosing the next photograph', taken
+    ready = guide.score >= MIN_SCORE
+    return 'hold still' if ready else 'bring the board to the outline', where, taken
+
+
+def _score_text(guide: Guide) -> str:
+    """Return the number asked for with its standard error, and the one that is wanted."""
+    stand, session = guide.stand, guide.session
+    assert stand is not None and stand.stderr is not None
+    factor, unit = 1.0, ''
+    if session.number in INTRINSICS:
+        unit = ' px'
+    elif session.number == 'e0':
+        factor, unit = 1e3, ' mm'
+    value = f'{factor * (stand.value or 0.0):.4g} +- {factor * stand.stderr:.2g}{unit}'
+    return f'{session.number} {value}, goal +- {factor * session.goal:.2g}'
+
+
+def draw_guide(pixels: Pixels, guide: Guide, seen: DetectedBoard | None) -> NDArray[np.uint8]:
+    """Return the picture (H, W, 3), blue, green, red, of an image with the guide over it."""
+    zoom = min(1.0, _MAX_WIDTH / max(pixels.shape))
+    picture, outline = to_color(pixels, zoom), guide.outline
+    if outline is not None:
+        colour = _READY if guide.score >= MIN_SCORE else _WANTED
+        wanted = _to_fixed_point(outline[np.isfinite(outline).all(axis=1)], zoom)
+        hull = cv2.convexHull(wanted)
+        filled = cv2.fillConvexPoly(picture.copy(), hull, colour, cv2.LINE_AA, _FRACTION_BITS)
+        picture = np.asarray(cv2.addWeighted(filled, 0.25, picture, 0.75, 0))
+        cv2.polylines(picture, [hull], True, colour, 2, cv2.LINE_AA, _FRACTION_BITS)
+        _dots(picture, wanted, colour, 2)
+        cv2.circle(picture, wanted[0].tolist(), 9 << _FRACTION_BITS, colour, 2, cv2.LINE_AA,
+                   _FRACTION_BITS)
+    if seen is not None:
+        found = _to_fixed_point(seen.uv, zoom)
+        _dots(picture, found, _SEEN, 3)
+        first = found[int(np.argmin(seen.ids))].tolist()
+        cv2.circle(picture, first, 9 << _FRACTION_BITS, _SEEN, 2, cv2.LINE_AA, _FRACTION_BITS)
+    _draw_texts(picture, guide)
+    return picture
+
+
+def _to_fixed_point(uv: NDArray[np.float64], zoom: float) -> NDArray[np.int32]:
+    """Return image points in the fixed point numbers of OpenCV's drawing."""
+    places = np.clip((uv + 0.5) * zoom - 0.5, -1e4, 1e4)
+    return np.round(places * (1 << _FRACTION_BITS)).astype(np.int32)
+
+
+def _dots(
+    picture: NDArray[np.uint8], places: NDArray[np.int32], colour: tuple[int, int, int], size: int
+) -> None:
+    for place in places.tolist():
+        cv2.circle(picture, place, size << _FRACTION_BITS, colour, -1, cv2.LINE_AA, _FRACTION_BITS)
+
+
+def _draw_texts(picture: NDArray[np.uint8], guide: Guide) -> None:
+    """Write what to do above, with the score as a bar, and where matters stand below."""
+    height, width = picture.shape[:2]
+    line, size = round(_BAND * width), _LETTER * width
+    todo, where, known = guide_words(guide)
+    for top, bottom in ((0, round(2.6 * line)), (height - round(1.3 * line), height)):
+        picture[top:bottom] //= 4
+    for text, base in ((todo, 1.0), (where, 2.0)):
+        _write(picture, text, round(base * line), size)
+    _write(picture, known, height - round(0.4 * line), size)
+    left, right, top = round(0.6 * width), round(0.98 * width), round(0.3 * line)
+    ready = guide.score >= MIN_SCORE
+    cv2.rectangle(picture, (left, top), (left + round(guide.score * (right - left)), line),
+                  _READY if ready else _WANTED, -1)
+    cv2.rectangle(picture, (left, top), (right, line), _TEXT, 1)
+    mark = left + round(MIN_SCORE * (right - left))
+    cv2.line(picture, (mark, top), (mark, line), _TEXT, 2)
+
+
+def _write(picture: NDArray[np.uint8], text: str, base: int, size: float) -> None:
+    cv2.putText(picture, text, (round(0.012 * picture.shape[1]), base), cv2.FONT_HERSHEY_SIMPLEX,
+                size, _TEXT, max(1, round(1.6 * size)), cv2.LINE_AA)

@@ -22,7 +22,7 @@ from fisheye_svp_ros.pose import Pose, axis_angle_between, identity
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate, triangulate_optimally
-from fisheye_svp_ros.study.metrics import known_mean
+from fisheye_svp_ros.study.solutions import known_mean
 
 QUANTITIES = ('position', 'axis', 'residual', 'epipolar', 'depth')
 UNITS = {'position': 'm', 'axis': 'rad', 'residual': 'px', 'epipolar': 'px', 'depth': 'm'}

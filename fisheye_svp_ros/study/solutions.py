@@ -1,6 +1,8 @@
 """One set, or many at once, to a solution and its metrics: the one way there is.
 
 Nodes, sweeps, commands and the paper's evaluation all come by here, so they tell the same numbers.
+Metrics carry their unit in the name, batch first: dictionaries of arrays (S,).  What needs the
+truth is absent without it.
 """
 
 from __future__ import annotations
@@ -13,18 +15,12 @@ from fisheye_svp_ros.arrays import Array, Mask, scatter
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.decoding import RESIDUALS, Points, structured_array
-from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.pose import Pose, axis_angle_between
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.localization import Localization, localize, sight
 from fisheye_svp_ros.solve.reliability import examine, misfit_fails, misfit_reason
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate, triangulate_optimally
-from fisheye_svp_ros.study.metrics import (
-    Metrics,
-    localization_metrics,
-    stereo_calibration_metrics,
-    stereo_depth_metrics,
-)
 
 T = TypeVar('T')
 Pair = tuple[ForwardModel, ForwardModel]  # of the left and the right camera
@@ -32,6 +28,15 @@ Pair = tuple[ForwardModel, ForwardModel]  # of the left and the right camera
 _NO_POSE = 'image_points: they do not determine a pose (all near one line, or of another lens?)'
 _NO_RIG = 'image_points: they do not determine a rig'
 _NO_PAIR = 'image_points: no landmark is in both images'
+Metrics = dict[str, Array]
+
+_FIT_METRICS = ('points', 'rms_px', 'mean_residual_px')
+_POSE = ('position_error_m', 'position_error_x_m', 'position_error_y_m', 'position_error_z_m',
+         'rotation_error_rad', 'axis_error_rad')
+LOCALIZATION_METRICS = (*_FIT_METRICS, *_POSE)
+STEREO_CALIBRATION_METRICS = ('views', *_FIT_METRICS, *_POSE)
+STEREO_DEPTH_METRICS = ('points', 'error2_px', 'error2_vertical_px', 'error2_max_px', 'error3_m',
+                        'error3_max_m')
 
 
 class Measurement(NamedTuple):
@@ -129,3 +134,102 @@ def measure_points(
         scatter(both, part) for part in (points, offset.distance, offset.vertical, offset.foot)))
     metrics = stereo_depth_metrics(found.distance, found.vertical, found.points, true)
     return SetSolutions(found, metrics, np.asarray(both.any(axis=1)), _NO_PAIR)
+
+
+class Summary(NamedTuple):
+    """Of the finite ones among some values; NaN where there is none."""
+
+    solved: int
+    missing: int
+    median: float
+    mean: float
+    largest: float
+
+
+def localization_metrics(pose: Pose, residual: Array, true: Pose | None = None) -> Metrics:
+    """Return LOCALIZATION_METRICS of poses (S,), residuals (S, N, 2), px, NaN = no point.
+
+    rms_px: root mean square of the 2-D residual norm; mean_residual_px: mean norm, as Kita's
+    tables have it; position errors in the frame of the poses; axis: the viewing axis.
+    """
+    return {**_fit_metrics(residual), **_pose_errors(pose, true)}
+
+
+def stereo_calibration_metrics(
+    rig: Pose, left_residual: Array, right_residual: Array, true: Pose | None = None
+) -> Metrics:
+    """Return STEREO_CALIBRATION_METRICS of rigs (S,), residuals (S, V, N, 2), px, NaN = no point.
+
+    Position errors of the left camera in the frame of the right one (Kita, section 4).
+    """
+    residual = np.concatenate([left_residual, right_residual], axis=2)
+    systems, views = residual.shape[:2]
+    return {
+        'views': np.full(systems, float(views)),
+        **_fit_metrics(residual.reshape(systems, -1, 2)),
+        **_pose_errors(rig, true),
+    }
+
+
+def stereo_depth_metrics(
+    distance: Array, vertical: Array, points: Array, true: Array | None = None
+) -> Metrics:
+    """Return STEREO_DEPTH_METRICS (Kita, section 5) of measured points (S, N, 3), m, NaN = none.
+
+    distance, vertical (S, N), px: of image points from their epipolar curves, NaN where there is
+    none; error2: mean distance; error3: mean distance from the true points (S, N, 3).
+    """
+    metrics = {
+        'points': np.isfinite(points[..., 0]).sum(axis=-1).astype(float),
+        'error2_px': known_mean(distance),
+        'error2_vertical_px': known_mean(np.abs(vertical)),
+        'error2_max_px': _nanmax(distance),
+    }
+    if true is not None:
+        off = np.linalg.norm(points - true, axis=-1)
+        metrics |= {'error3_m': known_mean(off), 'error3_max_m': _nanmax(off)}
+    return metrics
+
+
+def _fit_metrics(residual: Array) -> Metrics:
+    norm = np.linalg.norm(residual, axis=-1)
+    return {
+        'points': np.isfinite(norm).sum(axis=-1).astype(float),
+        'rms_px': np.sqrt(known_mean(norm**2)),
+        'mean_residual_px': known_mean(norm),
+    }
+
+
+def _pose_errors(pose: Pose, true: Pose | None) -> Metrics:
+    if true is None:
+        return {}
+    change = pose.difference(true)
+    return {
+        'position_error_m': np.linalg.norm(change[..., :3], axis=-1),
+        **{f'position_error_{axis}_m': change[..., i] for i, axis in enumerate('xyz')},
+        'rotation_error_rad': np.linalg.norm(change[..., 3:], axis=-1),
+        'axis_error_rad': axis_angle_between(pose, true),
+    }
+
+
+def known_mean(values: Array) -> Array:
+    """Return the mean over the last axis of what is known; NaN where nothing is."""
+    known = np.isfinite(values)
+    count = known.sum(axis=-1)
+    total = np.where(known, values, 0.0).sum(axis=-1)
+    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
+def _nanmax(values: Array) -> Array:
+    known = np.where(np.isfinite(values), values, np.nan)
+    return np.asarray(np.fmax.reduce(known, axis=-1, initial=np.nan))
+
+
+def summarise(values: Array) -> Summary:
+    """Return the summary of values (N,), NaN = missing; the largest is that of the magnitudes."""
+    known = values[np.isfinite(values)]
+    missing = len(values) - len(known)
+    if not len(known):
+        return Summary(0, missing, np.nan, np.nan, np.nan)
+    largest = np.abs(known).max()
+    return Summary(len(known), missing, *map(float, (np.median(known), known.mean(), largest)))

@@ -20,7 +20,7 @@ from helpers.targets import plane, poses_around
 from fisheye_svp_ros import __version__, cli, commands
 from fisheye_svp_ros.commands.notes import note_doubtful, note_gross_errors
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.io.csv_table import CsvTable
+from fisheye_svp_ros.io.csv_files import CsvTable
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
 from fisheye_svp_ros.library import calibrate

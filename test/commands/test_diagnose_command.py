@@ -23,7 +23,7 @@ from fisheye_svp_ros.effects.pose_effects import StereoTimeOffsetEffect
 from fisheye_svp_ros.effects.target_effects import TargetShapeEffect
 from fisheye_svp_ros.effects.target_map import board_maps
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.io.csv_table import CsvTable
+from fisheye_svp_ros.io.csv_files import CsvTable
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_observations, write_observations, write_poses
 from fisheye_svp_ros.io.rig_files import load_rig
@@ -31,12 +31,10 @@ from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting import diagnosis_plots, evidence_plots
-from fisheye_svp_ros.reporting.cause_text import cause_rows
-from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
+from fisheye_svp_ros.reporting.cause_text import cause_rows, intrinsic_rows
+from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, point_residuals, residual_pictures
 from fisheye_svp_ros.reporting.diagnosis_text import advice_text, verdict_sentences
-from fisheye_svp_ros.reporting.figure_rows import intrinsic_rows
 from fisheye_svp_ros.reporting.first_screen import headline
-from fisheye_svp_ros.reporting.point_residuals import point_residuals
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo

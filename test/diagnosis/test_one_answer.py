@@ -11,7 +11,7 @@ import pytest
 from helpers.nodes import ROOT
 
 from fisheye_svp_ros import cli
-from fisheye_svp_ros.io.csv_table import CsvTable
+from fisheye_svp_ros.io.csv_files import CsvTable
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.optics.lens import Lens

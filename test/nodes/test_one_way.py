@@ -15,7 +15,7 @@ from sensor_msgs.msg import PointCloud2  # isort: skip
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.io.csv_table import CsvTable, write_table
+from fisheye_svp_ros.io.csv_files import CsvTable, write_table
 from fisheye_svp_ros.io.decoding import read_pose
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses

@@ -26,6 +26,7 @@ from fisheye_svp_ros.diagnosis import (
 from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause
 from fisheye_svp_ros.diagnosis.decision import Bound, Figure
 from fisheye_svp_ros.reporting.cause_text import percent, size
+from fisheye_svp_ros.reporting.diagnosis_plots import point_residuals
 from fisheye_svp_ros.reporting.diagnosis_report import write_report
 from fisheye_svp_ros.reporting.diagnosis_text import refusal_reason, verdict_sentences
 from fisheye_svp_ros.reporting.first_screen import (
@@ -38,7 +39,6 @@ from fisheye_svp_ros.reporting.first_screen import (
     verdict_words,
 )
 from fisheye_svp_ros.reporting.next_steps import ReportInputs, command_to_go_on
-from fisheye_svp_ros.reporting.point_residuals import point_residuals
 
 
 @pytest.fixture(scope='module')

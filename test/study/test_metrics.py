@@ -12,7 +12,7 @@ from fisheye_svp_ros.scene.observations import stereo_views
 from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
 from fisheye_svp_ros.simulate.simulation import simulate_stereo
 from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
-from fisheye_svp_ros.study.metrics import (
+from fisheye_svp_ros.study.solutions import (
     LOCALIZATION_METRICS,
     STEREO_CALIBRATION_METRICS,
     STEREO_DEPTH_METRICS,

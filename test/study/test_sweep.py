@@ -29,7 +29,7 @@ from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.simulate.scenario import Scenario, model_of, simulate_scenario
 from fisheye_svp_ros.solve.localization import localize
-from fisheye_svp_ros.study.metrics import localization_metrics
+from fisheye_svp_ros.study.solutions import localization_metrics
 from fisheye_svp_ros.study.sweep import InProcess, plan_sweep, solve_sweep, sweep_rows, tasks
 
 # What a sweep leaves behind for scripts.
