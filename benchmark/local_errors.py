@@ -30,8 +30,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.scene.landmarks import Landmarks
-from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.observations import Landmarks, Observations
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.simulate.targets import board_views

@@ -13,8 +13,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.csv_files import pose_columns
-from fisheye_svp_ros.io.documents import read_json
-from fisheye_svp_ros.io.files import write_json
+from fisheye_svp_ros.io.files import read_json, write_json
 from fisheye_svp_ros.io.lens_files import lens_from_dict, lens_to_dict
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import Pose

@@ -104,7 +104,7 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_files import write_observations
 from fisheye_svp_ros.optics import engines
-from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.simulate.scenario import model_of
 from fisheye_svp_ros.simulate.simulation import simulate
 

@@ -40,8 +40,7 @@ from fisheye_svp_ros.io.share import config_path, lens_path
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.scene.landmarks import MOST_LANDMARK
-from fisheye_svp_ros.scene.observations import Observations, group_views
+from fisheye_svp_ros.scene.observations import MOST_LANDMARK, Observations, group_views
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 from fisheye_svp_ros.study.settings import (
     SolverSettings,

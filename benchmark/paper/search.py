@@ -18,7 +18,7 @@ from fisheye_svp_ros.paper.lens_evaluation import LocalizedSpread, localize_envi
 from fisheye_svp_ros.paper.studies import NAMES
 from fisheye_svp_ros.paper.tables import LOCALIZATION
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scene.landmarks import RADII
+from fisheye_svp_ros.scene.observations import RADII
 from fisheye_svp_ros.solve.least_squares import Arrays, dense_step, levenberg_marquardt
 
 STARTS, ITERATIONS = 32, 30

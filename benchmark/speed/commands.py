@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from fisheye_svp_ros.io.observations_csv import write_observations
 
 from benchmark.speed.report import Table, number
 from benchmark.speed.scenes import on_board, shift_lens
+from fisheye_svp_ros.io.csv_files import write_observations
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.optics.engines import VARIABLE
 

@@ -24,7 +24,7 @@ from benchmark.speed.scenes import LANDMARKS, localization, motion
 from fisheye_svp_ros.commands.processes import domain
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Landmarks
 
 _LENS = 'fish214'
 _VIEWS = 150

@@ -12,8 +12,14 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.commands.lenses import add_port_arguments, load_with_notes, port_of
-from fisheye_svp_ros.commands.notes import counted, note_gross_errors, note_huge, say
-from fisheye_svp_ros.commands.outputs import output_file, output_path
+from fisheye_svp_ros.commands.outputs import (
+    counted,
+    note_gross_errors,
+    note_huge,
+    output_file,
+    output_path,
+    say,
+)
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
     image_sizes,

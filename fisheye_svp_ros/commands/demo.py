@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fisheye_svp_ros.commands.node_sweeps import start_in_step, values
-from fisheye_svp_ros.commands.notes import note_formats
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import note_formats, output_folder
 from fisheye_svp_ros.commands.processes import Processes, missing_rclpy
 from fisheye_svp_ros.errors import OutputError
 from fisheye_svp_ros.io.bags import Bag
@@ -43,7 +42,7 @@ from fisheye_svp_ros.reporting.undistort_report import (
     remaining_document,
     rows_left,
 )
-from fisheye_svp_ros.scene.landmarks import RADII
+from fisheye_svp_ros.scene.observations import RADII
 
 _MARK, _RECORDING = '.demo', 'recording'
 _PATIENCE = 900.0  # s; only a hang takes this long

@@ -17,13 +17,13 @@ from fisheye_svp_ros.commands.lenses import (
     lenses_of,
     load_lenses,
 )
-from fisheye_svp_ros.commands.notes import (
+from fisheye_svp_ros.commands.outputs import (
     note_copies,
     note_huge,
     note_left_out,
     note_unconnected,
+    output_folder,
 )
-from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
     read_input,

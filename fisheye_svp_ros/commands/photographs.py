@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.outputs import say
 from fisheye_svp_ros.detect.finders import DETECTORS
 from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
 from fisheye_svp_ros.errors import ParameterError

@@ -8,12 +8,17 @@ from pathlib import Path
 
 from fisheye_svp_ros.commands.executors import dask, process_pool
 from fisheye_svp_ros.commands.node_sweeps import read_sweep
-from fisheye_svp_ros.commands.notes import counted, note_formats, say
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import counted, note_formats, output_folder, say
 from fisheye_svp_ros.errors import OutputError, ParameterError
 from fisheye_svp_ros.io.columns import TableParts, as_numbers, read_columns
-from fisheye_svp_ros.io.documents import read_json
-from fisheye_svp_ros.io.files import read_text, write_json, write_text, write_together, written
+from fisheye_svp_ros.io.files import (
+    read_json,
+    read_text,
+    write_json,
+    write_text,
+    write_together,
+    written,
+)
 from fisheye_svp_ros.io.share import sweep_path
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.reporting.terminal import print_table, progress

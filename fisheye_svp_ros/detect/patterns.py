@@ -13,7 +13,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.documents import read_yaml
+from fisheye_svp_ros.io.files import read_yaml
 
 _UNITS = {'mm': 1e-3, 'cm': 1e-2, 'm': 1.0}
 _LENGTH = re.compile(r'([0-9.]+(?:e-?[0-9]+)?) *(mm|cm|m)', re.IGNORECASE)

@@ -18,8 +18,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import ObservationError, OutputError
 from fisheye_svp_ros.io.csv_files import CsvTable
-from fisheye_svp_ros.io.documents import read_json
-from fisheye_svp_ros.io.files import read_bytes, replacing, write_text
+from fisheye_svp_ros.io.files import read_bytes, read_json, replacing, write_text
 
 _ROWS = 1 << 16  # of a row group
 _MOST_CELLS = 100_000_000

@@ -22,8 +22,7 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.files import path_of, read_text, write_text
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_quaternion
-from fisheye_svp_ros.scene.landmarks import MOST_LANDMARK
-from fisheye_svp_ros.scene.observations import Observations, make_observations
+from fisheye_svp_ros.scene.observations import MOST_LANDMARK, Observations, make_observations
 
 _MAX_HEADER = 60  # characters of a header
 _RECENT = 1e9  # s since 1970, in 2001

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.pose import Pose, rotation_from_quaternion
-from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Landmarks
 
 Points = NDArray[np.void]
 

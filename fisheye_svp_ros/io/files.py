@@ -1,10 +1,16 @@
-"""Files: read whole and within bounds, written so that nothing is left half-written."""
+"""Files, YAML, JSON: read whole and within bounds, written so that nothing is half-written.
+
+YAML and JSON are read whatever they hold, with errors that name the line.  Refused beside what is
+broken: aliases, of which a few lines can stand for gigabytes; keys that stand twice, of which one
+would be lost; nesting and counts of values beyond any use.
+"""
 
 from __future__ import annotations
 
 import json
 import math
 import os
+import re
 import signal
 import stat
 import tempfile
@@ -13,7 +19,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
+
+import numpy as np
+import yaml
 
 from fisheye_svp_ros.errors import FisheyeSvpError, OutputError, ParameterError
 
@@ -21,6 +30,13 @@ MAX_BYTES = 1 << 30  # bytes of a table or a photograph
 
 _BLOCK_BYTES = 1 << 20  # bytes
 _waiting: ContextVar[dict[Path, Path] | None] = ContextVar('_waiting', default=None)
+LARGEST_YAML = 1 << 22  # characters
+_MOST_VALUES, _DEEPEST = 100_000, 50
+
+# LibYAML, where PyYAML was built with it, takes a tenth of the time.
+_Base: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+_BaseDumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+_INT, _FLOAT, _TIMESTAMP = (f'tag:yaml.org,2002:{kind}' for kind in ('int', 'float', 'timestamp'))
 
 
 def path_of(given: str | Path) -> Path:
@@ -164,3 +180,144 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+class _Loader(_Base):  # type: ignore[misc]
+    """YAML 1.1 as PyYAML reads it, but for dates, and with the numbers of YAML 1.2.
+
+    So 1e-3 is one, 0800 is eight hundred, and 1:30 is not 90.
+    """
+
+    # A date is nothing that any file here has; 2001-99-99 may be a name.
+    yaml_implicit_resolvers: ClassVar = {
+        first: [(tag, pattern) for tag, pattern in resolvers
+                if tag not in (_INT, _FLOAT, _TIMESTAMP)]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+
+_Loader.add_implicit_resolver(
+    _INT, re.compile(r'[-+]?(0|[1-9][0-9]*|0x[0-9a-fA-F]+)$'), list('-+0123456789'))
+_Loader.add_implicit_resolver(
+    _FLOAT, re.compile(r'[-+]?((\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|\.(inf|Inf|INF))$'
+                       r'|\.(nan|NaN|NAN)$'), list('-+.0123456789'))
+# OpenCV's matrices are mappings; those of other types are none that a lens has.
+_Loader.add_constructor('tag:yaml.org,2002:opencv-matrix', _Loader.construct_yaml_map)
+
+
+class _Dumper(_BaseDumper):  # type: ignore[misc]
+    """A dumper that writes every value out, since aliases are not read."""
+
+    def ignore_aliases(self, _: Any) -> bool:
+        return True
+
+
+# Whoever builds a lens or a scenario in Python computes with numpy.
+for _scalar in (np.bool_, np.integer, np.floating):
+    _Dumper.add_multi_representer(
+        _scalar, lambda dumper, value: dumper.represent_data(value.item()))
+
+
+def read_yaml(path: str | Path, error: type[FisheyeSvpError]) -> dict[str, Any]:
+    """Return the mapping a YAML file holds; raise `error`, naming file and line, if it cannot."""
+    return parse_yaml(read_text(path, error, LARGEST_YAML), path, error)
+
+
+def parse_yaml(text: str, where: str | Path, error: type[FisheyeSvpError]) -> dict[str, Any]:
+    """Return the mapping a YAML text holds; raise `error`, naming `where` and line."""
+    node = compose_yaml(text, where, error)
+    loader = _Loader('')
+    try:
+        with _convert_errors(where, error):
+            document = loader.construct_document(node) if node else None
+    finally:
+        loader.dispose()
+    if not isinstance(document, dict):
+        raise error(f'{where}: a YAML mapping is expected, found {type(document).__name__}')
+    return document
+
+
+def compose_yaml(text: str, where: str | Path, error: type[FisheyeSvpError]) -> yaml.Node | None:
+    """Return the nodes of a YAML text, None for an empty one; raise `error` as `parse_yaml`."""
+    if len(text) > LARGEST_YAML:
+        raise error(f'{where}: above {LARGEST_YAML >> 20} MB, the largest YAML file that is read')
+    depth = values = 0
+    with _convert_errors(where, error):
+        for event in yaml.parse(text, _Loader):
+            opens = isinstance(event, yaml.CollectionStartEvent)
+            depth += opens - isinstance(event, yaml.CollectionEndEvent)
+            values += opens or isinstance(event, yaml.ScalarEvent)
+            if isinstance(event, yaml.AliasEvent):
+                raise _yaml_error('an alias; write out what it stands for', event)
+            if depth > _DEEPEST or values > _MOST_VALUES:
+                raise _yaml_error(f'more than {_MOST_VALUES} values, or nested deeper than '
+                               f'{_DEEPEST}', event)
+        node: yaml.Node | None = yaml.compose(text, _Loader)
+        _refuse_repeated_keys(node)
+    return node
+
+
+def dump_yaml(document: Any, **style: Any) -> str:
+    """Return a document as YAML that `parse_yaml` reads back."""
+    text: str = yaml.dump(document, Dumper=_Dumper, sort_keys=False, **style)
+    return text
+
+
+def parse_json(text: str, where: str | Path, error: type[FisheyeSvpError]) -> dict[str, Any]:
+    """Return the object a JSON text holds; raise `error`, naming `where`."""
+    try:
+        document = json.loads(text, object_pairs_hook=_object)
+    except (ValueError, RecursionError) as cause:
+        raise error(f'{where}: broken JSON ({cause})') from cause
+    if not isinstance(document, dict):
+        raise error(f'{where}: a JSON object is expected, found {type(document).__name__}')
+    return document
+
+
+def read_json(path: str | Path, error: type[FisheyeSvpError]) -> dict[str, Any]:
+    """Return the object a JSON file holds; raise `error`, naming the file."""
+    return parse_json(read_text(path, error), path, error)
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f'{next(n for n in names if names.count(n) > 1)!r} is listed twice')
+    return found
+
+
+def _refuse_repeated_keys(node: yaml.Node | None) -> None:
+    nodes = [node]
+    while nodes:
+        one = nodes.pop()
+        if isinstance(one, yaml.SequenceNode):
+            nodes += one.value
+        if not isinstance(one, yaml.MappingNode):
+            continue
+        seen = set()
+        for key, value in one.value:
+            name = key.value if isinstance(key, yaml.ScalarNode) else id(key)
+            if name in seen:
+                raise _yaml_error(f'the key {name!r} a second time', key)
+            seen.add(name)
+            nodes += (key, value)
+
+
+def _yaml_error(what: str, place: Any) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=f'there is {what}', problem_mark=place.start_mark)
+
+
+@contextmanager
+def _convert_errors(where: str | Path, error: type[FisheyeSvpError]) -> Iterator[None]:
+    try:
+        yield
+    except yaml.YAMLError as cause:
+        mark = getattr(cause, 'problem_mark', None)
+        line = f' at line {mark.line + 1}' if mark else ''
+        problem = getattr(cause, 'problem', None) or f'cannot be parsed ({cause})'
+        raise error(f'{where}: broken YAML{line}: {problem}') from cause
+    except (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError) as cause:
+        # What PyYAML lets out for a value that is none of its own tag
+        raise error(f'{where}: broken YAML: a value is not what it is tagged as, or has too many '
+                    f'digits ({cause})') from cause

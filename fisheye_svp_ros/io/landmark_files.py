@@ -8,9 +8,9 @@ import numpy as np
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.csv_files import CsvTable
-from fisheye_svp_ros.io.documents import read_yaml
+from fisheye_svp_ros.io.files import read_yaml
 from fisheye_svp_ros.io.share import config_path
-from fisheye_svp_ros.scene.landmarks import MOST_LANDMARK, SPREADS, Landmarks, check_landmarks
+from fisheye_svp_ros.scene.observations import MOST_LANDMARK, SPREADS, Landmarks, check_landmarks
 
 
 def environment(spread: str, radius: float, layout: str | Path | None = None) -> Landmarks:

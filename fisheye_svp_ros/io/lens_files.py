@@ -16,8 +16,7 @@ from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.target import LANDMARKS, Target
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
-from fisheye_svp_ros.io.files import read_text, write_text
+from fisheye_svp_ros.io.files import dump_yaml, parse_yaml, read_text, write_text
 from fisheye_svp_ros.io.lens_formats import READABLE, Foreign, read_foreign
 from fisheye_svp_ros.io.share import without_camera
 from fisheye_svp_ros.optics.curve_base import Curve, ViewpointShift

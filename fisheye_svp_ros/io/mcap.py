@@ -25,8 +25,8 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message, Schema, Statistics
 
 from fisheye_svp_ros.errors import BagError
-from fisheye_svp_ros.io.recording_files import MAX_BYTES
 
+MAX_BYTES = 1 << 28  # bytes of a chunk or a message, decompressed
 _MAGIC = b'\x89MCAP0\r\n'
 _HEAD = struct.Struct('<BQ')  # of a record: opcode, length
 

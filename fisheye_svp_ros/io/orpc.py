@@ -17,8 +17,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.files import read_text
-from fisheye_svp_ros.scene.landmarks import MOST_LANDMARK
-from fisheye_svp_ros.scene.observations import Observations, make_observations
+from fisheye_svp_ros.scene.observations import MOST_LANDMARK, Observations, make_observations
 
 _CM, _MM = 0.01, 0.001
 _MAX_BYTES = 1 << 24  # bytes

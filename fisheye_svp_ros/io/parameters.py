@@ -15,8 +15,7 @@ from typing import Any, NamedTuple, TypeVar
 import yaml
 
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.documents import LARGEST_YAML, compose_yaml
-from fisheye_svp_ros.io.files import read_text
+from fisheye_svp_ros.io.files import LARGEST_YAML, compose_yaml, read_text
 
 SWEEP = 'sweep.'
 

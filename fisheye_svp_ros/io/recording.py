@@ -25,8 +25,7 @@ from fisheye_svp_ros.io.decoding import (
     stamp_of,
     statuses,
 )
-from fisheye_svp_ros.scene.landmarks import Landmarks
-from fisheye_svp_ros.scene.observations import Observations, make_observations
+from fisheye_svp_ros.scene.observations import Landmarks, Observations, make_observations
 
 STAMP = 'stamp_ns'
 NAMESPACE = 'namespace'

@@ -27,8 +27,7 @@ from fisheye_svp_ros.nodes.silence import LIMIT
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scene.landmarks import Landmarks
-from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.observations import Landmarks, Observations
 from fisheye_svp_ros.study.settings import CameraSettings
 
 _TOPIC = re.compile(r'(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', re.ASCII)

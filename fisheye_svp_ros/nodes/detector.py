@@ -28,7 +28,7 @@ from fisheye_svp_ros.nodes.image_topics import COMPRESSED_SUFFIX, ImageTopics
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.subscriptions import Unread
 from fisheye_svp_ros.optics.lens import INTRINSICS
-from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.study.settings import Settings
 
 if TYPE_CHECKING:

@@ -19,8 +19,7 @@ from fisheye_svp_ros.nodes.camera import CameraNode, rows_by_frame
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.svp import svp_equivalent
-from fisheye_svp_ros.scene.landmarks import Landmarks
-from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.observations import Landmarks, Observations
 from fisheye_svp_ros.study.settings import CameraSettings
 
 _NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*')

@@ -10,7 +10,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.paper.lens_evaluation import LensEvaluation
 from fisheye_svp_ros.paper.tables import ERROR2_RANGE, ERROR3_RANGE, LENSES, NAMES
-from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
+from fisheye_svp_ros.scene.observations import RADII, SPREADS
 
 HOLDS, IN_PART, FAILS = 'holds', 'holds in part', 'does not hold'
 _Z, _AXIS = 2, 3

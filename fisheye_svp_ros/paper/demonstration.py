@@ -25,8 +25,7 @@ from fisheye_svp_ros.paper.tables import (
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.cameras import camera_for
 from fisheye_svp_ros.rectify.maps import RectifiedPair, rectify_pair
-from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
-from fisheye_svp_ros.scene.observations import group_views
+from fisheye_svp_ros.scene.observations import RADII, SPREADS, group_views
 from fisheye_svp_ros.scene.rigs import rig
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.simulate.scenario import Scenario, model_of, scalars, simulate_scenario

@@ -20,8 +20,7 @@ from fisheye_svp_ros.paper.lens_evaluation import (
 )
 from fisheye_svp_ros.paper.tables import STYLE_NAMES
 from fisheye_svp_ros.pose import PAPER_FROM_OPTICAL, Pose, rotation_from_vector
-from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
-from fisheye_svp_ros.scene.observations import views_of
+from fisheye_svp_ros.scene.observations import RADII, SPREADS, views_of
 from fisheye_svp_ros.scene.rigs import BASELINE
 from fisheye_svp_ros.solve.bundle_adjustment import adjust_lens
 from fisheye_svp_ros.solve.localization import localize

@@ -19,8 +19,7 @@ from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.paper.tables import CAPTIONS, PANELS, RIGHT_CAMERA_Z, STYLE_NAMES
 from fisheye_svp_ros.pose import PAPER_FROM_OPTICAL, Pose
-from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
-from fisheye_svp_ros.scene.observations import Views, views_of
+from fisheye_svp_ros.scene.observations import RADII, SPREADS, Views, views_of
 from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
 from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration

@@ -34,7 +34,7 @@ from fisheye_svp_ros.reporting.blocks import (
     Text,
     write_blocks,
 )
-from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
+from fisheye_svp_ros.scene.observations import RADII, SPREADS
 
 FACTOR = 3.0  # beyond it a difference is discussed
 _ANGLES = (0, 20, 40, 60, 75, 85)  # degree

@@ -32,7 +32,7 @@ from fisheye_svp_ros.paper.tables import (
     agreeing,
     cells,
 )
-from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
+from fisheye_svp_ros.scene.observations import RADII, SPREADS
 
 SVP = 'SVP'
 

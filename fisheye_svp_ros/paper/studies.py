@@ -10,11 +10,11 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.documents import read_yaml
+from fisheye_svp_ros.io.files import read_yaml
 from fisheye_svp_ros.io.share import config_path
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.paper.tables import CALIBRATION, LENSES
-from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
+from fisheye_svp_ros.scene.observations import RADII, SPREADS
 
 COMMAND = 'make paper-search'
 NAMES = ('f', 's0', 'e0', 'e1', 'e2')

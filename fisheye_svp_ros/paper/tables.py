@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.scene.landmarks import RADII
+from fisheye_svp_ros.scene.observations import RADII
 from fisheye_svp_ros.scene.rigs import STYLES
 
 NAMES = {'fish180': 'Fish180', 'fish214': 'Fish214'}

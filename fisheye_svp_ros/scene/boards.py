@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.scene.landmarks import Landmarks
-from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.observations import Landmarks, Observations
 
 _MIN_LANDMARKS_DEGREE_6 = 100  # landmarks: four for each coefficient from degree 2 to 6
 

@@ -29,8 +29,7 @@ from fisheye_svp_ros.pose import (
     rotation_from_vector,
     vector_from_rotation,
 )
-from fisheye_svp_ros.scene.landmarks import Landmarks
-from fisheye_svp_ros.scene.observations import STEREO, Observations
+from fisheye_svp_ros.scene.observations import STEREO, Landmarks, Observations
 from fisheye_svp_ros.scene.rigs import BASELINE, STYLES, calibration_poses, rig_from_angle
 from fisheye_svp_ros.simulate.simulation import (
     add_noise,

@@ -11,9 +11,9 @@ from fisheye_svp_ros.effects.base import noise_scale
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import (
     STEREO,
+    Landmarks,
     Observations,
     Views,
     make_observations,

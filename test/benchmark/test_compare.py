@@ -28,7 +28,7 @@ from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import rotation_from_vector
-from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.simulate.simulation import simulate
 
 LENS = Lens('camera', 800, 700, 220.0, 220.0, 400.0, 350.0, KannalaBrandt(-0.02, 0.004, -0.003),

@@ -35,7 +35,7 @@ from fisheye_svp_ros.reporting.cause_text import cause_rows, intrinsic_rows
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, point_residuals, residual_pictures
 from fisheye_svp_ros.reporting.diagnosis_text import advice_text, verdict_sentences
 from fisheye_svp_ros.reporting.first_screen import headline
-from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
 from fisheye_svp_ros.solve.rig_state import Linearization, with_effect

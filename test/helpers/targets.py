@@ -3,7 +3,7 @@
 import numpy as np
 
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Landmarks
 
 
 def plane():

@@ -11,8 +11,7 @@ from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.optics.ports import Port
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.scene.landmarks import Landmarks
-from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.observations import Landmarks, Observations
 from fisheye_svp_ros.simulate.simulation import simulate
 
 AIR = Lens('air', 1280, 960, 420.0, 421.0, 640.0, 478.0, KannalaBrandt(-0.02, 0.003, -0.001, 0.0),

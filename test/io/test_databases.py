@@ -15,7 +15,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from fisheye_svp_ros.errors import BagError, ObservationError
-from fisheye_svp_ros.io import recording_files
+from fisheye_svp_ros.io import bags
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.readers import read_observations
 
@@ -75,9 +75,9 @@ def test_a_recording_is_read_however_it_is_stored_and_without_its_metadata(
 def test_a_compressed_file_is_not_unpacked_to_list_topics_that_its_metadata_lists(
     write: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, metadata: str, times: int
 ) -> None:
-    file, unpack = write(StoragePlugin.MCAP, CompressionMode.FILE), recording_files._unpack
+    file, unpack = write(StoragePlugin.MCAP, CompressionMode.FILE), bags._unpack
     unpacked: list[Path] = []
-    monkeypatch.setattr(recording_files, '_unpack', lambda packed, whole: (
+    monkeypatch.setattr(bags, '_unpack', lambda packed, whole: (
         unpacked.append(packed), unpack(packed, whole)))
     if metadata:
         (file.parent / 'metadata.yaml').write_text(metadata)

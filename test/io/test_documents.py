@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError
-from fisheye_svp_ros.io.documents import dump_yaml, parse_json, parse_yaml, read_yaml
-from fisheye_svp_ros.io.files import read_bytes
+from fisheye_svp_ros.io.files import dump_yaml, parse_json, parse_yaml, read_bytes, read_yaml
 from fisheye_svp_ros.io.parameters import parameters_of, read_parameter_file
 
 BOMB = 'a: &a [1, 1]\n' + ''.join(

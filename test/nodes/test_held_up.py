@@ -27,7 +27,7 @@ from fisheye_svp_ros.nodes.quality import LATCHED_SETS, RELIABLE, SENSOR
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import kannala_brandt_equivalent
-from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.scene.rigs import paper_pose
 
 MS = 10**6

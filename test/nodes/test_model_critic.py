@@ -39,7 +39,7 @@ from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.sweep_plots import draw_runs
-from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Landmarks
 
 FRAMES = 16
 EXPLAINED = ('explained', 'partly_explained')

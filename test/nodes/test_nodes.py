@@ -41,8 +41,7 @@ from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.optics.camera import incidence
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.scene.landmarks import Landmarks
-from fisheye_svp_ros.scene.observations import group_views
+from fisheye_svp_ros.scene.observations import Landmarks, group_views
 from fisheye_svp_ros.scene.rigs import paper_pose, rig
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 from fisheye_svp_ros.simulate.simulation import simulate

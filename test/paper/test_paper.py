@@ -25,7 +25,7 @@ from fisheye_svp_ros.paper.tables import (
     QUANTITIES,
     STYLE_NAMES,
 )
-from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
+from fisheye_svp_ros.scene.observations import RADII, SPREADS
 
 pytestmark = pytest.mark.xdist_group('paper')  # made once
 HELD = Path(__file__).with_name('paper_cells.csv')

@@ -5,7 +5,7 @@ import pytest
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.landmark_files import environment, load_landmarks
-from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
+from fisheye_svp_ros.scene.observations import RADII, SPREADS
 
 
 def angles(landmarks):

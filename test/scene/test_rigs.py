@@ -9,8 +9,7 @@ from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.camera import project, unique_range
 from fisheye_svp_ros.pose import PAPER_FROM_OPTICAL
-from fisheye_svp_ros.scene.landmarks import RADII
-from fisheye_svp_ros.scene.observations import rig_cameras
+from fisheye_svp_ros.scene.observations import RADII, rig_cameras
 from fisheye_svp_ros.scene.rigs import BASELINE, STYLES, calibration_poses, paper_pose, rig
 
 

@@ -20,8 +20,7 @@ from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.camera import back_project, project
 from fisheye_svp_ros.pose import identity
-from fisheye_svp_ros.scene.landmarks import Landmarks
-from fisheye_svp_ros.scene.observations import group_views
+from fisheye_svp_ros.scene.observations import Landmarks, group_views
 from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig, surround_rig
 from fisheye_svp_ros.simulate import scenario
 from fisheye_svp_ros.simulate.scenario import (

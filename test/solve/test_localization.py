@@ -13,8 +13,7 @@ from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.pose import Pose, axis_angle_between, rotation_from_vector
-from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
-from fisheye_svp_ros.scene.observations import views_of
+from fisheye_svp_ros.scene.observations import RADII, SPREADS, views_of
 from fisheye_svp_ros.scene.rigs import paper_pose
 from fisheye_svp_ros.solve.localization import localize, normal_equations
 

@@ -11,8 +11,7 @@ from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.pose import Pose, axis_angle_between
-from fisheye_svp_ros.scene.landmarks import RADII
-from fisheye_svp_ros.scene.observations import stereo_views, views_of
+from fisheye_svp_ros.scene.observations import RADII, stereo_views, views_of
 from fisheye_svp_ros.scene.rigs import STYLES, calibration_poses, rig
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
 from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo

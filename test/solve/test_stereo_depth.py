@@ -12,7 +12,7 @@ from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.camera import back_project, project
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scene.landmarks import RADII
+from fisheye_svp_ros.scene.observations import RADII
 from fisheye_svp_ros.scene.rigs import STYLES, paper_pose, rig
 from fisheye_svp_ros.solve.stereo_depth import (
     epipolar_curves,

@@ -21,8 +21,7 @@ from fisheye_svp_ros.diagnosis.problem import Problem
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.effects.target_map import KnownTarget
 from fisheye_svp_ros.scene.boards import BoardTurn, board_turns
-from fisheye_svp_ros.scene.landmarks import Landmarks
-from fisheye_svp_ros.scene.observations import Observations, frame_name
+from fisheye_svp_ros.scene.observations import Landmarks, Observations, frame_name
 from fisheye_svp_ros.solve.initial_rig import localize_cameras
 from fisheye_svp_ros.solve.outliers import FRAME, cross_camera_offsets
 from fisheye_svp_ros.solve.rig_checks import is_unpaired

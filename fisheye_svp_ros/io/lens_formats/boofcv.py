@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import parse_yaml
+from fisheye_svp_ros.io.files import parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 
 recognises = re.compile('omnidirectional_universal').search

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import LARGEST_YAML, parse_yaml
+from fisheye_svp_ros.io.files import LARGEST_YAML, parse_yaml
 from fisheye_svp_ros.pose import Pose, nearest_rotation, rotation_from_quaternion
 
 MAX_NUMBER = 1e12  # any number of a lens

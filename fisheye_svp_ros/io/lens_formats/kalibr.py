@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import dump_yaml
+from fisheye_svp_ros.io.files import dump_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose

@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import parse_yaml
+from fisheye_svp_ros.io.files import parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields
 
 SEPARATOR = '_in_'

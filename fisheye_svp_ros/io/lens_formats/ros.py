@@ -17,7 +17,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError, ObservationError
 from fisheye_svp_ros.io.decoding import read_camera_info
-from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
+from fisheye_svp_ros.io.files import dump_yaml, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 

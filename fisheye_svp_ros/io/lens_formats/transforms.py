@@ -14,7 +14,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
+from fisheye_svp_ros.io.files import dump_yaml, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields
 from fisheye_svp_ros.pose import (
     Pose,
