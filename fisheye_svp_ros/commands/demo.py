@@ -18,7 +18,6 @@ from fisheye_svp_ros.io.columns import write_columns
 from fisheye_svp_ros.io.files import write_json, write_text, write_together
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.recording import (
-    Columns,
     ResidualSet,
     has_residuals,
     is_tabulated,
@@ -66,14 +65,16 @@ def run(args: argparse.Namespace) -> None:
     Where no node can run, the same scenarios are computed in this process.
     """
     lenses, radii = list(dict.fromkeys(args.lenses)), list(dict.fromkeys(args.radii))
-    bag: Path | None = args.output / _RECORDING
+    bag = args.output / _RECORDING
     if reason := missing_rclpy():
         print(f'  ROS 2 is missing ({reason}): the same scenarios run in one process, without '
               'nodes.')
-        bag = None
         columns, fields = compute_demo(lenses, radii)
     else:
-        columns, fields = _record(args.output, lenses, radii)
+        with progress('running the nodes'):
+            record(bag, args.output / 'logs', lenses, radii)
+        columns = tabulate(Bag(bag).records(is_tabulated))
+        fields = residual_fields(Bag(bag).records(has_residuals))
     rows = demo_rows(columns, lenses, radii)
     with progress('rectifying a pair'):
         pair, images = rectified_pair(load_lens(lens_path(lenses[0])))
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace) -> None:
     with write_together():
         write_columns(args.output / 'table', columns)
         write_json(args.output / 'demo.json', {
-            'recording': bag and str(bag), 'rows': [row._asdict() for row in rows],
+            'recording': None if reason else str(bag), 'rows': [row._asdict() for row in rows],
             'rectified': remaining_document(apart),
         })
         _draw(args.output, rows, fields)
@@ -90,18 +91,7 @@ def run(args: argparse.Namespace) -> None:
     _print(rows)
     print_remaining(f'A pair of {lenses[0]}, rectified at {range_text(pair.left.range)}: '
                     'difference between the rows of left and right', apart)
-    print(f'  {"recording, " if bag else ""}table, pictures: {args.output}')
-
-
-def _record(
-    folder: Path, lenses: Sequence[str], radii: Sequence[float]
-) -> tuple[Columns, list[ResidualSet]]:
-    """Run the node graph into a recording; return what is to be tabulated and drawn of it."""
-    bag = folder / _RECORDING
-    with progress('running the nodes'):
-        record(bag, folder / 'logs', lenses, radii)
-    columns = tabulate(Bag(bag).records(is_tabulated))
-    return columns, residual_fields(Bag(bag).records(has_residuals))
+    print(f'  {"" if reason else "recording, "}table, pictures: {args.output}')
 
 
 def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float]) -> None:

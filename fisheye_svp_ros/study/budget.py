@@ -169,17 +169,18 @@ def at_point(
         by_range = _interpolate_rows(budget.spreads, excess, spread)
         by_spread = _interpolate_rows(np.log(budget.ranges), excess.T, np.log(working_range))
         here = np.interp(np.log(working_range), np.log(budget.ranges), by_range)
+        own = [budget.own.get(part, {}).get(quantity, np.full_like(noise, np.nan))
+               for part in _LENS_PARTS]
+        caused, noisy, most, parameters, misfit = (
+            _value(budget, table, spread, working_range)
+            for table in (error, noise, allowed, *own))
+        logs = np.log(budget.ranges)
         found.append(Point(
-            quantity,
-            _value(budget, error, spread, working_range),
-            _value(budget, noise, spread, working_range),
-            _value(budget, allowed, spread, working_range),
-            None if np.isnan(here) else bool(here <= 0),
-            float(np.exp(_range_from(np.log(budget.ranges), by_range))),
-            _max_range(budget.spreads, by_spread),
-            *(_value(budget, budget.own.get(part, {}).get(quantity, np.full_like(noise, np.nan)),
-                     spread, working_range) for part in _LENS_PARTS),
-        ))
+            quantity, caused, noisy, most, None if np.isnan(here) else bool(here <= 0),
+            # From which range on the limit is kept, and up to which spread
+            float(np.exp(_last_crossing(logs, by_range, ~(by_range <= 0), logs[0], np.nan))),
+            _last_crossing(budget.spreads, by_spread, by_spread <= 0, np.nan, budget.spreads[-1]),
+            parameters, misfit))
     return found
 
 
@@ -270,24 +271,16 @@ def _value(budget: Budget, table: Array, spread: float, working_range: float) ->
     return float(np.exp(np.interp(np.log(working_range), logs, by_range)))
 
 
-def _range_from(places: Array, excess: Array) -> float:
-    """Return the place from which on an excess stays at or below 0; NaN for nowhere."""
-    above = np.flatnonzero(~(excess <= 0))
-    if not above.size:
-        return float(places[0])
-    return _crossing(places, excess, above[-1]) if above[-1] < len(places) - 1 else float('nan')
+def _last_crossing(places: Array, excess: Array, side: Mask, none: float, all_: float) -> float:
+    """Return where an excess is 0 after the last place on a side of it.
 
-
-def _max_range(places: Array, excess: Array) -> float:
-    """Return the last place where an excess is at or below 0; NaN for nowhere."""
-    kept = np.flatnonzero(excess <= 0)
-    if not kept.size:
-        return float('nan')
-    return _crossing(places, excess, kept[-1]) if kept[-1] < len(places) - 1 else places[-1].item()
-
-
-def _crossing(places: Array, excess: Array, i: int) -> float:
-    """Return where the excess is 0 between places i and i + 1; on the kept side where unknown."""
+    On the kept side where that is unknown; none, all_: what it is with no place, or the last one,
+    on that side.
+    """
+    rows = np.flatnonzero(side)
+    i = int(rows[-1]) if rows.size else -1
+    if i in (-1, len(places) - 1):
+        return float(none if i < 0 else all_)
     one, two = excess[i:i + 2]
     if not np.isfinite(one - two):
         return float(places[i + 1] if two <= 0 else places[i])
