@@ -135,8 +135,7 @@ def on_board(frames: int, landmarks: int, cameras: int) -> tuple[Observations, t
     frame, camera, point = np.indices((frames, cameras, landmarks)).reshape(3, -1)
     poses = Pose(rotation_from_vector(rng.uniform(-0.5, 0.5, (frames, 3))),
                  rng.uniform([-0.2, -0.2, 0.3], [0.2, 0.2, 0.7], (frames, 3)))
-    seen = poses.take(frame).transform(board[point][:, None])[:, 0] - camera[:, None] * [
-        0.02, 0.0, 0.0]
+    seen = poses.take(frame).transform(board[point]) - camera[:, None] * [0.02, 0.0, 0.0]
     names = tuple(f'camera{i}' for i in range(cameras))
     uv = project(lens, seen).uv + rng.normal(0, 0.2, (len(seen), 2))
     return make_observations(

@@ -34,7 +34,7 @@ from benchmark.speed.harness import (
     require,
 )
 from benchmark.speed.scenes import localization as scene_of
-from benchmark.speed.scenes import points, shift_lens, svp_lens
+from benchmark.speed.scenes import on_board, points, shift_lens, svp_lens
 from benchmark.speed.worker import worker
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
@@ -172,6 +172,14 @@ def test_the_report_is_markdown_with_versions_goals_and_reasons():
     assert '| fisheye-svp, numpy | 1 | 1 to 1 | 2.0e-12 |' in text
     assert '- peer did not take part: not installed.' in text
     assert '| work | numpy | peer | 2 × | not measured | - |' in text
+
+
+def test_every_frame_of_the_board_has_its_own_pose():
+    table, names = on_board(3, 32, 2)
+    assert len(table) == 3 * 32 * 2 and table.cameras == names
+    centres = [table.uv[(table.frame == frame) & (table.camera == 0)].mean(axis=0)
+               for frame in range(3)]
+    assert min(np.linalg.norm(centres[i] - centres[i - 1]) for i in range(3)) > 10.0
 
 
 def test_commands_are_timed_to_their_end_and_until_a_text(tmp_path):
