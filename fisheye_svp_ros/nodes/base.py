@@ -24,8 +24,13 @@ from fisheye_svp_ros.nodes.declaration import (
 )
 from fisheye_svp_ros.nodes.quality import INPUT, RELIABLE, create_with_qos
 from fisheye_svp_ros.nodes.session import start_timer
-from fisheye_svp_ros.nodes.silence import LIMIT, explain_silence, silent_inputs
-from fisheye_svp_ros.nodes.subscriptions import Input, Unread
+from fisheye_svp_ros.nodes.subscriptions import (
+    LIMIT,
+    Input,
+    Unread,
+    explain_silence,
+    silent_inputs,
+)
 from fisheye_svp_ros.study.settings import Settings, SolverSettings
 
 _OF_ROS = ('use_sim_time', 'start_type_description_service')

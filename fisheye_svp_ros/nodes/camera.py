@@ -23,7 +23,7 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode, NodeExit, NodeFailure
 from fisheye_svp_ros.nodes.quality import LATCHED_SETS, SENSOR
 from fisheye_svp_ros.nodes.session import RCLError
-from fisheye_svp_ros.nodes.silence import LIMIT
+from fisheye_svp_ros.nodes.subscriptions import LIMIT
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose

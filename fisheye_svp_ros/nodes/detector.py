@@ -22,9 +22,13 @@ from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterE
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
-from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
+from fisheye_svp_ros.nodes.camera_info import (
+    CAMERA_INFO,
+    COMPRESSED_SUFFIX,
+    CameraInfos,
+    ImageTopics,
+)
 from fisheye_svp_ros.nodes.declaration import check_access
-from fisheye_svp_ros.nodes.image_topics import COMPRESSED_SUFFIX, ImageTopics
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.subscriptions import Unread
 from fisheye_svp_ros.optics.lens import INTRINSICS

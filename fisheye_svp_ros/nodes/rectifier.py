@@ -20,8 +20,12 @@ from fisheye_svp_ros.io.rig_files import load_pair, pair_of_lenses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
-from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
-from fisheye_svp_ros.nodes.image_topics import COMPRESSED_SUFFIX, ImageTopics
+from fisheye_svp_ros.nodes.camera_info import (
+    CAMERA_INFO,
+    COMPRESSED_SUFFIX,
+    CameraInfos,
+    ImageTopics,
+)
 from fisheye_svp_ros.nodes.quality import SENSOR
 from fisheye_svp_ros.nodes.subscriptions import Unread
 from fisheye_svp_ros.optics.lens import Lens

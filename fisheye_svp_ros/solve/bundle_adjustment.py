@@ -1,7 +1,7 @@
 """Bundle adjustment: poses, rig, intrinsics and effects together, by least squares.
 
 Any of them may have a Gaussian prior, or be held.  The frames are the blocks of one arrow
-(`solve.arrow`), so that the time grows as their number does.
+(`solve.least_squares`), so that the time grows as their number does.
 """
 
 from __future__ import annotations
@@ -18,13 +18,15 @@ from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, log_derivative
 from fisheye_svp_ros.scene.observations import Views
-from fisheye_svp_ros.solve.arrow import (
+from fisheye_svp_ros.solve.least_squares import (
+    Arrays,
     ArrowEquations,
+    Minimum,
     arrow_covariance,
     arrow_information,
     arrow_step,
+    levenberg_marquardt,
 )
-from fisheye_svp_ros.solve.least_squares import Arrays, Minimum, levenberg_marquardt
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, is_shared
 
 MAX_LENS_ITERATIONS = 200

@@ -24,9 +24,14 @@ from fisheye_svp_ros.pose import (
     nearest_rotation,
     quaternion_from_rotation,
 )
-from fisheye_svp_ros.solve.arrow import ArrowEquations, arrow_covariance, arrow_information
 from fisheye_svp_ros.solve.bundle_adjustment import Adjustment
-from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt
+from fisheye_svp_ros.solve.least_squares import (
+    Arrays,
+    ArrowEquations,
+    arrow_covariance,
+    arrow_information,
+    levenberg_marquardt,
+)
 from fisheye_svp_ros.solve.reliability import noise_sigma
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 

@@ -129,8 +129,7 @@ def _best_turn(
 
 def _translation(problem: _Problem, rotation: Array) -> Array:
     """Return the best translations (S, C, 3) for turns (S, C, 3, 3)."""
-    translation: Array = (problem.pull[:, None] @ _columns(rotation)[..., None])[..., 0]
-    return translation
+    return np.asarray((problem.pull[:, None] @ _columns(rotation)[..., None])[..., 0])
 
 
 def _polish(rotation: Array, form: Array, steps: int) -> Array:

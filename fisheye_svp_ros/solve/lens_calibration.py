@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, LensError, ObservationError
-from fisheye_svp_ros.optics.camera import back_project, incidence
+from fisheye_svp_ros.optics.camera import back_project, incidence, project
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
 from fisheye_svp_ros.optics.lens import (
     INTRINSICS,
@@ -24,11 +24,10 @@ from fisheye_svp_ros.optics.lens import (
 )
 from fisheye_svp_ros.optics.ports import Port
 from fisheye_svp_ros.pose import Pose, identity
-from fisheye_svp_ros.scene.observations import Observations, Views
+from fisheye_svp_ros.scene.observations import Observations, Views, views_of
 from fisheye_svp_ros.solve.bundle_adjustment import AdjustedLens, adjust_lens, adjust_lens_from
 from fisheye_svp_ros.solve.hand_eye import HandEye, fit_hand_eye, flange_poses
 from fisheye_svp_ros.solve.initial_pose import initial_poses
-from fisheye_svp_ros.solve.lens_start import focal_candidates, lost_views, select_points
 from fisheye_svp_ros.solve.localization import Localization, localize
 from fisheye_svp_ros.solve.measured_poses import posable_views, rms_px, sigma_known
 from fisheye_svp_ros.solve.reliability import noise_sigma
@@ -39,6 +38,12 @@ FOCAL_UNCERTAINTY = 0.1  # a focal length that is known no better than this is n
 _CANDIDATES = 4
 _START_ITERATIONS = 40
 _ROUNDS = 4
+# Incidence angles between which the farthest image corner is looked for, rad, and in how many
+# steps; neighbouring focal lengths differ by less than a fifth.
+_CORNER_ANGLES = np.geomspace(np.radians(4.0), np.radians(160.0), 24)
+_VIEWS, _POINTS = 20, 60  # enough for a start
+_GOLDEN = (np.sqrt(5) - 1) / 2
+_LOST, _FEW_LOST = 6.0, 0.2  # times the median view; of the views
 
 
 class Calibration(NamedTuple):
@@ -247,23 +252,17 @@ def _fit_lens(start: Lens, views: Views, names: tuple[str, ...]) -> AdjustedLens
     best = adjust_lens_from(start.svp(), few, pose, values, svp_names, _START_ITERATIONS)
     adjusted = _adjust_until_stable(best, views, svp_names)
     if start.port is not None:
-        adjusted = _fit_behind_port(start, adjusted, few, views, (*svp_names, *port_names))
+        air, larger = adjusted.lens, start.port.magnification
+        if larger > 1:
+            # What a port does to the focal length is known, the rest of the curve is begun anew.
+            air = replace(air, fx=air.fx / larger, fy=air.fy / larger,
+                          image_height=start.image_height)
+        adjusted = _fit_port(
+            replace(air, port=start.port), few, views, (*svp_names, *port_names))
     if shift is None:
         return adjusted
     lens = _with_corner(replace(adjusted.lens, viewpoint_shift=shift))
     return adjust_lens(lens, views, adjusted.pose, names)
-
-
-def _fit_behind_port(
-    start: Lens, central: AdjustedLens, few: Views, views: Views, names: tuple[str, ...]
-) -> AdjustedLens:
-    """Adjust lens and port from a fit that knows of no port, and from several places of it."""
-    assert start.port is not None
-    air, larger = central.lens, start.port.magnification
-    if larger > 1:
-        # What a port does to the focal length is known, the rest of the curve is begun anew.
-        air = replace(air, fx=air.fx / larger, fy=air.fy / larger, image_height=start.image_height)
-    return _fit_port(replace(air, port=start.port), few, views, names)
 
 
 def _fit_port(lens: Lens, few: Views, views: Views, names: tuple[str, ...]) -> AdjustedLens:
@@ -323,3 +322,70 @@ def _check_focal(adjusted: AdjustedLens, source: str) -> None:
                     'and covers the image; check that image points and landmarks belong together '
                     '(order, units, axes: u to the right, v down, x, y, z right-handed)'
                 )
+
+
+def focal_candidates(lens: Lens, views: Views, keep: int) -> tuple[Array, Pose]:
+    """Return the best focal lengths (C,), px, of a scan and the poses (C, V) under each.
+
+    The image height is that of `lens` with the coefficients it has (kannala_brandt without any is
+    equidistant), the centre is the lens's.  Candidates are ranked by what their poses leave over.
+    """
+    focals, pose, rms = _scan(lens, views)
+    # A sum of root mean squares forgives one lost view.
+    best = np.argsort(rms.sum(axis=1))[:keep]
+    return focals[best], pose.take(best)
+
+
+def lost_views(lens: Lens, views: Views) -> Mask:
+    """Return which views (V,) are far worse than most at the focal length that suits most.
+
+    No pose goes with their points, as those are in another order, say.  None where a fifth or
+    more of the views are: then it is another lens that is wanted.
+    """
+    rms = _scan(lens, views)[2]
+    middle = np.median(rms, axis=1)
+    best = int(np.argmin(middle))
+    lost: Mask = rms[best] > _LOST * middle[best]
+    return lost if lost.mean() < _FEW_LOST else np.zeros_like(lost)
+
+
+def _scan(lens: Lens, views: Views) -> tuple[Array, Pose, Array]:
+    """Return focal lengths (C,), px, the poses (C, V) under each, and rms of each view, px."""
+    corner = np.hypot(lens.width, lens.height) / 2
+    heights, _ = lens.image_height.value_and_slope(
+        np.minimum(_CORNER_ANGLES, monotone_limit(lens))
+    )
+    focals = np.unique(corner / heights)
+    lenses = [replace(lens, fx=focal, fy=focal) for focal in focals.tolist()]
+    lenses = [replace(one, max_incidence=field_of_view(one)) for one in lenses]
+    direction = np.stack([back_project(one, views.uv).direction for one in lenses])
+    shape = direction.shape[:3]
+    points = np.broadcast_to(views.points, (*shape, 3)).reshape(-1, *views.points.shape[1:])
+    weight = np.broadcast_to(views.weight, shape).reshape(-1, shape[-1])
+    pose = initial_poses(points, direction.reshape(points.shape), weight).reshape(*shape[:2])
+    rms = np.array([_view_rms(one, pose.take(i), views) for i, one in enumerate(lenses)])
+    return focals, pose, rms
+
+
+def select_points(views: Views, most: int = _VIEWS) -> Views:
+    """Return the views that spread widest in the image, with a few evenly spread points each."""
+    used = views.used[..., None]
+    count = used.sum(axis=(1, 2))
+    centre = (views.uv * used).sum(axis=1, keepdims=True) / count[:, None, None]
+    spread = ((views.uv - centre) ** 2 * used).sum(axis=(1, 2)) / count
+    widest = np.sort(np.argsort(-spread, kind='stable')[:most])
+    chosen = views.take(widest)
+    # Multiples of the golden ratio do not fall into step with the rows of a board.
+    steps = np.arange(min(_POINTS, int(count.max()))) * _GOLDEN % 1
+    slot = (count[widest, None] * steps).astype(np.int64)
+    uv = np.take_along_axis(chosen.uv, slot[..., None], axis=1)
+    points = np.take_along_axis(chosen.points, slot[..., None], axis=1)
+    return views_of(points, uv, np.take_along_axis(chosen.weight, slot, axis=1))
+
+
+def _view_rms(lens: Lens, pose: Pose, views: Views) -> Array:
+    """Return the root mean square of the residuals of each view (V,), px."""
+    image = project(lens, pose.into_body(views.points), limited=False)
+    distance2 = np.where(views.used, ((image.uv - views.uv) ** 2).sum(axis=-1), 0.0)
+    mean = distance2.sum(axis=1) / views.used.sum(axis=1)
+    return np.sqrt(np.where(np.isfinite(mean), mean, np.inf))

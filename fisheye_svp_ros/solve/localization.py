@@ -162,8 +162,7 @@ def _mirror_image(pose: Pose, centre: Array, normal: Array) -> Pose:
 
 
 def _mirror(normal: Array) -> Array:
-    mirror: Array = np.eye(3) - 2 * normal[..., :, None] * normal[..., None, :]
-    return mirror
+    return np.asarray(np.eye(3) - 2 * normal[..., :, None] * normal[..., None, :])
 
 
 def check_views(views: Views, minimum: int, what: str = 'in it') -> None:

@@ -208,8 +208,8 @@ def robust_scale(offset: Array) -> Array:
     """Robust standard deviation of a coordinate, one a view (S, 1), from offsets (S, N)."""
     median, typical = (np.nanmedian(np.minimum(offset, _UNSEEN_PX), axis=axis, keepdims=True)
                        for axis in (1, None))
-    scale: Array = np.maximum(median, np.maximum(typical, _MIN_RESIDUAL_PX)) / _MEDIAN_NORM
-    return scale
+    least = np.maximum(typical, _MIN_RESIDUAL_PX)
+    return np.asarray(np.maximum(median, least) / _MEDIAN_NORM)
 
 
 def _landmark_scale(views: Views, offset: Array) -> Array:

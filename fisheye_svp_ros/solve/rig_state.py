@@ -277,9 +277,7 @@ class Linearization:
         d_place, d_turn = self._d_pose[..., :3], self._d_pose[..., 3:]
         body = self.state.pose.rotation[self.data.frame_of][:, None]
         rig = np.concatenate([d_place @ body, d_turn @ body], axis=-1)
-        mine = self.data.camera_of[:, None] == np.arange(1, self.data.cameras)
-        columns = rig[..., None, :] * mine[:, None, None, :, None]
-        return np.asarray(columns.reshape(*rig.shape[:3], -1))
+        return _place_columns(rig, self.data.camera_of, self.data.cameras)
 
     def _board_columns(self) -> Array:
         """Return columns (S, N, 2, 6 (B - 1)) by the poses of the boards but the first."""
@@ -288,9 +286,7 @@ class Linearization:
         arm = self._camera.position - self.state.board_poses(self.data).position
         columns = np.concatenate(
             [-d_place, d_place @ cross_matrix(arm)[:, None] - d_turn], axis=-1)
-        mine = board[:, None] == np.arange(1, max(self.state.boards) + 1)
-        columns = columns[..., None, :] * mine[:, None, None, :, None]
-        return np.asarray(columns.reshape(*d_place.shape[:-1], -1))
+        return _place_columns(columns, board, max(self.state.boards) + 1)
 
     def _lens_columns(self) -> Array:
         columns = self.model.lens_columns(self.linear, self.state.lens_names(self.free))
@@ -299,6 +295,13 @@ class Linearization:
         if any(inner):
             columns[..., inner] = self._through_corrections(columns[..., inner])
         return columns
+
+
+def _place_columns(columns: Array, body: Index, count: int) -> Array:
+    """Return columns (S, N, 2, 6) where those of each body stand, (S, N, 2, 6 (count - 1))."""
+    mine = body[:, None] == np.arange(1, count)
+    placed = columns[..., None, :] * mine[:, None, None, :, None]
+    return np.asarray(placed.reshape(*columns.shape[:3], -1))
 
 
 def is_shared(effect: Effect) -> bool:

@@ -12,8 +12,14 @@ from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.pose import Pose, cross_matrix, identity
 from fisheye_svp_ros.scene.observations import Views
-from fisheye_svp_ros.solve.arrow import arrow_covariance, arrow_of_views, arrow_step
-from fisheye_svp_ros.solve.least_squares import Arrays, Minimum, levenberg_marquardt
+from fisheye_svp_ros.solve.least_squares import (
+    Arrays,
+    Minimum,
+    arrow_covariance,
+    arrow_of_views,
+    arrow_step,
+    levenberg_marquardt,
+)
 from fisheye_svp_ros.solve.localization import MIN_POINTS, localize, pose_equations, residuals
 
 _MEAN_ROUNDS = 6

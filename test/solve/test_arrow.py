@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fisheye_svp_ros.solve.arrow import (
+from fisheye_svp_ros.solve.least_squares import (
     arrow_covariance,
     arrow_information,
     arrow_of_views,

@@ -14,7 +14,6 @@ from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.pose import Pose, identity
-from fisheye_svp_ros.solve.arrow import ArrowEquations, arrow_step
 from fisheye_svp_ros.solve.bundle_adjustment import (
     PosePrior,
     Prior,
@@ -26,6 +25,7 @@ from fisheye_svp_ros.solve.bundle_adjustment import (
     shorten_step,
 )
 from fisheye_svp_ros.solve.initial_rig import initial_state, localize_frames
+from fisheye_svp_ros.solve.least_squares import ArrowEquations, arrow_step
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, group_by_frame
 
 SIGMA = 0.2

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt compiled: `solve.least_squares` and `solve.arrow`, system by system.
+"""Levenberg-Marquardt compiled: `solve.least_squares`, system by system.
 
 A system is V views of a rig of one or two cameras: a pose of the right camera for each view and,
 for two, the rig that they share.  Its state (V + 1, 4, 3) is these poses and last the rig, each a

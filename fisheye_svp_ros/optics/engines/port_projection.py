@@ -176,5 +176,4 @@ def _solve_2x2(matrix: Array, right: Array) -> Array:
     """Return matrix^-1 right for matrices (M, 2, 2), right (M, 2, K); not finite if singular."""
     a, b, c, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 0], matrix[:, 1, 1]
     turned = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=1)
-    solved: Array = turned @ right / (a * d - b * c)[:, None, None]
-    return solved
+    return np.asarray(turned @ right / (a * d - b * c)[:, None, None])
