@@ -7,20 +7,18 @@ it: a file a mode in docs/results/blind/, and docs/results/blind.md from all tha
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from benchmark import study
 from benchmark.blind_effects import HIDDEN
 from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_report import write_report
 from benchmark.blind_trial import MODES, Outcome, Task, run_trial
-from benchmark.workers import in_processes
 from fisheye_svp_ros.io.files import write_text
 
 SIZES = (1.0, 0.5, 0.2, 0.1, 0.05)
@@ -53,7 +51,7 @@ def tasks(mode: str, trials: int, seed: int) -> Iterator[Task]:
 
 def run(todo: Sequence[Task], workers: int) -> list[Outcome]:
     """Run trials in processes of their own; Ctrl-C keeps those that are done."""
-    return in_processes('blind trials', run_trial, todo, workers)
+    return study.in_processes('blind trials', run_trial, todo, workers)
 
 
 def save(mode: str, outcomes: Sequence[Outcome], seed: int, directory: Path) -> None:
@@ -62,8 +60,7 @@ def save(mode: str, outcomes: Sequence[Outcome], seed: int, directory: Path) -> 
     trials = len(outcomes) // len(list(tasks(mode, 1, seed)))
     whole = [outcome for outcome in outcomes if outcome.task.number < trials]
     command = f'python -m benchmark.blind --modes {mode} --trials {trials} --seed {seed}'
-    lines = ',\n'.join(json.dumps(outcome.to_dict()) for outcome in whole)
-    text = f'{{"command": {json.dumps(command)},\n"trials": [\n{lines}\n]}}\n'
+    text = study.json_lines([outcome.to_dict() for outcome in whole], command)
     write_text(directory / f'blind/{mode}.json', text)
 
 
@@ -81,15 +78,10 @@ def load(directory: Path) -> dict[str, tuple[str, list[Outcome]]]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the trials that the command line asks for and write the report."""
-    parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.blind')
-    parser.add_argument('--trials', type=int, default=200, help='a mode, and a size of one effect')
-    parser.add_argument('--workers', type=int, default=os.cpu_count(), help='processes')
-    parser.add_argument('--seed', type=int, default=0, help='another seed, other trials')
+    parser = study.parser('blind', __doc__, trials=(200, 'a mode, and a size of one effect'),
+                          seed=(0, 'another seed, other trials'))
     parser.add_argument('--modes', nargs='+', choices=MODES, default=MODES, help='what to hide')
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results'),
-                        help='directory')
     asked = parser.parse_args(arguments)
-    (asked.output / 'blind').mkdir(parents=True, exist_ok=True)
     for mode in asked.modes:
         outcomes = run(list(tasks(mode, asked.trials, asked.seed)), asked.workers)
         save(mode, outcomes, asked.seed, asked.output)

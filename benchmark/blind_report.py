@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
 
 from benchmark.blind_effects import HIDDEN
-from benchmark.blind_figures import (
-    Rate,
-    confusion,
-    coverage,
-    is_clean,
-    is_hit,
-    is_open,
-    is_right_variable,
-    of,
-    oracle_finds_all,
-    rate,
-    sizes,
-    uniformity,
-)
 from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_trial import Outcome
-from fisheye_svp_ros.io.files import write_text
+from benchmark.study import Rate, table, write_lines
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, picture
 
 _GOALS = {1.0: 0.98, 0.5: 0.95, 0.2: 0.85}
@@ -48,54 +35,96 @@ Pearson).
 """
 
 
+def of(
+    outcomes: Iterable[Outcome], mode: str, size: float | None = None, name: str | None = None
+) -> list[Outcome]:
+    """Return the outcomes of a mode, a size, a hidden effect."""
+    return [
+        o for o in outcomes
+        if o.task.mode == mode and size in (None, o.task.size)
+        and (name is None or name in o.task.names)
+    ]
+
+
+def sizes(outcomes: Iterable[Outcome], mode: str) -> list[float]:
+    """Return the sizes of a mode, largest first."""
+    return sorted({o.task.size for o in of(outcomes, mode)}, reverse=True)
+
+
+def hits(outcomes: Iterable[Outcome]) -> Rate:
+    """Count trials whose named classes hold all that was hidden."""
+    return Rate.of(o.hit for o in outcomes)
+
+
+def oracle_hits(outcomes: Iterable[Outcome]) -> Rate:
+    """Count trials in which the oracle finds all that was hidden."""
+    return Rate.of(all(o.oracle) for o in outcomes)
+
+
+def adequate(outcomes: Iterable[Outcome]) -> Rate:
+    """Count trials in which nothing was found."""
+    return Rate.of(o.verdict == 'adequate' for o in outcomes)
+
+
+def others(outcomes: Iterable[Outcome]) -> Rate:
+    """Count trials in which an effect is named that was not hidden."""
+    return Rate.of(bool(o.extra) for o in outcomes)
+
+
+def coverage(outcomes: Iterable[Outcome], limit: float) -> Rate:
+    """Count parameters whose error is within a multiple of its standard error."""
+    return Rate.of(abs(error) < limit for o in outcomes for error in o.errors.values())
+
+
+def uniformity(outcomes: Sequence[Outcome]) -> dict[str, tuple[int, float]]:
+    """Return by effect the number of p-values under the null and their Kolmogorov-Smirnov p."""
+    values = {name: [o.p_values[name] for o in outcomes if name in o.p_values] for name in HIDDEN}
+    return {name: (len(some), float(stats.kstest(some, 'uniform').pvalue))
+            for name, some in values.items() if len(some) >= 5}
+
+
 def write_report(saved: Mapping[str, tuple[str, list[Outcome]]], directory: Path) -> None:
     """Write blind.md from the commands and outcomes by mode, and the pictures beside it."""
-    sections: dict[str, Callable[[Sequence[Outcome], Path], str]] = {
+    sections: dict[str, Callable[[Sequence[Outcome], Path], list[str]]] = {
         'one': _one_effect, 'clean': _clean, 'outside': _outside, 'two': _two,
         'background': _background,
     }
-    parts, everything = [_HEAD], []
+    lines, everything = _HEAD.split('\n'), []
     for mode, (command, outcomes) in saved.items():
-        title, rest = sections[mode](outcomes, directory / 'blind').split('\n', 1)
-        parts.append(f'{title}\n\n{len(outcomes)} trials:\n\n    {command}\n{rest}')
+        title, *rest = sections[mode](outcomes, directory / 'blind')
+        lines += [title, '', f'{len(outcomes)} trials:', '', f'    {command}', *rest]
         everything += outcomes
-    parts += ['## Every trial that failed\n', *(f'- {line}' for line in failures(everything)), '']
-    write_text(directory / 'blind.md', '\n'.join(parts))
+    lines += ['## Every trial that failed', '', *(f'- {line}' for line in failures(everything))]
+    write_lines(directory / 'blind.md', lines)
 
 
-def _one_effect(outcomes: Sequence[Outcome], directory: Path) -> str:
+def _one_effect(outcomes: Sequence[Outcome], directory: Path) -> list[str]:
     steps = sizes(outcomes, 'one')
-    lines = ['## One hidden effect', '', _table(
-        ['size', 'its class is named', 'interval', 'goal', 'oracle', 'another effect named too'],
-        [
-            [
-                f'{size:g}', str(named := rate(of(outcomes, 'one', size), is_hit)),
-                _interval(named), f'{100 * _GOALS[size]:.0f} %' if size in _GOALS else '-',
-                str(rate(of(outcomes, 'one', size), oracle_finds_all)),
-                str(rate(of(outcomes, 'one', size), lambda o: bool(o.extra))),
-            ] for size in steps
-        ],
-    ), '![power](blind/power.png)', '', 'Named by effect and size, oracle in brackets:', '',
-        _effects_table(outcomes, steps), '![confusion](blind/confusion.png)', '',
-        _gain_text(outcomes), '', _coverage_text(outcomes)]
+    rows = []
+    for size in steps:
+        mine = of(outcomes, 'one', size)
+        rows.append([f'{size:g}', hits(mine), hits(mine).bounds,
+                     f'{100 * _GOALS[size]:.0f} %' if size in _GOALS else '-', oracle_hits(mine),
+                     others(mine)])
     _draw_power(outcomes, directory / 'power.png')
     _draw_confusion([o for o in outcomes if o.task.size >= 0.2], directory / 'confusion.png')
-    return '\n'.join([*lines, ''])
-
-
-def _effects_table(outcomes: Sequence[Outcome], steps: Sequence[float]) -> str:
-    return _table(
-        ['effect', *(f'{size:g}' for size in steps)],
-        [[f'`{name}`', *(_beside_oracle(of(outcomes, 'one', s, name)) for s in steps)]
-         for name in HIDDEN],
-    )
+    return [
+        '## One hidden effect', '', *table(
+            'size | its class is named | interval | goal | oracle | another effect named too',
+            rows), '',
+        '![power](blind/power.png)', '', 'Named by effect and size, oracle in brackets:', '',
+        *table('effect | ' + ' | '.join(f'{size:g}' for size in steps), [
+            [f'`{name}`', *(_beside_oracle(of(outcomes, 'one', size, name)) for size in steps)]
+            for name in HIDDEN]), '',
+        '![confusion](blind/confusion.png)', '', _gain_text(outcomes), '',
+        _coverage_text(outcomes), '']
 
 
 def _gain_text(outcomes: Sequence[Outcome]) -> str:
     shares = np.array([o.recovered for o in outcomes if o.recovered is not None])
     if not shares.size:
         return ''
-    good = Rate(int((shares >= 0.95).sum()), shares.size)
+    good = Rate.of(shares >= 0.95)
     quantiles = ', '.join(f'{100 * q:.1f}' for q in np.quantile(shares, (0.05, 0.25, 0.5)))
     return (
         'Gain: the true model removes a part of the held-out residual variance above noise. The '
@@ -107,100 +136,78 @@ def _gain_text(outcomes: Sequence[Outcome]) -> str:
 
 def _coverage_text(outcomes: Sequence[Outcome]) -> str:
     mine = [o for o in outcomes if o.task.size >= 0.2]
-    one, two = coverage(mine, 1.0), coverage(mine, 1.96)
     trials = sum(bool(o.errors) for o in mine)
     if not trials:
         return ''
     return (
-        f'Standard errors: the true value lies within 1 standard error for {one} and within 1.96 '
-        f'for {two} of the parameters, in {trials} trials at sizes from 0.2 whose effect has true '
-        'values by the same names.'
-    )
+        f'Standard errors: the true value lies within 1 standard error for {coverage(mine, 1.0)} '
+        f'and within 1.96 for {coverage(mine, 1.96)} of the parameters, in {trials} trials at '
+        'sizes from 0.2 whose effect has true values by the same names.')
 
 
-def _clean(outcomes: Sequence[Outcome], directory: Path) -> str:
-    kinds = {
-        'all': [''], 'lens': ['fish180', 'fish214', 'kannala_brandt'],
-        'noise': sorted({o.scene.split('noise ')[1].split(' px')[0] for o in outcomes if o.scene}),
-    }
-    rows = [['all', str(rate(outcomes, is_clean)), _interval(rate(outcomes, is_clean))]]
-    for kind, values in list(kinds.items())[1:]:
-        for value in values:
-            text = f'noise {value} px' if kind == 'noise' else value
-            found = rate([o for o in outcomes if text in o.scene], is_clean)
-            rows.append([text, str(found), _interval(found)])
-    bounds = (0, 2000, 4000, 10**6)
-    for low, high in pairwise(bounds):
-        found = rate([o for o in outcomes if low <= _numbers(o) < high], is_clean)
-        rows.append([f'{low} to {high} numbers' if high < 10**6 else f'from {low} numbers',
-                     str(found), _interval(found)])
+def _clean(outcomes: Sequence[Outcome], directory: Path) -> list[str]:
+    noises = sorted({o.scene.split('noise ')[1].split(' px')[0] for o in outcomes if o.scene})
+    groups = {'all': list(outcomes)} | {
+        text: [o for o in outcomes if text in o.scene] for text in (
+            'fish180', 'fish214', 'kannala_brandt', *(f'noise {value} px' for value in noises))}
+    for low, high in pairwise((0, 2000, 4000, 10**6)):
+        text = f'{low} to {high} numbers' if high < 10**6 else f'from {low} numbers'
+        groups[text] = [o for o in outcomes if low <= _numbers(o) < high]
     uniform = uniformity(outcomes)
     worst = min((p for _, p in uniform.values()), default=1.0)
     _draw_p_values(outcomes, directory / 'p_values.png')
-    return '\n'.join([
-        '## Clean data', '', _table(['', 'adequate', 'interval'], rows),
+    return [
+        '## Clean data', '', *table(' | adequate | interval', [
+            (name, adequate(mine), adequate(mine).bounds) for name, mine in groups.items()]), '',
         'p-values of the screening under the null, the simplest form of each effect, against the '
         'uniform distribution (Kolmogorov-Smirnov); of effects with a sign, those with the right '
         f'one. The smallest of {len(uniform)} is {worst:.3f}; by chance a smallest one below '
-        f'{0.05 / max(len(uniform), 1):.4f} would be seen in 5 % of runs.', '',
-        _table(['effect', 'p-values', 'KS p'],
-               [[f'`{name}`', str(n), f'{p:.3f}'] for name, (n, p) in uniform.items()]),
-        '![p-values](blind/p_values.png)', '',
-    ])
+        f'{0.05 / max(len(uniform), 1):.4f} would be seen in 5 % of runs.', '', *table(
+            'effect | p-values | KS p',
+            [(f'`{name}`', n, f'{p:.3f}') for name, (n, p) in uniform.items()]), '',
+        '![p-values](blind/p_values.png)', '']
 
 
-def _outside(outcomes: Sequence[Outcome], directory: Path) -> str:
+def _outside(outcomes: Sequence[Outcome], directory: Path) -> list[str]:
     groups = [('all', outcomes)]
     groups += [
         (f'`{name}`, size {size:g}', of(outcomes, 'outside', size, name))
         for name in OUTSIDE for size in sizes(outcomes, 'outside')
     ]
-    return '\n'.join(['## Effects outside the catalog', '', _table(
-        ['hidden', 'no name', 'something left', 'right variable', 'verdict adequate'],
-        [[
-            name, str(rate(mine, lambda o: not o.causes)), str(rate(mine, is_open)),
-            str(rate(mine, is_right_variable)), str(rate(mine, is_clean)),
-        ] for name, mine in groups if mine],
-    )])
+    return ['## Effects outside the catalog', '', *table(
+        'hidden | no name | something left | right variable | verdict adequate', [(
+            name, Rate.of(not o.causes for o in mine),
+            Rate.of(o.verdict in ('unexplained', 'partly_explained') for o in mine),
+            Rate.of(bool(OUTSIDE[o.task.names[0]][1] & set(o.remaining)) for o in mine),
+            adequate(mine)) for name, mine in groups if mine]), '']
 
 
-def _two(outcomes: Sequence[Outcome], directory: Path) -> str:
-    both = rate(outcomes, is_hit)
-    single = Rate(
-        sum(_named(o, name) for o in outcomes for name in o.task.names), 2 * len(outcomes)
-    )
-    return '\n'.join([
+def _two(outcomes: Sequence[Outcome], directory: Path) -> list[str]:
+    both = hits(outcomes)
+    single = Rate.of(_named(o, name) for o in outcomes for name in o.task.names)
+    return [
         '## Two effects at once', '',
-        f'At 0.5 of the noise each: both named in {both}, interval {_interval(both)}; each in '
-        f'{single}. The oracles find both in {rate(outcomes, oracle_finds_all)}. '
-        f'Another effect is named too in {rate(outcomes, lambda o: bool(o.extra))}.', '',
-    ])
+        f'At 0.5 of the noise each: both named in {both}, interval {both.bounds}; each in '
+        f'{single}. The oracles find both in {oracle_hits(outcomes)}. '
+        f'Another effect is named too in {others(outcomes)}.', '']
 
 
-def _background(outcomes: Sequence[Outcome], directory: Path) -> str:
-    bounds = (0.1, 0.22, 0.46, 1.0)
+def _background(outcomes: Sequence[Outcome], directory: Path) -> list[str]:
     rows = []
-    for low, high in [*pairwise(bounds), (0.0, 2.0)]:
+    for low, high in [*pairwise((0.1, 0.22, 0.46, 1.0)), (0.0, 2.0)]:
         mine = [o for o in outcomes if low <= o.background < high]
         with_one = [o for o in mine if o.task.names]
-        without = [o for o in mine if not o.task.names]
-        named = rate(with_one, is_hit)
         rows.append([
-            'all' if high > 1 else f'{low:g} to {high:g}', str(named), _interval(named),
-            str(rate(with_one, lambda o: bool(o.extra))),
-            str(rate(without, lambda o: bool(o.causes))),
-        ])
-    errors = _coverage_text(outcomes)
-    return '\n'.join([
+            'all' if high > 1 else f'{low:g} to {high:g}', hits(with_one), hits(with_one).bounds,
+            others(with_one), Rate.of(bool(o.causes) for o in mine if not o.task.names)])
+    return [
         '## With local errors', '',
         'Every set has errors outside the catalog: offsets of single landmarks, a smooth field '
         'over the image and one in each frame, in random proportions, and up to 1 % outliers. '
         'Their rms over the noise is 0.1 to 1 after poses and free intrinsics are fitted. Half '
-        'of the sets also have an effect of size 1.', '',
-        _table(['background over the noise', 'effect named', 'interval',
-                'another effect named too', 'effect named though none is hidden'], rows),
-        errors, '',
-    ])
+        'of the sets also have an effect of size 1.', '', *table(
+            'background over the noise | effect named | interval | another effect named too '
+            '| effect named though none is hidden', rows), '', _coverage_text(outcomes), '']
 
 
 def _named(outcome: Outcome, name: str) -> bool:
@@ -212,7 +219,7 @@ def failures(outcomes: Sequence[Outcome]) -> Iterator[str]:
     for o in outcomes:
         wrong = {
             'one': (not o.hit or bool(o.extra)) and o.task.size >= 0.2,
-            'clean': not is_clean(o), 'two': not o.hit, 'outside': bool(o.causes),
+            'clean': o.verdict != 'adequate', 'two': not o.hit, 'outside': bool(o.causes),
             'background': not o.hit or bool(o.extra),
         }[o.task.mode]
         if wrong:
@@ -226,10 +233,8 @@ def failures(outcomes: Sequence[Outcome]) -> Iterator[str]:
 
 def _draw_power(outcomes: Sequence[Outcome], path: Path) -> None:
     steps = sizes(outcomes, 'one')
-    named, oracle = (
-        [rate(of(outcomes, 'one', size), success) for size in steps]
-        for success in (is_hit, oracle_finds_all)
-    )
+    mine = [of(outcomes, 'one', size) for size in steps]
+    named, oracle = [hits(some) for some in mine], [oracle_hits(some) for some in mine]
     with picture(path, 5.5, 3.6) as figure:
         axis = figure.subplots()
         reach = np.abs(np.array([r.interval for r in named]).T - [r.value for r in named])
@@ -248,7 +253,13 @@ def _draw_power(outcomes: Sequence[Outcome], path: Path) -> None:
 
 
 def _draw_confusion(outcomes: Sequence[Outcome], path: Path) -> None:
-    rows, columns, shares = confusion(outcomes)
+    rows, columns = list(HIDDEN), [*HIDDEN, 'no name']
+    shares = np.zeros((len(rows), len(columns)))  # a trial with several names counts for each
+    for i, name in enumerate(rows):
+        mine = [o for o in outcomes if o.task.names == (name,)]
+        for outcome in mine:
+            for named in outcome.causes or ['no name']:
+                shares[i, columns.index(named)] += 1 / len(mine)
     with picture(path, 8.5, 7.5) as figure:
         axis = figure.subplots()
         axis.imshow(shares, cmap='Blues', vmin=0, vmax=1)
@@ -276,21 +287,9 @@ def _draw_p_values(outcomes: Sequence[Outcome], path: Path) -> None:
 
 
 def _beside_oracle(outcomes: Sequence[Outcome]) -> str:
-    if not outcomes:
-        return '-'
-    named, oracle = rate(outcomes, is_hit), rate(outcomes, oracle_finds_all)
-    return f'{named.successes} ({oracle.successes}) of {named.trials}'
+    named, oracle = hits(outcomes), oracle_hits(outcomes)
+    return f'{named.successes} ({oracle.successes}) of {named.trials}' if outcomes else '-'
 
 
 def _numbers(outcome: Outcome) -> int:
     return int(outcome.scene.rsplit(', ', 1)[-1].split()[0]) if outcome.scene else -1
-
-
-def _interval(found: Rate) -> str:
-    low, high = found.interval
-    return f'{100 * low:.1f} to {100 * high:.1f} %'
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [header, ['---'] * len(header), *rows]
-    return '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines) + '\n'

@@ -12,7 +12,6 @@ other half, and points that two of the cameras see as a rig, by what the lens fi
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections import Counter
@@ -24,22 +23,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmark import study
+from benchmark.boards import joined
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.diagnosis import Diagnosis, ErrorParts, LensErrors, diagnose, pose_maps
+from fisheye_svp_ros.diagnosis import Diagnosis, ErrorParts, LensErrors, pose_maps
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
-from fisheye_svp_ros.reporting.terminal import progress
-from fisheye_svp_ros.scene.observations import Landmarks, Observations, make_observations
+from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.simulate.targets import board_views
 from fisheye_svp_ros.solve.bundle_adjustment import adjust_poses
 from fisheye_svp_ros.solve.initial_rig import localize_frames
-from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
 from fisheye_svp_ros.study.pose_errors import depth_errors, localize_with_errors
@@ -62,18 +63,19 @@ class Simulated(NamedTuple):
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the study, write it, print what came of it."""
-    parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.coverage')
+    parser = study.parser(
+        'coverage', __doc__, study.RESULTS / 'coverage.json', workers=False,
+        image_size=('1280x800', 'of the tables'), name=('', 'of the data in the output'),
+        deals=(0, 'random ones, to halves'), cameras=(20, 'simulated ones'))
     parser.add_argument('tables', type=Path, nargs='*', help='of one camera and board')
-    parser.add_argument('--image-size', default='1280x800')
-    parser.add_argument('--name', help='of the data in the output')
-    parser.add_argument('--deals', type=int, default=0, help='random ones, to halves')
-    parser.add_argument('--cameras', type=int, default=20, help='simulated ones')
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results/coverage.json'))
     asked = parser.parse_args(arguments)
-    width, height = map(int, asked.image_size.split('x'))
-    sets = [Simulated(joined([read_observations(path) for path in asked.tables]), (width, height),
-                      None, None)
-            ] if asked.tables else [simulated(number) for number in range(asked.cameras)]
+    sets = [simulated(number) for number in range(asked.cameras)]
+    if asked.tables:
+        tables = [read_observations(path) for path in asked.tables]
+        table = joined([replace(one, frame=1000 * i + one.frame) for i, one in enumerate(tables)])
+        unknown = np.full(len(table), np.nan)
+        sets = [Simulated(replace(table, sigma=unknown, t=unknown),
+                          study.image_size(asked.image_size), None, None)]
     halves: list[Array] = []
     poses: list[Array] = []
     lenses: list[Lens] = []
@@ -87,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for half in (0, 1):
                 mine = np.isin(one.table.frame, frames[half::2])
                 test = one.table.take(~mine)
-                found = diagnosed(one.table.take(mine), one.size)
+                _, found = study.calibrated_and_diagnosed(one.table.take(mine), one.size)
                 halves.append(pulls_of(found, test))
                 named.update(cause.effect for cause in found.causes)
                 if one.poses is not None:
@@ -122,11 +124,6 @@ def coverage(pulls: Iterable[Array]) -> dict[str, Any]:
         'pull_rms': {level: float(np.sqrt((every[:, i] ** 2).mean()))
                      for i, level in enumerate(LEVELS)},
     }
-
-
-def diagnosed(train: Observations, size: tuple[int, int]) -> Diagnosis:
-    """Calibrate and diagnose."""
-    return diagnose(train, calibrate(train, 'kannala_brandt', size).adjusted.lens)
 
 
 def against_truth(lens: Lens, test: Observations, poses: Pose) -> Array:
@@ -182,15 +179,6 @@ def side(data: RigViews, state: RigState, mask: Mask) -> tuple[RigState, Array]:
         weight=np.where(mask, data.views.weight, 0.0)))
     posed = adjust_poses(kept, state)
     return posed, pose_maps(Linearization(kept, posed, ()).frame_columns)
-
-
-def joined(tables: Sequence[Observations]) -> Observations:
-    """Return tables of one camera and board as one."""
-    frame = [1000 * i + table.frame for i, table in enumerate(tables)]
-    return make_observations(
-        np.concatenate(frame), *(np.concatenate([getattr(t, name) for t in tables])
-                                 for name in ('landmark', 'uv', 'xyz')),
-        board=np.concatenate([t.board for t in tables]))
 
 
 def simulated(number: int) -> Simulated:

@@ -3,28 +3,27 @@
 A camera of the independent simulator is calibrated on one set and diagnosed on another, with a
 board whose landmarks are a little off.  Its lens is sound, or off by three of its stated errors in
 one intrinsic, or has a viewpoint shift that the calibration did not know of.
+
 Writes docs/results/decisions.md.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from scipy.stats import binomtest, norm, spearmanr
+from scipy.stats import norm, spearmanr
 
 import fisheye_svp_ros as fsvp
+from benchmark import study
+from benchmark.boards import directions
 from benchmark.independent.camera import Array, draw_lens, image_points
 from benchmark.independent.camera import Lens as TrueLens
 from benchmark.independent.formation import Departure, observed
 from benchmark.independent.scene import Scene, draw_scene
-from benchmark.workers import in_processes
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations, make_observations
@@ -34,7 +33,7 @@ OFF = 3.0  # standard errors
 OFFSET = 3e-5  # m: of the landmarks of a printed board
 SHIFT = 4e-3  # m
 RANGES = (0.3, 1.0, 5.0)
-RESULT = Path('docs/results/decisions.md')
+SAYS = ('keep', 'use_extended', 'recalibrate', 'undecided')
 
 
 @dataclass(frozen=True)
@@ -135,10 +134,8 @@ def _ray_error(lens: Lens, true: TrueLens, shift: float, table: Observations) ->
     inside = (np.linalg.norm(uv - center, axis=1) < seen) & (uv > 0).all(axis=1)
     inside &= (uv < [true.width, true.height]).all(axis=1)
     theta, azimuth, uv = theta[inside], azimuth[inside], uv[inside]
-    direction = np.stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth),
-                          np.cos(theta)], axis=1)
     origin = shift * _gennery(theta)[:, None] * [0.0, 0.0, 1.0]
-    points = np.concatenate([origin + far * direction for far in RANGES])
+    points = np.concatenate([origin + far * directions(theta, azimuth) for far in RANGES])
 
     def off(motion: Array) -> Array:
         moved = Rotation.from_rotvec(motion[:3]).apply(points) + motion[3:]
@@ -151,11 +148,10 @@ def _ray_error(lens: Lens, true: TrueLens, shift: float, table: Observations) ->
 
 def _share(hits: Sequence[bool]) -> str:
     """Return a share with its 95 % interval, in percent."""
-    if not hits:
-        return 'none'
-    found = binomtest(int(np.sum(hits)), len(hits)).proportion_ci(method='wilson')
-    return (f'{100 * np.mean(hits):.0f} % ({100 * found.low:.0f} to {100 * found.high:.0f}, '
-            f'n = {len(hits)})')
+    found = study.Rate.of(hits)
+    low, high = found.interval
+    return (f'{100 * found.value:.0f} % ({100 * low:.0f} to {100 * high:.0f}, '
+            f'n = {found.trials})') if hits else 'none'
 
 
 def report(outcomes: Sequence[Outcome], command: str) -> str:
@@ -163,23 +159,18 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
     of = {kind: [one for one in outcomes if one.kind == kind] for kind in KINDS}
     wanted = {'sound': {'keep'}, 'off': {'recalibrate'},
               'shift': {'use_extended', 'recalibrate', 'undecided'}}
-    lines = ['# Decisions about lenses whose truth is known', '', __doc__.partition('\n\n')[2]
-             .rpartition('\n')[0].rpartition('\n')[0], '', f'`{command}`', '',
-             '| lens | expected | as expected | '
-             + ' | '.join(('keep', 'use_extended', 'recalibrate', 'undecided')) + ' |',
-             '|---|---|---|---|---|---|---|']
-    for kind, found in of.items():
-        counts = [str(sum(one.decision == say for one in found))
-                  for say in ('keep', 'use_extended', 'recalibrate', 'undecided')]
-        lines.append(f'| {kind} | {", ".join(sorted(wanted[kind]))} | '
-                     f'{_share([one.decision in wanted[kind] for one in found])} | '
-                     + ' | '.join(counts) + ' |')
+    rows = [[kind, ', '.join(sorted(wanted[kind])),
+             _share([one.decision in wanted[kind] for one in found]),
+             *(sum(one.decision == say for one in found) for say in SAYS)]
+            for kind, found in of.items()]
+    lines = ['# Decisions about lenses whose truth is known', '', *study.paragraph(__doc__),
+             f'`{command}`', '',
+             *study.table('lens | expected | as expected | ' + ' | '.join(SAYS), rows), '']
     bounded = [one for one in outcomes if np.isfinite(one.bound)]
     covered = [one.bound >= abs(one.shift) for one in bounded]
     finite = [one for one in outcomes if np.isfinite(one.true_gain)]
     rank = spearmanr([one.gain for one in finite], [one.true_gain for one in finite])
     most = norm.sf(norm.isf(0.025) - OFF / 2**0.5)
-    lines.append('')
     for what in sorted({one.moved for one in of['off']}):
         mine = [one for one in of['off'] if one.moved == what]
         lines.append(
@@ -203,15 +194,12 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the trials and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--trials', type=int, default=60, help='of each kind')
-    parser.add_argument('--workers', type=int, default=2, help='processes')
-    parser.add_argument('-o', '--output', type=Path, default=RESULT)
-    chosen = parser.parse_args(arguments)
-    tasks: list[Any] = [(kind, i) for i in range(chosen.trials) for kind in KINDS]
-    outcomes = in_processes('decisions', run, tasks, chosen.workers)
-    write_text(chosen.output, report(
-        outcomes, f'python -m benchmark.decisions --trials {chosen.trials}'))
+    asked = study.parser('decisions', __doc__, study.RESULTS / 'decisions.md',
+                         trials=(60, 'of each kind')).parse_args(arguments)
+    tasks = [(kind, i) for i in range(asked.trials) for kind in KINDS]
+    outcomes = study.in_processes('decisions', run, tasks, asked.workers)
+    write_text(asked.output, report(
+        outcomes, f'python -m benchmark.decisions --trials {asked.trials}'))
 
 
 if __name__ == '__main__':

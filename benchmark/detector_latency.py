@@ -8,10 +8,8 @@ more process, and all of them share one core.  Leave the machine alone meanwhile
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -23,6 +21,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 
+from benchmark import study
 from fisheye_svp_ros.io.decoding import stamp_of
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.nodes.messages import image_message
@@ -47,12 +46,6 @@ def images(count: int) -> list[Any]:
     along = start.rotation[:, 0] * STEP
     poses = [Pose(start.rotation, start.position + i * along) for i in range(count)]
     return [render(LENS, PRINTED, pose, Exposure(), rng) for pose in poses]
-
-
-def command(node: str, *parameters: str) -> list[str]:
-    """Return what runs a node with parameters."""
-    words = [word for one in parameters for word in ('-p', one)]
-    return [sys.executable, '-m', 'fisheye_svp_ros.cli', 'run', node, '--ros-args', *words]
 
 
 def latencies(pictures: list[Any]) -> np.ndarray:
@@ -97,19 +90,17 @@ def latencies(pictures: list[Any]) -> np.ndarray:
 
 def main() -> None:
     """Measure, and print one line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--count', type=int, default=40, help='images')
-    count = parser.parse_args().count
+    count = study.parser('detector_latency', __doc__, None, workers=False,
+                         count=(40, 'images')).parse_args().count
     pictures = images(count)
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    os.environ.setdefault('ROS_DOMAIN_ID', '99')
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    study.stay_on_this_machine()
     os.environ |= {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
     with tempfile.TemporaryDirectory() as folder:
         lens = Path(folder) / 'lens.yaml'
         save_lens(LENS, lens)
-        nodes = [subprocess.Popen(command('detector', f'board:={BOARD}')),
-                 subprocess.Popen(command('localizer', f'lens:={lens}', 'patience:=0.0'))]
+        nodes = [subprocess.Popen(study.node_command(*words)) for words in (
+            ('detector', f'board:={BOARD}'), ('localizer', f'lens:={lens}', 'patience:=0.0'))]
         try:
             found = 1e3 * latencies(pictures)
         finally:

@@ -7,7 +7,6 @@ python -m benchmark.detectors [--count 60] [--photographs FOLDER]
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import os
 import tempfile
@@ -19,6 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmark import study
 from benchmark.prints import printed
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.detect.detection import detect
@@ -35,7 +35,6 @@ from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.simulate.targets import board_views
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
-PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'results' / 'detectors.md'
 DETECTORS = ('saddle', 'sb', 'classic')
 ANGLES = (0, 25, 45, 60, 75, 85, 95)
 LENS = Lens('benchmark', 848, 800, 285.0, 285.0, 423.6, 399.3,
@@ -56,7 +55,6 @@ CONDITIONS = {
     'uneven light': Exposure(slope=(0.6, -0.4)),
     'noise of 6 grey levels': Exposure(noise=6.0),
 }
-_MARK = '<!-- figures -->'
 
 
 @dataclass
@@ -112,58 +110,58 @@ def by_angle(results: dict[tuple[str, str], Corners], count: int) -> list[str]:
     """Return tables, one a condition: bias along the radius is not told from that across."""
     lines = []
     for condition in CONDITIONS:
-        lines += ['', f'### {condition[0].upper()}{condition[1:]}', '',
-                  '| detector | found | points | s | ' + ' | '.join(
-                      f'{a} to {b}°' for a, b in itertools.pairwise(ANGLES)) + ' |',
-                  '|---' * (len(ANGLES) + 3) + '|']
-        for (_, name), seen in ((key, one) for key, one in results.items() if key[0] == condition):
-            if not seen.found:
-                lines.append(f'| `{name}` | 0 of {count} |' + ' |' * (len(ANGLES) + 1))
-                continue
-            error, theta = np.concatenate(seen.error), np.concatenate(seen.theta)
-            sigma = np.concatenate(seen.sigma)
-            cells = []
-            for low, high in itertools.pairwise(ANGLES):
-                own = (theta >= low) & (theta < high)
-                if not own.any():
-                    cells.append('')
-                    continue
-                bias = np.linalg.norm(error[own].mean(axis=0))
-                scatter = np.sqrt((error[own] ** 2).mean())
-                over = np.sqrt(((error[own] / sigma[own, None]) ** 2).mean())
-                stated = '' if name in UNFITTED_DETECTORS else f' / {over:.2f}'
-                cells.append(f'{bias:.4f} / {scatter:.4f}{stated} ({own.sum()})')
-            share = 100 * len(error) / seen.points
-            lines.append(f'| `{name}` | {seen.found} of {count} | {share:.0f} % | '
-                         f'{np.median(seen.seconds):.2f} | ' + ' | '.join(cells) + ' |')
+        rows = [_row(name, seen, count) for (its, name), seen in results.items()
+                if its == condition]
+        lines += ['', f'### {condition[0].upper()}{condition[1:]}', '', *study.table(
+            'detector | found | points | s | ' + ' | '.join(
+                f'{a} to {b}°' for a, b in itertools.pairwise(ANGLES)), rows)]
     return lines
+
+
+def _row(name: str, seen: Corners, count: int) -> list[str]:
+    if not seen.found:
+        return [f'`{name}`', f'0 of {count}', *[''] * (len(ANGLES) + 1)]
+    error, theta, sigma = map(np.concatenate, (seen.error, seen.theta, seen.sigma))
+    cells = []
+    for low, high in itertools.pairwise(ANGLES):
+        own = (theta >= low) & (theta < high)
+        if not own.any():
+            cells.append('')
+            continue
+        bias = np.linalg.norm(error[own].mean(axis=0))
+        scatter = np.sqrt((error[own] ** 2).mean())
+        over = np.sqrt(((error[own] / sigma[own, None]) ** 2).mean())
+        stated = '' if name in UNFITTED_DETECTORS else f' / {over:.2f}'
+        cells.append(f'{bias:.4f} / {scatter:.4f}{stated} ({own.sum()})')
+    share = 100 * len(error) / seen.points
+    return [f'`{name}`', f'{seen.found} of {count}', f'{share:.0f} %',
+            f'{np.median(seen.seconds):.2f}', *cells]
 
 
 def real(folder: str, board: str) -> list[str]:
     """Return what a Kannala-Brandt fit leaves of each detector's corners."""
-    lines = ['', '### Real photographs', '',
-             f'`{board}`, a Kannala-Brandt lens without a viewpoint shift fitted to them:', '',
-             '| detector | found | rms, px | median, px |', '|---|---|---|---|']
+    rows = []
     for name in DETECTORS:
         try:
             seen = detect(find_photographs([folder]), parse_pattern(board), name)
             fitted = calibrate(seen.observations, 'kannala_brandt', seen.image_size)
         except FisheyeSvpError as error:
-            lines.append(f'| `{name}` | {error} | | |')
+            rows.append([f'`{name}`', error, '', ''])
             continue
         residual = np.linalg.norm(fitted.adjusted.residual[fitted.views.used], axis=-1)
         found = sum(one.points is not None for one in seen.searched)
-        lines.append(f'| `{name}` | {found} of {len(seen.searched)} | '
-                     f'{np.sqrt((residual**2).mean()):.3f} | {np.median(residual):.3f} |')
-    return lines
+        rows.append([f'`{name}`', f'{found} of {len(seen.searched)}',
+                     f'{np.sqrt((residual**2).mean()):.3f}', f'{np.median(residual):.3f}'])
+    return ['', '### Real photographs', '',
+            f'`{board}`, a Kannala-Brandt lens without a viewpoint shift fitted to them:', '',
+            *study.table('detector | found | rms, px | median, px', rows)]
 
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--count', type=int, default=60)
-    parser.add_argument('--photographs')
-    parser.add_argument('--board', default='chessboard:4x6:30mm')
+    parser = study.parser('detectors', __doc__, None, workers=False, count=(60, 'photographs'),
+                          board=('chessboard:4x6:30mm', 'of --photographs'))
+    parser.add_argument('--photographs', help='folder of real ones')
     args = parser.parse_args()
     cv2.setNumThreads(1)
     lines = by_angle(rendered(parse_pattern(BOARD), DETECTORS, args.count), args.count)
@@ -179,8 +177,7 @@ def main() -> None:
             found = rendered(board, [default_detector(board)], args.count)
             others |= {(condition, spec): seen for (condition, _), seen in found.items()}
     lines += by_angle(others, args.count)
-    head = PAGE.read_text(encoding='utf-8').partition(_MARK)[0]
-    PAGE.write_text(head + _MARK + '\n' + '\n'.join(lines) + '\n', encoding='utf-8')
+    study.write_figures(study.RESULTS / 'detectors.md', lines)
 
 
 if __name__ == '__main__':

@@ -11,7 +11,6 @@ first camera, docs/images/guide.jpg.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -23,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmark import study
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.points import Points, find_points
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
@@ -43,17 +43,15 @@ from fisheye_svp_ros.planning.guide import (
 from fisheye_svp_ros.planning.optimal_design import FlatBoard
 from fisheye_svp_ros.planning.plan import nominal_lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector, vector_from_rotation
-from fisheye_svp_ros.reporting.shot_list import draw_guide
-from fisheye_svp_ros.reporting.terminal import progress
+from fisheye_svp_ros.reporting.guide_picture import draw_guide
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
-from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.localization import localize
 
 BOARD, SIZE, ROOM, GOAL = 'chessboard:9x6:25mm', (848, 800), (0.12, 0.6), 2e-4
 STEP = 0.25  # s between images
 EXPOSURE = Exposure(blur=0.9, noise=4.0)
-PICTURE = Path('docs/images/guide.jpg')
+PICTURE = study.DOCS / 'images' / 'guide.jpg'
 LONGEST = 3000  # images, most of them waited through
 # What a hand does: off at first, m and rad; off by each correction, and of its length; trembling
 OFF, CORRECTION, SHARE, TREMOR = (0.03, 0.1), (0.002, 0.02), 0.2, (0.0002, 0.001)
@@ -181,8 +179,7 @@ def judged(guide: Guide, lens: Lens) -> dict[str, Any]:
     Whoever sees that there is no window before the lens diagnoses `--without flat_port`: e0.
     """
     table = observations_of(guide.session.taken, guide.session.points)
-    fitted = calibrate(table, 'kannala_brandt', SIZE).adjusted.lens
-    found = diagnose(table, fitted)
+    fitted, found = study.calibrated_and_diagnosed(table, SIZE)
     bare = diagnose(table, fitted, options=DiagnosisOptions(left_out=('flat_port',)))
     e0 = [c.parameters['e0'] for c in bare.causes if c.effect == 'viewpoint_shift']
     true = lens.viewpoint_shift.e0
@@ -215,17 +212,11 @@ def summary(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the trial, write it, print what came of it."""
-    parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.guided')
-    parser.add_argument('--cameras', type=int, default=10)
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results/next/guided.json'))
-    asked = parser.parse_args(arguments)
-    with progress('cameras', asked.cameras) as advance:
-        cameras = []
-        for number in range(asked.cameras):
-            cameras.append(camera(number, PICTURE if not number else None))
-            lines = ',\n'.join(map(json.dumps, cameras))
-            write_text(asked.output, f'[\n{lines}\n]\n')
-            advance()
+    asked = study.parser('guided', __doc__, study.RESULTS / 'next' / 'guided.json', workers=False,
+                         cameras=(10, 'hidden ones')).parse_args(arguments)
+    cameras = study.in_turn(
+        'cameras', lambda number: camera(number, PICTURE if not number else None),
+        range(asked.cameras), lambda some: write_text(asked.output, study.json_lines(some)))
     sys.stdout.write(json.dumps(summary(cameras), indent=1) + '\n')
 
 

@@ -9,7 +9,6 @@ every other one with a hidden error of the lens.  Writes docs/results/hand_eye.m
 from __future__ import annotations
 
 import sys
-import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,12 +18,11 @@ import cv2
 import numpy as np
 from scipy import stats
 
-from benchmark.true_rays import ray_error
-from benchmark.workers import in_processes
+from benchmark import study
+from benchmark.boards import grid
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, diagnose
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
@@ -34,7 +32,6 @@ from fisheye_svp_ros.solve.hand_eye import Transforms
 from fisheye_svp_ros.solve.lens_calibration import Calibration, calibrate, calibrate_hand_eye
 
 TRIALS, DIAGNOSED = 60, 120
-_DOC = Path(__file__).parents[1] / 'docs' / 'results' / 'hand_eye.md'
 _FRAMES, _NOISE_PX = 20, 0.15
 _LENS = Lens('made', 1280, 800, 350.0, 350.5, 645.0, 396.0, KannalaBrandt(-0.01, 0.002), 1.6)
 _SHIFT = Gennery(e0=0.015)
@@ -76,13 +73,11 @@ def draw_case(seed: int, hidden: bool, bent: bool) -> Case:
     """Return a camera on a robot: poses over half a sphere above the board, all turned."""
     rng = np.random.default_rng(seed)
     lens = replace(_LENS, viewpoint_shift=_SHIFT) if hidden else _LENS
-    x, y = (np.ravel(part) for part in np.meshgrid(np.arange(_COLUMNS), np.arange(_ROWS)))
-    said = _SQUARE * np.column_stack([x, y, 0 * x])
-    middle = said.mean(axis=0)
-    across = 2 * (said - middle) / np.ptp(said[:, 0])
+    said = grid(_COLUMNS, _ROWS, _SQUARE)
+    across = 2 * said / np.ptp(said[:, 0])
     bend = bent * _BEND * rng.uniform(0.3, 1.0) * (across[:, 0] ** 2 + across[:, 1] * across[:, 0])
-    points = said + np.column_stack([0 * x, 0 * x, bend]) + rng.normal(0, 3e-5, said.shape)
-    camera = _camera_poses(rng, middle)
+    points = said + bend[:, None] * [0.0, 0.0, 1.0] + rng.normal(0, 3e-5, said.shape)
+    camera = _camera_poses(rng)
     seen = predict_points(
         ForwardModel(lens), camera, views_of(points, np.zeros((_FRAMES, len(points), 2))))
     uv = seen.uv + rng.normal(0, _NOISE_PX, seen.uv.shape)
@@ -102,7 +97,7 @@ def draw_case(seed: int, hidden: bool, bent: bool) -> Case:
     return Case(lens, table, poses, truth, noise)
 
 
-def _camera_poses(rng: np.random.Generator, middle: Array) -> Pose:
+def _camera_poses(rng: np.random.Generator) -> Pose:
     """Return the camera in the board's frame; the board lies anywhere in its image."""
     tilt = rng.uniform(-0.7, 0.7, (_FRAMES, 2))
     spin = rng.uniform(-np.pi, np.pi, _FRAMES)
@@ -111,7 +106,7 @@ def _camera_poses(rng: np.random.Generator, middle: Array) -> Pose:
     sight = rng.uniform(-1.0, 1.0, (_FRAMES, 2)) * (1.0, 0.6)
     place = np.column_stack([np.tan(sight), np.ones(_FRAMES)])
     place *= rng.uniform(0.3, 0.7, (_FRAMES, 1)) / np.linalg.norm(place, axis=1, keepdims=True)
-    return Pose(turn, place - turn @ middle).inverse()
+    return Pose(turn, place).inverse()
 
 
 def run_trial(task: tuple[int, bool]) -> Outcome:
@@ -155,7 +150,7 @@ def _ray_error(found: Calibration, case: Case) -> float:
     uv = grid.reshape(-1, 2)
     near = np.linalg.norm(uv[:, None] - case.table.uv, axis=-1).min(axis=1)
     uv = uv[near < _NEAR]
-    return 1e-3 * ray_error(found.adjusted.lens, case.lens, uv, (0.5,))
+    return 1e-3 * study.ray_error(found.adjusted.lens, case.lens, uv, (0.5,))
 
 
 def _named(case: Case, found: Calibration) -> tuple[list[str], list[str], bool]:
@@ -171,7 +166,7 @@ def _lens_causes(found: Diagnosis) -> list[str]:
             if cause.effect_class.stage not in ('target', 'pose', 'noise')]
 
 
-def write_results(outcomes: Sequence[Outcome], path: Path = _DOC) -> None:
+def write_results(outcomes: Sequence[Outcome], path: Path = study.RESULTS / 'hand_eye.md') -> None:
     """Write the page of the results."""
     clean = [one for one in outcomes if one.named is None]
     z = np.array([one.z for one in clean])
@@ -182,16 +177,16 @@ def write_results(outcomes: Sequence[Outcome], path: Path = _DOC) -> None:
     rays = np.array([one.rays for one in clean])
     noise = np.array([one.noise for one in clean])
     asked = [one for one in outcomes if one.named is not None]
-    lines = [
+    study.write_wrapped(path, [
         '# Cameras on robots', '',
         'Written by `python -m benchmark.hand_eye` (`make hand-eye`). A robot turns a camera of '
         f'1280 x 800 px ({_LENS.fx:.0f} px, Kannala-Brandt) before a board of {_COLUMNS} x '
         f'{_ROWS} corners, {_FRAMES} photographs, {_NOISE_PX} px of noise. Its poses are those of '
         'the flange, with noise of 0.1 to 0.4 mm and 0.02 to 0.08 deg an axis and a scale of '
         '0.05 %. OpenCV solves from the poses of our calibrated lens.', '',
-        f'| {len(clean)} robots | place, mm | turn, deg |', '|---|---|---|',
-        *(f'| {name} | {1e3 * place:.3f} | {np.degrees(turn):.4f} |'
-          for name, place, turn in rows),
+        *study.table(f'{len(clean)} robots | place, mm | turn, deg', [
+            (name, f'{1e3 * place:.3f}', f'{np.degrees(turn):.4f}')
+            for name, place, turn in rows]),
         '', 'Median errors of the camera in the flange.', '',
         f'- Of the {z.size} numbers of the transforms, {100 * inside:.1f} % lie within 1.96 of '
         'their standard errors; 95 % should.',
@@ -199,14 +194,7 @@ def write_results(outcomes: Sequence[Outcome], path: Path = _DOC) -> None:
         f'{np.median(noise[:, 1]):.2f} (rad) times the true one, median.',
         f'- The rays of the calibrated lens are off by {1e3 * np.median(rays[:, 0]):.3f} mrad '
         f'without the robot\'s poses, by {1e3 * np.median(rays[:, 1]):.3f} mrad with them '
-        '(median).', '',
-    ]
-    if asked:
-        lines += [*_diagnosed_lines(asked), '']
-    write_text(path, '\n'.join(
-        textwrap.fill(line, 100, break_on_hyphens=False,
-                      subsequent_indent='  ' if line.startswith('- ') else '')
-        for line in lines))
+        '(median).', '', *(_diagnosed_lines(asked) if asked else ())])
 
 
 def _median(errors: Sequence[tuple[float, float]]) -> Array:
@@ -220,11 +208,11 @@ def _diagnosed_lines(asked: Sequence[Outcome]) -> list[str]:
         f'`diagnose --quick`, {len(shown)} more robots, whose boards are bent by 0.1 to 0.3 mm, '
         f'with the poses and without; they are recognized as those of a robot in '
         f'{sum(told for *_, told in shown)}:', '',
-        '| | robots | a cause in the lens, without poses | with poses |', '|---|---|---|---|',
-        *(f'| {hidden or "no hidden error"} | {len(mine)} | '
-          f'{sum(bool(one[1]) for one in mine)} | {sum(bool(one[2]) for one in mine)} |'
-          for hidden in ('', 'viewpoint_shift')
-          if (mine := [one for one in shown if one[0] == hidden])),
+        *study.table(' | robots | a cause in the lens, without poses | with poses', [
+            (hidden or 'no hidden error', len(mine), sum(bool(one[1]) for one in mine),
+             sum(bool(one[2]) for one in mine))
+            for hidden in ('', 'viewpoint_shift')
+            if (mine := [one for one in shown if one[0] == hidden])]), '',
     ]
 
 
@@ -233,7 +221,7 @@ def main(words: Sequence[str]) -> None:
     trials = int(words[0]) if words else TRIALS
     diagnosed = int(words[1]) if len(words) > 1 else DIAGNOSED
     todo = [(i, False) for i in range(trials)] + [(i, True) for i in range(diagnosed)]
-    write_results(in_processes('robots', run_trial, todo, 2))
+    write_results(study.in_processes('robots', run_trial, todo, 2))
 
 
 if __name__ == '__main__':

@@ -10,10 +10,8 @@ docs/results/reliability.md.
 
 from __future__ import annotations
 
-import argparse
 import os
 import random
-import re
 import shutil
 import signal
 import subprocess
@@ -26,20 +24,20 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fisheye_svp_ros.reporting.terminal import progress
+import psutil
 
-_DOC = Path(__file__).parents[1] / 'docs' / 'results' / 'reliability.md'
-_BEGIN, _END = '<!-- kills -->', '<!-- end of kills -->'
+from benchmark import study
+from fisheye_svp_ros.reporting.progress import progress
+
 _WRITING = 0.15  # of a run: the end, where most is written
 _PATIENCE = 20.0  # s to end after SIGTERM, and for children to go with their parent
 _LONGEST = 240.0  # s for the kills of one command
 _NOBODY = 65534
 _PAGE = 4096  # bytes
 _BOARD = 'chessboard:6x5:25mm'
-_CALIBRATE = ('calibrate', '{obs}', '--model', 'kannala_brandt', '-o', '{out}/lens.yaml')
 COMMANDS = {
     'budget': ('budget', '--lens', 'fish180', '-o', '{out}'),
-    'calibrate': _CALIBRATE,
+    'calibrate': ('calibrate', '{obs}', '--model', 'kannala_brandt', '-o', '{out}/lens.yaml'),
     'demo': ('demo', '--lenses', 'fish180', '--radii', '0.2', '-o', '{out}'),
     'detect': ('detect', '{photographs}', '--board', _BOARD, '-o', '{out}/seen.csv',
                '--overlays', '{out}/overlays'),
@@ -125,14 +123,10 @@ def temporary(names: Sequence[str]) -> list[str]:
 def left_running(session: int) -> list[int]:
     """Return the processes of a session that live on."""
     found = []
-    for entry in Path('/proc').iterdir():
-        try:
-            if entry.name.isdigit() and os.getsid(int(entry.name)) == session:
-                state = (entry / 'stat').read_text().rpartition(')')[2].split()[0]
-                if state != 'Z':
-                    found.append(int(entry.name))
-        except (OSError, ValueError):
-            continue
+    for entry in psutil.process_iter():
+        with suppress(OSError, psutil.Error):
+            if os.getsid(entry.pid) == session and entry.status() != psutil.STATUS_ZOMBIE:
+                found.append(entry.pid)
     return found
 
 
@@ -313,57 +307,47 @@ def section(
     commands: dict[str, Outcome], nodes: dict[str, Outcome], disks: dict[str, Outcome], how: str
 ) -> str:
     """Return the section of docs/results/reliability.md."""
-    lines = [
-        f'`{how}`:', '',
-        '| killed | SIGTERM | SIGKILL | all files | none | some | temporary files (SIGTERM) | '
-        'processes left | no end | rerun fails |',
-        '| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |',
-    ]
-    for name, one in {**commands, **nodes}.items():
-        cells = (one.kills['SIGTERM'], one.kills['SIGKILL'], one.whole, one.nothing,
-                 *(one.faults[kind] for kind in (
-                     'part', 'temporary file', 'orphan', 'no end', 'rerun')))
-        lines.append(f'| {name} | ' + ' | '.join(map(str, cells)) + ' |')
+    kinds = ('part', 'temporary file', 'orphan', 'no end', 'rerun')
     tried = sum(sum(one.kills.values()) for one in disks.values())
     faults = sum((one.faults for one in disks.values()), Counter[str]())
-    lines += ['', f'Disks that are full before, after 30 % or after 90 % of what the command '
-              f'writes, a read-only file system, and a folder of another user: {tried} runs of '
-              f'{len(disks)} commands; not one line and status 2: {faults["line"]}, files left: '
-              f'{faults["part"]}.']
-    return '\n'.join(lines)
+    return '\n'.join([
+        f'`{how}`:', '', *study.table(
+            'killed | SIGTERM | SIGKILL | all files | none | some | temporary files (SIGTERM) | '
+            'processes left | no end | rerun fails',
+            [[name, one.kills['SIGTERM'], one.kills['SIGKILL'], one.whole, one.nothing,
+              *(one.faults[kind] for kind in kinds)]
+             for name, one in {**commands, **nodes}.items()], numbers=True),
+        '', 'Disks that are full before, after 30 % or after 90 % of what the command writes, '
+        f'a read-only file system, and a folder of another user: {tried} runs of {len(disks)} '
+        f'commands; not one line and status 2: {faults["line"]}, files left: {faults["part"]}.'])
 
 
 def main() -> int:
     """Kill everything, write the section; return 1 where anything is at fault."""
-    parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.kills')
-    parser.add_argument('--kills', type=int, default=20, help='of each command by each signal')
+    parser = study.parser('kills', __doc__, None, workers=False,
+                          kills=(20, 'of each command by each signal'), seed=(0, 'of the moments'))
     parser.add_argument('--without', nargs='*', default=[], choices=[*COMMANDS, *NODES])
-    parser.add_argument('--seed', type=int, default=0)
     asked = parser.parse_args()
-    commands = {name: words for name, words in COMMANDS.items()
-                if name not in asked.without}
-    nodes = {name: words for name, words in NODES.items() if name not in asked.without}
     ended: dict[str, Outcome] = {}
     stopped: dict[str, Outcome] = {}
     kept_out: dict[str, Outcome] = {}
+    names = [name for name in (*NODES, *COMMANDS) if name not in asked.without]
     with tempfile.TemporaryDirectory() as place:
         Path(place).chmod(0o755)
         given = prepare(Path(place))
-        total = len(commands) + len(nodes)
-        with suppress(KeyboardInterrupt), progress('killing', total) as advance:
-            for name, template in nodes.items():
+        with suppress(KeyboardInterrupt), progress('killing', len(names)) as advance:
+            for name in names:
+                template = NODES.get(name) or COMMANDS[name]
                 words = [word.format(out='{out}', **given) for word in template]
-                stopped[name] = killed_node(words, _made(place, name), asked.kills,
-                                            random.Random(f'{asked.seed} {name}'))
-                advance()
-            for name, template in commands.items():
-                words = [word.format(out='{out}', **given) for word in template]
-                folder = _made(place, name)
-                ended[name] = killed(words, folder, asked.kills,
-                                     random.Random(f'{asked.seed} {name}'))
-                if os.geteuid() == 0:
-                    size = sum(files(folder / 'whole').values())
-                    kept_out[name] = refused(words, folder, size)
+                folder, rng = Path(place, name), random.Random(f'{asked.seed} {name}')
+                folder.mkdir()
+                if name in NODES:
+                    stopped[name] = killed_node(words, folder, asked.kills, rng)
+                else:
+                    ended[name] = killed(words, folder, asked.kills, rng)
+                    if os.geteuid() == 0:
+                        size = sum(files(folder / 'whole').values())
+                        kept_out[name] = refused(words, folder, size)
                 advance()
     said = ' '.join(['python -m benchmark.kills', *sys.argv[1:]])
     text = section(ended, stopped, kept_out, said)
@@ -371,16 +355,8 @@ def main() -> int:
     told = [f'{name}: {line}' for group in (ended, stopped, kept_out)
             for name, one in group.items() for line in one.told[:5]]
     print(*told, sep='\n')
-    between = f'{_BEGIN}\n{text}\n{_END}'
-    old = _DOC.read_text()
-    _DOC.write_text(re.sub(f'{_BEGIN}.*{_END}', lambda _: between, old, flags=re.DOTALL))
+    study.write_section(study.RELIABILITY, 'kills', text)
     return int(bool(told))
-
-
-def _made(place: str, name: str) -> Path:
-    folder = Path(place, name)
-    folder.mkdir()
-    return folder
 
 
 if __name__ == '__main__':

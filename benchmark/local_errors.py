@@ -12,18 +12,15 @@ Writes docs/results/local_errors.json and .md.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmark.workers import in_processes
+from benchmark import study
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -34,7 +31,6 @@ from fisheye_svp_ros.scene.observations import Landmarks, Observations
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.simulate.targets import board_views
-from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 SHIFTS, BENDS = (0.0, 3e-3, 7e-3), (0.0, 4e-4, 1.2e-3)  # m
 BOARDS = ((9, 6, 0.025, 0.12), (11, 8, 0.03, 0.2), (6, 4, 0.04, 0.2))  # square and nearest, m
@@ -104,10 +100,9 @@ def own_errors(seen: Observations, centre: Array, rng: Rng) -> Array:
 def trial(number: int) -> dict[str, Any]:
     """Return what was hidden, what was named, and e0 with its standard error, mm."""
     table, shift, bend = photographed(number)
-    lens = calibrate(table, 'kannala_brandt', SIZE).adjusted.lens
-    found = diagnose(table, lens).to_dict()
+    lens, diagnosis = study.calibrated_and_diagnosed(table, SIZE)
     options = DiagnosisOptions(included=('viewpoint_shift',))
-    asked = diagnose(table, lens, options=options).to_dict()
+    found, asked = diagnosis.to_dict(), diagnose(table, lens, options=options).to_dict()
     e0 = next(c for c in asked['causes'] if c['effect'] == 'viewpoint_shift')['parameters']['e0']
     return {
         'number': number, 'e0_mm': 1e3 * shift, 'bend_mm': 1e3 * bend, 'points': len(table),
@@ -121,38 +116,30 @@ def report(trials: Sequence[dict[str, Any]]) -> str:
     """Return the page on what came of it."""
     pulls = np.array([(t['found_mm'] - t['e0_mm']) / t['stderr_mm'] for t in trials])
     within = [np.mean(np.abs(pulls) < limit) for limit in (1.0, 1.96)]
-    lines = [
-        '# Sets like real ones', '', (__doc__ or '').split('\n\n')[1], '',
+    rows = []
+    for shift, bend in product(SHIFTS, BENDS):
+        mine = [t for t in trials if (t['e0_mm'], t['bend_mm']) == (1e3 * shift, 1e3 * bend)]
+        if mine:
+            named = [sum(n in t['causes'] for t in mine)
+                     for n in ('viewpoint_shift', 'target_shape')]
+            rms = np.array([t['heldout_rms_px'] for t in mine])
+            ratios = np.median(rms[:, 1:] / rms[:, :1], axis=0)
+            rows.append([f'{1e3 * shift:g}', f'{1e3 * bend:g}', len(mine), *named,
+                         *(f'{ratio:.2f}' for ratio in ratios)])
+    return '\n'.join([
+        '# Sets like real ones', '', *study.paragraph(__doc__),
         f'    python -m benchmark.local_errors --trials {len(trials)}', '',
         f'The true e0 lies within one standard error in {within[0]:.1%} and within 1.96 in '
-        f'{within[1]:.1%} of {len(pulls)} sets.', '',
-        '| e0, mm | bend, mm | sets | `viewpoint_shift` named | `target_shape` named | held-out '
-        'rms over the calibration\'s, `named` | `extended` |', '|---|---|---|---|---|---|---|',
-    ]
-    for shift in SHIFTS:
-        for bend in BENDS:
-            mine = [t for t in trials if (t['e0_mm'], t['bend_mm']) == (1e3 * shift, 1e3 * bend)]
-            if mine:
-                named = [sum(n in t['causes'] for t in mine)
-                         for n in ('viewpoint_shift', 'target_shape')]
-                rms = np.array([t['heldout_rms_px'] for t in mine])
-                ratios = np.median(rms[:, 1:] / rms[:, :1], axis=0)
-                lines.append(f'| {1e3 * shift:g} | {1e3 * bend:g} | {len(mine)} | {named[0]} | '
-                             f'{named[1]} | {ratios[0]:.2f} | {ratios[1]:.2f} |')
-    return '\n'.join(lines) + '\n'
+        f'{within[1]:.1%} of {len(pulls)} sets.', '', *study.table(
+            'e0, mm | bend, mm | sets | `viewpoint_shift` named | `target_shape` named '
+            "| held-out rms over the calibration's, `named` | `extended`", rows), ''])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the trials and write what came of them."""
-    parser = argparse.ArgumentParser(prog='python -m benchmark.local_errors')
-    parser.add_argument('--trials', type=int, default=200)
-    parser.add_argument('--workers', type=int, default=os.cpu_count(), help='processes')
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results'),
-                        help='directory')
-    asked = parser.parse_args(arguments)
-    trials = in_processes('sets', trial, range(asked.trials), asked.workers)
-    lines = ',\n'.join(json.dumps(one) for one in trials)
-    write_text(asked.output / 'local_errors.json', f'[\n{lines}\n]\n')
+    asked = study.parser('local_errors', __doc__, trials=(200, 'sets')).parse_args(arguments)
+    trials = study.in_processes('sets', trial, range(asked.trials), asked.workers)
+    write_text(asked.output / 'local_errors.json', study.json_lines(trials))
     page = report(trials)
     write_text(asked.output / 'local_errors.md', page)
     sys.stdout.write(page)

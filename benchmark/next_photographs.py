@@ -12,18 +12,18 @@ Writes docs/results/next/*.json.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmark import study
+from benchmark.boards import directions
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis import diagnose
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.errors import FisheyeSvpError
@@ -42,13 +42,11 @@ from fisheye_svp_ros.planning.optimal_design import (
     information,
 )
 from fisheye_svp_ros.pose import identity
-from fisheye_svp_ros.reporting.terminal import progress
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.simulation import blank_views
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 
 NOISE, SHIFT, MOST, RANDOM = 0.1, 0.002, 60, 10
@@ -59,25 +57,16 @@ EFFECT = ViewpointShiftEffect(1)
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the study, write it, print what came of it."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, prog='python -m benchmark.next_photographs')
-    parser.add_argument('--cameras', type=int, default=100)
+    parser = study.parser('next_photographs', __doc__, study.RESULTS / 'next', workers=False,
+                          cameras=(100, 'simulated ones'), image_size=('1280x800', 'of --data'))
     parser.add_argument('--data', type=Path, help='observations CSV: choose among its frames')
-    parser.add_argument('--image-size', default='1280x800', help='of --data')
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results/next'))
     asked = parser.parse_args(arguments)
     if asked.data:
-        width, height = map(int, asked.image_size.split('x'))
-        found = on_data(asked.data, (width, height))
+        found = on_data(asked.data, study.image_size(asked.image_size))
         name = asked.data.parent.name
     else:
-        with progress('cameras', asked.cameras) as advance:
-            cameras = []
-            for number in range(asked.cameras):
-                cameras.append(camera(number))
-                advance()
+        cameras = study.in_turn('cameras', camera, range(asked.cameras))
         found, name = {'cameras': cameras, 'summary': summary(cameras)}, 'simulated'
-    asked.output.mkdir(parents=True, exist_ok=True)
     lines = ',\n'.join(f'{json.dumps(key)}: {_lines(value)}' for key, value in found.items())
     write_text(asked.output / f'{name}.json', f'{{{lines}}}\n')
     sys.stdout.write(json.dumps(found.get('summary', found), indent=1) + '\n')
@@ -85,34 +74,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _lines(value: Any) -> str:
     """Return JSON with one entry of a list a line."""
-    if isinstance(value, list):
-        return '[\n' + ',\n'.join(map(json.dumps, value)) + ']'
-    return json.dumps(value)
+    return study.json_lines(value).rstrip() if isinstance(value, list) else json.dumps(value)
 
 
 def camera(number: int) -> dict[str, Any]:
     """Return how many photographs one camera needs, by method."""
     rng = np.random.default_rng([3, number])
     design, linear = simulated(rng)
-    e0 = design.question('e0')
+    e0 = without(design, design.question('e0'))
     wizard = over_the_image(linear, design)
     design.values[design.columns('e0')] = SHIFT
     name = design.question('viewpoint_shift', ('radial_profile', 'target_shape'))
-    alone = plain(design, e0)
+    alone = answers(design, e0)
     count = len(design.shots.distance)
     random = [rng.permutation(count)[:MOST] for _ in range(RANDOM)]
     goal = float(np.median([alone(order[:20]) for order in random]))
-    by_shift = design.choose(without(design, e0), 20)[0]
+    by_shift = design.choose(e0, 20)[0]
     by_image = greedy(design, wizard, 30)
     return {
-        'goal_m': goal,
-        'e0': {'chosen': fewest(design, without(design, e0), lambda error: error <= goal),
-               'intrinsics': needed(alone, by_image, goal),
-               'random': float(np.median([needed(alone, o, goal) for o in random]))},
-        'named': {'chosen': fewest(design, name, lambda sure: sure >= SURE)} | {
-            method: float(np.median([sure(name, design, order) for order in orders]))
-            for method, orders in (('intrinsics', [by_image]), ('random', random))
-        },
+        'goal_m': goal, 'e0': needed(design, e0, lambda error: error <= goal, by_image, random),
+        'named': needed(design, name, lambda sure: sure >= SURE, by_image, random),
         'at_20_m': {'chosen': alone(by_shift[:20]), 'random': goal,
                     'intrinsics': alone(by_image[:20])},
         'pull': refitted(linear, design, by_shift[:8], rng) if number < 20 else None,
@@ -145,27 +126,33 @@ def without(design: Design, question: Criterion) -> Criterion:
     return replace(question, nuisance=np.setdiff1d(own, question.interest))
 
 
-def plain(design: Design, question: Criterion) -> Callable[[Index], float]:
-    """Return the standard error of a number from some photographs, confounded effects absent."""
-    own = without(design, question)
-    return lambda taken: own.answer(design.known + design.added[taken].sum(axis=0))
+def answers(design: Design, question: Criterion) -> Callable[[Index], float]:
+    """Return what answers a question from some photographs: a standard error, or how sure."""
+    return lambda taken: question.answer(design.known + design.added[taken].sum(axis=0))
 
 
-def fewest(design: Design, question: Criterion, settles: Callable[[float], bool]) -> float:
-    """Return how many photographs settle a question, those of each number chosen together."""
-    return next((float(n) for n in range(1, 21)
-                 if settles(design.choose(question, n)[1][-1])), np.inf)
+def fewest(settled: Callable[[int], bool], counts: Iterable[int]) -> float:
+    """Return how many photographs settle a question; infinity if none do."""
+    return next((float(count) for count in counts if settled(count)), np.inf)
 
 
-def needed(error: Callable[[Index], float], order: Index, goal: float) -> float:
-    """Return how many photographs bring the error to the goal; infinity if none do."""
-    return next((float(n) for n in range(1, len(order) + 1) if error(order[:n]) <= goal), np.inf)
+def needed(
+    design: Design, question: Criterion, settles: Callable[[float], bool], by_image: Index,
+    random: Sequence[Index],
+) -> dict[str, float]:
+    """Return by method how many photographs settle a question.
 
+    The chosen ones of each number are chosen together.
+    """
+    answer = answers(design, question)
 
-def sure(question: Criterion, design: Design, order: Index) -> float:
-    """Return how many photographs make the name sure."""
-    return next((float(n) for n in range(1, len(order) + 1) if question.answer(
-        design.known + design.added[order[:n]].sum(axis=0)) >= SURE), np.inf)
+    def of(order: Index) -> float:
+        return fewest(lambda n: settles(answer(order[:n])), range(1, len(order) + 1))
+
+    return {
+        'chosen': fewest(lambda n: settles(design.choose(question, n)[1][-1]), range(1, 21)),
+        'intrinsics': of(by_image), 'random': float(np.median([of(one) for one in random])),
+    }
 
 
 def over_the_image(linear: Linearization, design: Design) -> Array:
@@ -173,8 +160,7 @@ def over_the_image(linear: Linearization, design: Design) -> Array:
     lens = linear.state.lens
     angle, turn = np.meshgrid(np.linspace(0.05, 0.98, 16) * lens.max_incidence,
                               np.linspace(0, 2 * np.pi, 24, endpoint=False))
-    points = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn),
-                       np.cos(angle)], axis=-1).reshape(-1, 3)
+    points = directions(angle, turn).reshape(-1, 3)
     columns = lens_columns(lens, project_with_jacobian(lens, points), list(linear.free))
     return np.asarray(np.einsum('mik,mil->kl', columns, columns) / len(points))
 
@@ -205,14 +191,14 @@ def refitted(
     data = replace(data, views=views._replace(uv=uv + NOISE * rng.normal(size=uv.shape)))
     begun = replace(model, lens=state.lens, terms=((EFFECT, np.zeros(1)),))
     fitted = adjust(data, begun, linear.free)
-    predicted = plain(design, design.question('e0'))(taken)
+    predicted = answers(design, without(design, design.question('e0')))(taken)
     return float((fitted.terms[0][1][0] - SHIFT) / predicted)
 
 
 def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
     """Choose among the frames of a real table: how many tell e0 nearly as well as all."""
     table = read_observations(path)
-    lens = calibrate(table, 'kannala_brandt', image_size).adjusted.lens
+    lens = study.calibrated(table, image_size)
     data, free = group_by_frame(table), intrinsic_names(lens)
     state = initial_state(data, lens)
     state = adjust(data, replace(state, terms=((EFFECT, np.zeros(1)),)), free)
@@ -222,7 +208,7 @@ def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
     e0 = without(design, design.question('e0'))
     name = design.question('viewpoint_shift', ('radial_profile', 'target_shape'))
     count = len(design.added)
-    error = plain(design, e0)
+    error = answers(design, e0)
     by_image = greedy(design, over_the_image(linear, design), count)
     rng = np.random.default_rng(0)
     random = [rng.permutation(count) for _ in range(200)]
@@ -230,12 +216,8 @@ def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
     goal = 1.5 * everything
     return {
         'frames': count, 'stderr_all_m': everything, 'goal_m': goal,
-        'e0': {'chosen': fewest(design, e0, lambda error: error <= goal),
-               'intrinsics': needed(error, by_image, goal),
-               'random': float(np.median([needed(error, o, goal) for o in random]))},
-        'named': {'chosen': fewest(design, name, lambda sure: sure >= SURE),
-                  'intrinsics': sure(name, design, by_image),
-                  'random': float(np.median([sure(name, design, o) for o in random]))},
+        'e0': needed(design, e0, lambda error: error <= goal, by_image, random),
+        'named': needed(design, name, lambda sure: sure >= SURE, by_image, random),
         'diagnosed': {
             'chosen': diagnosed(table, lens, lambda n: design.choose(name, n)[0]),
             'intrinsics': diagnosed(table, lens, lambda n: by_image[:n]),
@@ -250,17 +232,16 @@ def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
 
 def diagnosed(table: Observations, lens: Lens, chosen: Callable[[int], Index]) -> float:
     """Return how many frames of a table it takes for `diagnose` to name the viewpoint shift."""
-    for count in range(1, len(table.frames) + 1):
+    def named(count: int) -> bool:
         some = table.take(np.isin(table.frame, table.frames[chosen(count)]))
         try:
-            size = (lens.width, lens.height)
-            own = calibrate(some, 'kannala_brandt', size).adjusted.lens
-            causes = diagnose(some, own, free_intrinsics=True).causes
+            found = study.calibrated_and_diagnosed(some, (lens.width, lens.height),
+                                                   free_intrinsics=True)[1]
         except FisheyeSvpError:
-            continue  # too few to tell anything
-        if any(cause.effect == EFFECT.name for cause in causes):
-            return float(count)
-    return np.inf
+            return False  # too few to tell anything
+        return any(cause.effect == EFFECT.name for cause in found.causes)
+
+    return fewest(named, range(1, len(table.frames) + 1))
 
 
 class Taken(Design):

@@ -7,10 +7,7 @@ Leave the machine alone meanwhile.
 
 from __future__ import annotations
 
-import argparse
-import os
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 
@@ -19,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2
 
+from benchmark import study
 from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.nodes import messages
@@ -95,17 +93,13 @@ class Trial:
 
 def main() -> None:
     """Measure, and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--seconds', type=float, default=10.0, help='at each rate')
-    seconds = parser.parse_args().seconds
-    os.environ.setdefault('ROS_DOMAIN_ID', '99')
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    seconds = study.parser('overload', __doc__, None, workers=False,
+                           seconds=(10.0, 'at each rate')).parse_args().seconds
+    study.stay_on_this_machine()
     rclpy.init(args=[])
-    localizer = subprocess.Popen([
-        sys.executable, '-m', 'fisheye_svp_ros.cli', 'run', 'localizer', '--ros-args',
-        '-p', 'lens:=fish214', '-p', 'svp:=true',
-        '-p', 'qos_overrides./image_points.subscription.history:=keep_all',
-    ])
+    localizer = subprocess.Popen(study.node_command(
+        'localizer', 'lens:=fish214', 'svp:=true',
+        'qos_overrides./image_points.subscription.history:=keep_all'))
     try:
         trial = Trial()
         trial.until(lambda: trial.points.get_subscription_count() > 0)

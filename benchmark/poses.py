@@ -5,13 +5,12 @@
 
 from __future__ import annotations
 
-import argparse
-import re
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from benchmark import study
+from benchmark.boards import directions, grid
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.lens_files import load_lens
@@ -38,8 +37,6 @@ CASES = {
 # From one view these cannot be told: a mirrored plane is the same plane seen from behind.
 UNTESTABLE = {('mirrored', 'board')}
 _LENS, _OTHER = 'fish214', 'fish180'
-_DOC = Path(__file__).parents[1] / 'docs' / 'results' / 'reliability.md'
-_BEGIN, _END = '<!-- poses -->', '<!-- end of poses -->'
 
 
 class Outcome(NamedTuple):
@@ -63,16 +60,19 @@ class Outcome(NamedTuple):
 def scene(kind: str, count: int, rng: np.random.Generator, points: int = 20) -> tuple[Array, Pose]:
     """Return landmarks (S, N, 3), m, and poses (S,) that see them: a room, or a board of 5 x 4."""
     if kind == 'room':
-        d = _within(np.radians(80), (count, points), rng)
-        pose = identity(count).retract(rng.normal(size=(count, 6)) * [1, 1, 1, 2, 2, 2])
-        local = d * rng.uniform(0.5, 3.0, (count, points, 1))
-        turned = local @ np.swapaxes(pose.rotation, -1, -2)
-        return turned + pose.position[:, None], pose
-    x, y = np.meshgrid(np.arange(5) - 2, np.arange(4) - 1.5)
-    board = 0.1 * np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=-1)
+        return _around(np.radians(80), 0.5, 3.0, count, points, rng)
     place = _within(np.radians(50), (count,), rng) * rng.uniform(0.25, 0.8, (count, 1))
     turn = rotation_from_vector(rng.uniform(-0.6, 0.6, (count, 3)) * [1, 1, 3])
-    return np.tile(board[:points], (count, 1, 1)), Pose(turn, place).inverse()
+    return np.tile(grid(5, 4, 0.1)[:points], (count, 1, 1)), Pose(turn, place).inverse()
+
+
+def _around(
+    cone: float, near: float, far: float, count: int, points: int, rng: np.random.Generator
+) -> tuple[Array, Pose]:
+    """Return landmarks (S, N, 3), m, within a cone ahead of cameras, and their poses (S,)."""
+    d = _within(cone, (count, points), rng)
+    pose = identity(count).retract(rng.normal(size=(count, 6)) * [1, 1, 1, 2, 2, 2])
+    return pose.transform(d * rng.uniform(near, far, (count, points, 1))), pose
 
 
 def spoilt(
@@ -132,10 +132,7 @@ def lost_minima(points: int, cone: float, count: int, rng: np.random.Generator) 
 
     cone: half angle, rad, of the landmarks as the camera sees them.
     """
-    d = _within(cone, (count, points), rng)
-    pose = identity(count).retract(rng.normal(size=(count, 6)) * [1, 1, 1, 2, 2, 2])
-    local = d * rng.uniform(1.0, 1.5, (count, points, 1))
-    landmarks = local @ np.swapaxes(pose.rotation, -1, -2) + pose.position[:, None]
+    landmarks, pose = _around(cone, 1.0, 1.5, count, points, rng)
     model = ForwardModel(load_lens(lens_path(_LENS)))
     uv = model.predict(pose, views_of(landmarks, np.zeros((count, points, 2)))).uv
     views = views_of(landmarks, uv + SIGMA * rng.normal(size=uv.shape),
@@ -159,26 +156,23 @@ def section(outcomes: dict[tuple[str, str], Outcome], lost: dict[int, tuple[int,
         f'Wrong poses that pass: {sum(o.wrong for o in told)}, those left out that one view '
         'cannot tell (below). Clean views that do not pass: '
         f'{sum(o.views - o.passed for o in clean)} of {sum(o.views for o in clean)}.', '',
-        '| spoilt by | scene | views | refused | no pose | warned | passed | wrong and passed | '
-        'outliers rejected | of these right |',
-        '| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |',
+        *study.table(
+            'spoilt by | scene | views | refused | no pose | warned | passed | wrong and passed | '
+            'outliers rejected | of these right',
+            [[CASES[case] + ' (cannot be told)' * ((case, kind) in UNTESTABLE), kind, *o]
+             for (case, kind), o in outcomes.items()], numbers=True),
+        '', 'Views of few points have several minima: the best of twelve starts, the true '
+        'pose among them, against `localize` without a start.', '',
+        *study.table('points | views | minima missed', [
+            (points, count, missed) for points, (missed, count) in lost.items()], numbers=True),
     ]
-    for (case, kind), o in outcomes.items():
-        note = ' (cannot be told)' if (case, kind) in UNTESTABLE else ''
-        cells = ' | '.join(map(str, o))
-        lines.append(f'| {CASES[case]}{note} | {kind} | {cells} |')
-    lines += ['', 'Views of few points have several minima: the best of twelve starts, the true '
-              'pose among them, against `localize` without a start.', '',
-              '| points | views | minima missed |', '| ---: | ---: | ---: |']
-    lines += [f'| {points} | {count} | {missed} |' for points, (missed, count) in lost.items()]
     return '\n'.join(lines)
 
 
 def main() -> None:
     """Run the study and write its section."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--views', type=int, default=720, help='of each case and scene')
-    count = parser.parse_args().views
+    count = study.parser('poses', __doc__, None, workers=False,
+                         views=(720, 'of each case and scene')).parse_args().views
     engines.settle(1e9)
     outcomes = {
         (case, kind): tried(case, kind, count, np.random.default_rng([i, j]))
@@ -190,17 +184,15 @@ def main() -> None:
         missed = [lost_minima(points, cone, count, np.random.default_rng(i))
                   for i, cone in enumerate(cones)]
         lost[points] = sum(missed), count * len(cones)
-    text = _DOC.read_text()
-    between = f'{_BEGIN}\n{section(outcomes, lost)}\n{_END}'
-    _DOC.write_text(re.sub(f'{_BEGIN}.*{_END}', lambda _: between, text, flags=re.DOTALL))
-    print(between)
+    text = section(outcomes, lost)
+    study.write_section(study.RELIABILITY, 'poses', text)
+    print(text)
 
 
 def _within(angle: float, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
     """Return unit directions (*shape, 3) up to an angle from z."""
     theta, azimuth = angle * np.sqrt(rng.uniform(size=shape)), rng.uniform(0, 2 * np.pi, shape)
-    return np.stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth),
-                     np.cos(theta)], axis=-1)
+    return directions(theta, azimuth)
 
 
 if __name__ == '__main__':

@@ -11,21 +11,15 @@ Writes docs/results/ray_halves.md.
 
 from __future__ import annotations
 
-import argparse
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from benchmark.true_rays import ray_error
-from benchmark.workers import in_processes
-from fisheye_svp_ros.diagnosis import Diagnosis, diagnose
-from fisheye_svp_ros.io.files import write_text
+from benchmark import study
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations
-from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.ray_errors import RayError, typical_points
 
 RANGE = 1.0  # m
@@ -43,9 +37,7 @@ def diagnosed(part: Part) -> Found:
     chosen = PARTS[name]
     frames = (table.frames[chosen] if isinstance(chosen, slice)
               else np.array_split(table.frames, 2)[chosen])
-    mine = table.take(np.isin(table.frame, frames))
-    given = calibrate(mine, 'kannala_brandt', size).adjusted.lens
-    found: Diagnosis = diagnose(mine, given)
+    given, found = study.calibrated_and_diagnosed(table.take(np.isin(table.frame, frames)), size)
     stated = found.conclusion.ray_error['']
     at = [one.range_m for one in stated['given']].index(RANGE)
     assert found.lens is not None
@@ -58,7 +50,7 @@ def lines(name: str, table: Observations, parts: dict[str, Found]) -> list[str]:
     for part, (given, extended, stated) in parts.items():
         cells = []
         for lens, one in zip((given, extended), stated, strict=True):
-            off = '-' if lens is truth else f'{ray_error(lens, truth, uv, (RANGE,)):.2f}'
+            off = '-' if lens is truth else f'{study.ray_error(lens, truth, uv, (RANGE,)):.2f}'
             cells.append(f'{1e3 * one.value:.2f} ({1e3 * one.low:.2f} to {1e3 * one.high:.2f}) '
                          f'| {off}')
         rows.append(f'| {name} | {part} | {" | ".join(cells)} |')
@@ -67,25 +59,22 @@ def lines(name: str, table: Observations, parts: dict[str, Found]) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Diagnose the halves and write what they state and what is found."""
-    parser = argparse.ArgumentParser(prog='python -m benchmark.ray_halves')
-    parser.add_argument('sets', type=Path, nargs='+', metavar='TRAIN.csv')
-    parser.add_argument('--image-size', required=True, metavar='WxH')
-    parser.add_argument('--workers', type=int, default=os.cpu_count(), help='processes')
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results'),
-                        help='directory')
+    parser = study.parser('ray_halves', __doc__)
+    study.add_sets(parser)
     asked = parser.parse_args(arguments)
-    width, height = (int(side) for side in asked.image_size.split('x'))
-    todo = [(path, (width, height), part) for path in asked.sets for part in PARTS]
-    found = iter(in_processes('halves', diagnosed, todo, asked.workers))
-    command = [*map(str, asked.sets), '--image-size', asked.image_size]
-    page = ['# Are rays as far off as is stated?', '', *(__doc__ or '').split('\n\n')[1].split(
-        '\n'), '', f'    python -m benchmark.ray_halves {" ".join(command)}', '',
-        '| set | part | calibrated: stated, mrad | found | extended: stated, mrad | found |',
-        '|---|---|---|---|---|---|']
+    todo = [(path, asked.image_size, part) for path in asked.sets for part in PARTS]
+    found = iter(study.in_processes('halves', diagnosed, todo, asked.workers))
+    rows = []
     for path in asked.sets:
         parts = {part: next(found) for part in PARTS}
-        page += lines(path.parent.name, read_observations(path), parts)
-    write_text(asked.output / 'ray_halves.md', '\n'.join(page) + '\n')
+        rows += lines(path.parent.name, read_observations(path), parts)
+    width, height = asked.image_size
+    command = ' '.join([*map(str, asked.sets), '--image-size', f'{width}x{height}'])
+    study.write_lines(asked.output / 'ray_halves.md', [
+        '# Are rays as far off as is stated?', '', *study.paragraph(__doc__),
+        f'    python -m benchmark.ray_halves {command}', '', *study.table(
+            'set | part | calibrated: stated, mrad | found | extended: stated, mrad | found', []),
+        *rows])
 
 
 if __name__ == '__main__':

@@ -9,7 +9,7 @@ done.  Writes docs/results/rectification.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -21,6 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import fisheye_svp_ros as fsvp
+from benchmark import study
+from benchmark.boards import facing
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_formats import write_foreign
@@ -30,7 +32,6 @@ from fisheye_svp_ros.pose import Pose, rotation_from_vector, vector_from_rotatio
 from fisheye_svp_ros.reporting.terminal import range_text
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 
-_DOC = Path(__file__).parents[1] / 'docs' / 'results' / 'rectification.md'
 # mrcal's CAHVORE with a linearity of 0 is this lens exactly.
 _SHIFT = Gennery(e0=0.006, e1=0.002)
 LEFT = Lens('left', 1280, 800, 420.0, 420.0, 637.3, 403.4, Equidistant(), np.radians(95.0), _SHIFT)
@@ -125,11 +126,9 @@ WHO: dict[str, Callable[[float], Sides]] = {
 def scene(range_m: float) -> tuple[Array, list[NDArray[np.uint8]]]:
     """Return the corners (N, 3), m, in the left camera, and both photographs of them."""
     board = Print(_COLUMNS, _ROWS, _SQUARE * range_m)
-    middle = _PLACE / np.linalg.norm(_PLACE) * range_m + [0.075, 0.0, 0.0]
     ahead = _PLACE / np.linalg.norm(_PLACE)
-    right = np.cross([0.0, 1.0, 0.0], ahead)
-    right /= np.linalg.norm(right)
-    turn = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    middle = range_m * ahead + [0.075, 0.0, 0.0]
+    turn = facing(ahead)
     place = Pose(turn, middle - turn @ board.corners.mean(axis=0))
     camera = place.inverse()
     images = [render(lens, board, pose, Exposure(noise=0.5), np.random.default_rng(number))
@@ -167,21 +166,19 @@ def _inverse(maps: NDArray[np.float32], uv: Array) -> Array:
     return np.asarray(np.array([column, row]) + np.linalg.solve(slope, uv - maps[:, row, column]))
 
 
-def lines() -> Iterator[str]:
-    """Yield the table."""
-    names = [range_text(range_m) for range_m in RANGES]
-    yield '| maps | ' + ' | '.join(f'{name}: row, px | depth, mm' for name in names) + ' |'
-    yield '| --- |' + ' ---: |' * (2 * len(names))
-    scenes = [scene(range_m) for range_m in RANGES]
+def lines() -> list[str]:
+    """Return the table."""
+    scenes, rows = [scene(range_m) for range_m in RANGES], []
     for name, make in WHO.items():
         try:
             found = [errors(make(range_m), *one)
                      for range_m, one in zip(RANGES, scenes, strict=True)]
         except ImportError as cause:
-            yield f'| {name} | not measured: {cause} |' + ' |' * (2 * len(names) - 1)
+            rows.append([name, f'not measured: {cause}', *[''] * (2 * len(RANGES) - 1)])
             continue
-        yield f'| {name} | ' + ' | '.join(
-            f'{row:.3f} | {1e3 * depth:.2f}' for row, depth in found) + ' |'
+        rows.append([name, *(f'{row:.3f} | {1e3 * depth:.2f}' for row, depth in found)])
+    return study.table('maps | ' + ' | '.join(
+        f'{range_text(range_m)}: row, px | depth, mm' for range_m in RANGES), rows, numbers=True)
 
 
 def main() -> None:
@@ -194,8 +191,9 @@ def main() -> None:
 
     head = _HEAD.format(baseline=1e3 * np.linalg.norm(RIG.position), e0=1e3 * _SHIFT.e0,
                         mrcal=known('mrcal'), opencv=cv2.__version__)
-    write_text(_DOC, head + '\n'.join(lines()) + '\n')
-    print(_DOC)
+    path = study.RESULTS / 'rectification.md'
+    write_text(path, head + '\n'.join(lines()) + '\n')
+    print(path)
 
 
 if __name__ == '__main__':

@@ -8,10 +8,8 @@ that holds images (config/fastdds/images.xml); --defaults takes that of Fast DDS
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from itertools import product
@@ -25,6 +23,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image
 
+from benchmark import study
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.nodes.messages import image_message
@@ -46,10 +45,9 @@ def rate(channels: int, cameras: tuple[str, ...], pace: float, seconds: float) -
         for name in cameras:
             save_lens(LENS, Path(folder) / f'{name or "camera"}.yaml')
         save_rig(rig('parallel'), Path(folder) / 'rig.yaml')
-        words = [f'lens:={folder}/', f'stereo:={str(len(cameras) > 1).lower()}']
         process = psutil.Process(subprocess.Popen(
-            [sys.executable, '-m', 'fisheye_svp_ros.cli', 'run', 'rectifier', '--ros-args',
-             *(word for one in words for word in ('-p', one))],
+            study.node_command('rectifier', f'lens:={folder}/',
+                               f'stereo:={str(len(cameras) > 1).lower()}'),
             preexec_fn=lambda: os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})).pid)
         try:
             return _measured(message, cameras, pace, seconds, process)
@@ -97,12 +95,11 @@ def _measured(
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog='python -m benchmark.rectifier_rate')
-    parser.add_argument('--pace', type=float, default=30.0, help='images a second (30)')
-    parser.add_argument('--seconds', type=float, default=10.0, help='for each line (10)')
-    parser.add_argument('--defaults', action='store_true', help='the transports of Fast DDS')
-    args = parser.parse_args()
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    args = study.parser(
+        'rectifier_rate', __doc__, None, workers=False, pace=(30.0, 'images a second (30)'),
+        seconds=(10.0, 'for each line (10)'),
+        defaults=(False, 'the transports of Fast DDS')).parse_args()
+    study.stay_on_this_machine()
     if not args.defaults:
         os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(PROFILE))
     rclpy.init(args=[])

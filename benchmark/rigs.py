@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,9 +22,9 @@ import cv2
 import numpy as np
 from scipy import stats
 
-from benchmark.workers import in_processes
+from benchmark import study
+from benchmark.boards import facing, grid
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
@@ -39,7 +38,6 @@ from fisheye_svp_ros.solve.rig_state import group_by_frame
 from fisheye_svp_ros.study.lens_trust import assess_lens, with_covariance
 
 TRIALS = 60
-_DOC = Path(__file__).parents[1] / 'docs' / 'results' / 'rigs.md'
 _LENS = Lens('around', 1280, 800, 400.0, 400.0, 639.5, 399.5, KannalaBrandt(-0.01, 0.002),
              np.radians(90.0))
 _CAMERAS = tuple(f'cam{i}' for i in range(4))
@@ -47,8 +45,7 @@ _RIG = surround_rig(4, 0.1)
 _SEAMS, _FRAMES, _NOISE_PX = 32, 64, 0.2  # photographs between two cameras, all, px
 _MOVING, _TURN = 24, 0.35  # photographs of each camera, rad
 _PEERS = Path(__file__).parents[1] / '.venv-rigs' / 'bin' / 'python'
-_Y, _X = np.mgrid[:6, :9]
-_BOARD = 0.05 * np.stack([_X.ravel() - 4.0, _Y.ravel() - 2.5, np.zeros(54)], axis=-1)
+_BOARD = grid(9, 6, 0.05)
 
 
 class Outcome(NamedTuple):
@@ -72,10 +69,7 @@ def draw_points(seed: int) -> Array:
         azimuth += rng.normal(0, 0.1 if frame < _SEAMS else 0.4)
         ahead = np.array([np.sin(azimuth), rng.normal(0, 0.2), np.cos(azimuth)])
         ahead /= np.linalg.norm(ahead)
-        right = np.cross([0.0, 1.0, 0.0], ahead)
-        right /= np.linalg.norm(right)
-        turn = np.stack([right, np.cross(ahead, right), ahead], axis=1)
-        turn = turn @ rotation_from_vector(rng.normal(0, 0.4, 3))
+        turn = facing(ahead) @ rotation_from_vector(rng.normal(0, 0.4, 3))
         board = Pose(turn, rng.uniform(0.4, 0.8) * ahead).transform(_BOARD)
         for camera in range(4):
             image = project(_LENS, _RIG.take(camera).inverse().transform(board))
@@ -188,10 +182,20 @@ def _opencv(uv: Array, lenses: Sequence[Lens]) -> Pose:
 
 
 def write_results(
-    outcomes: Sequence[Outcome], moving: Sequence[list[float]], path: Path = _DOC
+    outcomes: Sequence[Outcome], moving: Sequence[list[float]],
+    path: Path = study.RESULTS / 'rigs.md',
 ) -> None:
     """Write the page of the results."""
-    lines = [
+    rows = []
+    for name in dict.fromkeys(name for one in outcomes for name in one.errors):
+        errors = np.array([one.errors[name] for one in outcomes if name in one.errors])
+        place, turn, took = np.median(errors, axis=0)
+        rows.append([name, len(errors), f'{1e3 * place:.3f}', f'{np.degrees(turn):.4f}',
+                     f'{took:.1f}'])
+    why = {f'{name}: {text}' for one in outcomes for name, text in one.why.items()}
+    if not _PEERS.exists():
+        why.add('multical, pycolmap: not installed (`make rigs`)')
+    study.write_wrapped(path, [
         '# Rigs of four cameras', '',
         'Written by `python -m benchmark.rigs` (`make rigs`). Four cameras of 1280 x 800 px and '
         '180 deg stand 90 deg apart on a circle of 0.1 m. They photograph a board of 9 x 6 '
@@ -200,26 +204,15 @@ def write_results(
         f'{cv2.__version__} is `cv2.calibrateMultiview` with fisheye models; it, multical and '
         "pycolmap (COLMAP's bundle adjustment of a rig, OPENCV_FISHEYE, points known) start at "
         'our lenses, pycolmap at our start of the poses too.', '',
-        '| | trials | place, mm | turn, deg | processor time, s |', '|---|---|---|---|---|',
-    ]
-    for name in dict.fromkeys(name for one in outcomes for name in one.errors):
-        errors = np.array([one.errors[name] for one in outcomes if name in one.errors])
-        place, turn, took = np.median(errors, axis=0)
-        lines.append(f'| {name} | {len(errors)} | {1e3 * place:.3f} | {np.degrees(turn):.4f} | '
-                     f'{took:.1f} |')
-    why = {f'{name}: {text}' for one in outcomes for name, text in one.why.items()}
-    if not _PEERS.exists():
-        why.add('multical, pycolmap: not installed (`make rigs`)')
-    lines += ['', 'Medians of the rms errors of the other three cameras in the first one. The '
-              'time of the others is without that of their start. Only ours states standard '
-              'errors.', *(f'\nLeft out: {one}.' for one in sorted(why)), '',
-              _within('the transforms', [one.z for one in outcomes]), '',
-              '## A board for each camera', '',
-              f'The same cameras, lenses known, see a board each, {_MOVING} photographs; the rig '
-              f'turns by up to {np.degrees(_TURN):.0f} deg about each axis. '
-              + _within('the transforms, from the motion of the rig,', moving), '']
-    write_text(path, '\n'.join(textwrap.fill(line, 100, break_on_hyphens=False)
-                               for line in lines))
+        *study.table(' | trials | place, mm | turn, deg | processor time, s', rows), '',
+        'Medians of the rms errors of the other three cameras in the first one. The '
+        'time of the others is without that of their start. Only ours states standard '
+        'errors.', *(f'\nLeft out: {one}.' for one in sorted(why)), '',
+        _within('the transforms', [one.z for one in outcomes]), '',
+        '## A board for each camera', '',
+        f'The same cameras, lenses known, see a board each, {_MOVING} photographs; the rig '
+        f'turns by up to {np.degrees(_TURN):.0f} deg about each axis. '
+        + _within('the transforms, from the motion of the rig,', moving), ''])
 
 
 def _within(what: str, scores: Sequence[list[float]]) -> str:
@@ -231,5 +224,5 @@ def _within(what: str, scores: Sequence[list[float]]) -> str:
 
 if __name__ == '__main__':
     todo = list(range(int(sys.argv[1]) if len(sys.argv) > 1 else TRIALS))
-    write_results(in_processes('rigs', run_trial, todo, 2),
-                  in_processes('moving rigs', run_moving, todo, 2))
+    write_results(study.in_processes('rigs', run_trial, todo, 2),
+                  study.in_processes('moving rigs', run_moving, todo, 2))

@@ -11,8 +11,6 @@ Writes docs/results/thirds.md.
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,13 +18,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmark.workers import in_processes
+from benchmark import study
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, can_be_included, diagnose
+from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, can_be_included
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.scene.observations import Observations
-from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 SHIFT = 'viewpoint_shift'
 NAMES = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4', 'e0')
@@ -44,14 +41,8 @@ class Part(NamedTuple):
 
 def diagnosed(table: Observations, size: tuple[int, int], causes: tuple[str, ...]) -> Diagnosis:
     """Calibrate and diagnose a table, some causes taken in without a test."""
-    lens = calibrate(table, 'kannala_brandt', size).adjusted.lens
-    return diagnose(table, lens, options=DiagnosisOptions(included=causes))
-
-
-def named(path: Path, size: tuple[int, int]) -> tuple[str, ...]:
-    """Return the causes of a whole set that can be taken in without a test."""
-    found = diagnosed(read_observations(path), size, (SHIFT,)).causes
-    return tuple(cause.effect for cause in found if can_be_included(cause.effect))
+    return study.calibrated_and_diagnosed(
+        table, size, options=DiagnosisOptions(included=causes))[1]
 
 
 def estimates(part: Part) -> Array:
@@ -75,41 +66,32 @@ def agreement(parts: Array) -> Array:
 
 def report(rows: dict[str, Array], deals: int, command: str) -> str:
     """Return the page; rows: chi^2 (deals, 9) by set and causes."""
-    lines = ['# Do thirds of the frames agree?', '', (__doc__ or '').split('\n\n')[1], '',
-             f'    {command}', '', f'Means over {deals} deals; - where a part always leaves the '
-             'number open.', '', f'| set | causes | {" | ".join(NAMES)} |',
-             '|---' * (len(NAMES) + 2) + '|']
-    for label, values in rows.items():
-        there = np.isfinite(values)
-        means = np.where(there, values, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
-        cells = [f'{mean:.1f}' if some else '-'
-                 for mean, some in zip(means, there.any(axis=0), strict=True)]
-        lines.append(f'| {label} | {" | ".join(cells)} |')
-    return '\n'.join(lines) + '\n'
+    cells = [[label, *(f'{one[np.isfinite(one)].mean():.1f}' if np.isfinite(one).any() else '-'
+                       for one in values.T)] for label, values in rows.items()]
+    return '\n'.join([
+        '# Do thirds of the frames agree?', '', *study.paragraph(__doc__), f'    {command}', '',
+        f'Means over {deals} deals; - where a part always leaves the number open.', '',
+        *study.table(f'set | causes | {" | ".join(NAMES)}', cells), ''])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Diagnose the parts and write how they agree."""
-    parser = argparse.ArgumentParser(prog='python -m benchmark.thirds')
-    parser.add_argument('sets', type=Path, nargs='+', metavar='TRAIN.csv')
-    parser.add_argument('--image-size', required=True, metavar='WxH')
-    parser.add_argument('--deals', type=int, default=5)
-    parser.add_argument('--workers', type=int, default=os.cpu_count(), help='processes')
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results'),
-                        help='directory')
+    parser = study.parser('thirds', __doc__, deals=(5, 'of the frames to three parts'))
+    study.add_sets(parser)
     asked = parser.parse_args(arguments)
-    width, height = (int(side) for side in asked.image_size.split('x'))
     todo, labels = [], []
     for path in asked.sets:
-        whole = named(path, (width, height))
-        for label, causes in (('its own', (SHIFT,)), ('of the whole set', whole)):
+        whole = diagnosed(read_observations(path), asked.image_size, (SHIFT,)).causes
+        named = tuple(one.effect for one in whole if can_be_included(one.effect))
+        for label, causes in (('its own', (SHIFT,)), ('of the whole set', named)):
             labels.append(f'{path.parent.name} | {label}')
-            todo += [Part(path, (width, height), deal, third, causes)
+            todo += [Part(path, asked.image_size, deal, third, causes)
                      for deal in range(asked.deals) for third in range(3)]
-    found = np.array(in_processes('thirds', estimates, todo, asked.workers))
+    found = np.array(study.in_processes('thirds', estimates, todo, asked.workers))
     values = agreement(found.reshape(len(labels), asked.deals, 3, len(NAMES), 2))
     sets = ' '.join(f'{path.parent.name}/{path.name}' for path in asked.sets)
-    command = (f'python -m benchmark.thirds {sets} --image-size {asked.image_size} '
+    width, height = asked.image_size
+    command = (f'python -m benchmark.thirds {sets} --image-size {width}x{height} '
                f'--deals {asked.deals}')
     page = report(dict(zip(labels, values, strict=True)), asked.deals, command)
     write_text(asked.output / 'thirds.md', page)

@@ -10,19 +10,19 @@ writes docs/results/two_cameras.json and the table in docs/results/two_cameras.m
 
 from __future__ import annotations
 
-import argparse
 import json
-import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from itertools import product
 from time import process_time
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index, Mask
+from benchmark import study
+from benchmark.boards import draw_fields, joined
+from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.detect.detection import detect
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import Photograph
@@ -35,13 +35,10 @@ from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import STEREO, Observations, group_views, make_observations
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.simulate.targets import board_views
-from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.localization import localize
 
 Rng = np.random.Generator
-DOCS = Path(__file__).parents[1] / 'docs'
 _ROUNDS, _FAR = 3, 4.0  # of setting aside what lies so many times the median off
-BEGIN, END = '<!-- two cameras -->', '<!-- end of two cameras -->'
 
 
 @dataclass(frozen=True)
@@ -105,7 +102,7 @@ def pair(hidden: Hidden, seed: int) -> Pair:
     seen = hidden_lenses(hidden)
     rig = Pose(rotation_from_vector(np.array([0.01, 0.08, -0.02])), np.array([0.12, 0.004, -0.01]))
     left = _views(lenses(), printed, rig, hidden.frames, rng)
-    right = left.compose(_repeated(rig, hidden.frames))
+    right = left.compose(rig.broadcast_to(hidden.frames))
     if hidden.late:
         right = right.retract(hidden.late * rng.normal(size=(hidden.frames, 6))
                               * [1, 1, 1, 3, 3, 3])
@@ -117,7 +114,7 @@ def pair(hidden: Hidden, seed: int) -> Pair:
             f'chessboard:{hidden.columns}x{hidden.rows}:{1000 * printed.size}mm')
         table = detect(photographs, pattern).observations
     else:
-        table = _joined([
+        table = joined([
             _seen(lens, printed, board, pose, hidden, rng, camera)
             for camera, (lens, board, pose) in enumerate(zip(seen, boards, poses, strict=True))])
         wrong = rng.choice(hidden.frames, hidden.reversed_frames, replace=False)
@@ -125,10 +122,10 @@ def pair(hidden: Hidden, seed: int) -> Pair:
         last = len(printed.corners) - 1
         landmark = np.where(turn, last - table.landmark, table.landmark)
         table = replace(table, landmark=landmark, xyz=printed.corners[landmark])
-    found = {name: calibrate(replace(table.take(table.camera == i), cameras=(name,),
-                                     camera=np.zeros(int((table.camera == i).sum()), dtype=int)),
-                             'kannala_brandt', (one.width, one.height)).adjusted.lens
-             for i, (name, one) in enumerate(zip(STEREO, seen, strict=True))}
+    found = {name: study.calibrated(
+        replace(table.take(table.camera == i), cameras=(name,),
+                camera=np.zeros(int((table.camera == i).sum()), dtype=int)),
+        (one.width, one.height)) for i, (name, one) in enumerate(zip(STEREO, seen, strict=True))}
     both = np.intersect1d(*(table.frame[table.camera == i] for i in (0, 1)))
     return Pair(table, found, true.true_corners() - printed.corners,
                 sorted(set(wrong) & set(both.tolist())))
@@ -185,12 +182,8 @@ def _views(
     """Return poses of the left camera; every camera sees the board as a whole in most of them."""
     own = board_views(given[0], printed, frames - frames // 3, (0.25, 0.8), rng)
     other = board_views(given[1], printed, frames // 3, (0.25, 0.8), rng)
-    back = other.compose(_repeated(rig.inverse(), frames // 3))
+    back = other.compose(rig.inverse().broadcast_to(frames // 3))
     return Pose(*(np.concatenate(both) for both in zip(own, back, strict=True)))
-
-
-def _repeated(pose: Pose, count: int) -> Pose:
-    return Pose(*(np.repeat(part[None], count, axis=0) for part in pose))
 
 
 def _seen(
@@ -200,7 +193,7 @@ def _seen(
     count = len(true)
     uv, whole = _image(lens, pose.into_body(np.broadcast_to(true, (hidden.frames, count, 3))))
     whole &= rng.random(hidden.frames) > 0.15
-    static, own = _field(lens, rng, 1), _field(lens, rng, hidden.frames)
+    static, own = (draw_fields(lens, rng, each, 8, (0.08, 0.3)) for each in (1, hidden.frames))
     uv = uv + hidden.field * static(uv, np.zeros(hidden.frames, dtype=int))
     uv = uv + hidden.frame_field * own(uv, np.arange(hidden.frames))
     uv = uv + hidden.noise * rng.normal(size=uv.shape)
@@ -217,27 +210,6 @@ def _image(lens: Lens, points: Array) -> tuple[Array, Mask]:
     image = ForwardModel(lens).project(points)
     inside = (image.uv > 4) & (image.uv < np.array([lens.width, lens.height]) - 4)
     return image.uv, np.asarray((image.valid & inside.all(axis=-1)).all(axis=1))
-
-
-def _field(lens: Lens, rng: Rng, count: int) -> Any:
-    """Draw smooth fields over the image of 1 px or so, of a few bumps each."""
-    size = np.array([lens.width, lens.height])
-    centres = rng.uniform(size=(count, 8, 2)) * size
-    widths = rng.uniform(0.08, 0.3, (count, 8)) * size.max()
-    heights = rng.normal(size=(count, 8, 2))
-
-    def field(uv: Array, which: Index) -> Array:
-        off = uv[:, :, None] - centres[which][:, None]
-        near = np.exp(-(off**2).sum(axis=-1) / 2 / widths[which][:, None] ** 2)
-        return np.asarray(np.einsum('fnb,fbd->fnd', near, heights[which]))
-
-    return field
-
-
-def _joined(parts: Sequence[Observations]) -> Observations:
-    names = ('frame', 'landmark', 'uv', 'xyz', 'camera', 'board', 't', 'sigma')
-    return replace(parts[0], **{
-        name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 KINDS = {
@@ -296,11 +268,7 @@ def tried(kind: str, seed: int) -> dict[str, Any]:
 
 def section(found: Sequence[dict[str, Any]]) -> str:
     """Return the table of docs/results/two_cameras.md."""
-    lines = [
-        '| pairs | agree, undecided, contradict | correlation of the maps | rms of the one that '
-        'did not find it, px | less scatter of the rig: translation | rotation | by the truth | '
-        'of what can be had |',
-        '| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |']
+    rows = []
     for kind in KINDS:
         said = [one['external'] for one in found if one['kind'] == kind]
         if not said:
@@ -313,11 +281,12 @@ def section(found: Sequence[dict[str, Any]]) -> str:
                 for name in ('translation_m', 'rotation_rad')]
         px = ' → '.join(spread([one[name] for one in carried], '.3f')
                         for name in ('without_px', 'with_px'))
-        lines.append(f'| {len(said)}: {kind} | {", ".join(map(str, counts))} | '
-                     f'{spread(maps, ".3f")} | {px} | '
-                     + ' | '.join(f'{spread(one, ".0f")} %' for one in less)
-                     + f' | {" | ".join(_bound(found, kind))} |')
-    return '\n'.join(lines)
+        rows.append([f'{len(said)}: {kind}', ', '.join(map(str, counts)), spread(maps, '.3f'), px,
+                     *(f'{spread(one, ".0f")} %' for one in less), *_bound(found, kind)])
+    return '\n'.join(study.table(
+        'pairs | agree, undecided, contradict | correlation of the maps | rms of the one that did '
+        'not find it, px | less scatter of the rig: translation | rotation | by the truth | '
+        'of what can be had', rows, numbers=True))
 
 
 def _bound(found: Sequence[dict[str, Any]], kind: str) -> tuple[str, str]:
@@ -349,24 +318,17 @@ def spread(values: Sequence[float], form: str) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the pairs, write those that are done and print a line for each."""
-    parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.two_cameras')
-    parser.add_argument('--pairs', type=int, default=10, help='of each kind')
-    parser.add_argument('-o', '--output', type=Path, default=DOCS / 'results' / 'two_cameras.json')
-    asked = parser.parse_args(arguments)
+    asked = study.parser('two_cameras', __doc__, study.RESULTS / 'two_cameras.json', workers=False,
+                         pairs=(10, 'of each kind')).parse_args(arguments)
     found = json.loads(asked.output.read_text()) if asked.output.is_file() else []
     done = {(one['kind'], one['seed']) for one in found}
-    for seed in range(asked.pairs):
-        for kind in KINDS:
-            if (kind, seed) in done:
-                continue
+    for seed, kind in product(range(asked.pairs), KINDS):
+        if (kind, seed) not in done:
             found.append(tried(kind, seed))
-            lines = [json.dumps(one) for one in found]
-            sys.stdout.write(lines[-1] + '\n')
+            sys.stdout.write(json.dumps(found[-1]) + '\n')
             sys.stdout.flush()
-            write_text(asked.output, '[\n' + ',\n'.join(lines) + '\n]\n')
-    page = DOCS / 'results' / 'two_cameras.md'
-    between = f'{BEGIN}\n{section(found)}\n{END}'
-    write_text(page, re.sub(f'{BEGIN}.*{END}', lambda _: between, page.read_text(), flags=re.S))
+            write_text(asked.output, study.json_lines(found))
+    study.write_section(study.RESULTS / 'two_cameras.md', 'two cameras', section(found))
 
 
 if __name__ == '__main__':

@@ -4,31 +4,28 @@ Cameras calibrated in air (another noise than that of the photographs, so that t
 little off) photograph a board through a tilted port into a hidden medium, or do not: decoys look
 through a plate with air on both sides, have another focal length or another curve.  Lens and
 table alone are handed to `diagnose`; with --air the lens is what `calibrate` makes of photographs
-in air.  Rays are traced here by bisection, as nowhere else in the package.  Writes
+in air.  Rays are traced by bisection, as nowhere in the package.  Writes
 docs/results/water/trials.json.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
-from benchmark.workers import in_processes
+from benchmark import study
+from benchmark.boards import Seen, angle_behind_window, as_table, directions, grid
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import diagnose
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.scene.observations import Observations, make_observations
+from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.study.lens_trust import (
     assess_lens,
@@ -37,7 +34,6 @@ from fisheye_svp_ros.study.lens_trust import (
 )
 
 KINDS = ('water', 'water', 'water', 'plate', 'focal', 'curve', 'air')
-_HALVINGS = 60
 
 
 @dataclass(frozen=True)
@@ -62,21 +58,15 @@ class Outcome:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the trials, write them, print what came of them."""
-    parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.water')
-    parser.add_argument('--trials', type=int, default=120)
-    parser.add_argument('--rough', action='store_true', help='with errors of board and frames')
-    parser.add_argument('--air', action='store_true', help='lenses calibrated in air')
-    parser.add_argument('--workers', type=int, default=os.cpu_count())
-    parser.add_argument('-o', '--output', type=Path,
-                        default=Path('docs/results/water/trials.json'))
-    asked = parser.parse_args(arguments)
+    asked = study.parser(
+        'water', __doc__, study.RESULTS / 'water' / 'trials.json', trials=(120, 'of all kinds'),
+        rough=(False, 'with errors of board and frames'),
+        air=(False, 'lenses calibrated in air')).parse_args(arguments)
     run = partial(run_trial, rough=asked.rough, air=asked.air)
-    outcomes = in_processes('trials', run, range(asked.trials), asked.workers)
-    lines = ',\n'.join(json.dumps(asdict(one)) for one in outcomes)
-    command = f'python -m benchmark.water --trials {asked.trials}' + ' --rough' * asked.rough
-    command += ' --air' * asked.air
-    asked.output.parent.mkdir(parents=True, exist_ok=True)
-    write_text(asked.output, f'{{"command": "{command}", "trials": [\n{lines}\n]}}\n')
+    outcomes = study.in_processes('trials', run, range(asked.trials), asked.workers)
+    command = (f'python -m benchmark.water --trials {asked.trials}' + ' --rough' * asked.rough
+               + ' --air' * asked.air)
+    write_text(asked.output, study.json_lines(map(asdict, outcomes), command))
     sys.stdout.write(summary(outcomes))
 
 
@@ -193,13 +183,7 @@ def _through(
     z = points @ normal
     across = points - z[:, None] * normal
     r = np.linalg.norm(across, axis=-1)
-    low, high = np.zeros_like(r), np.full_like(r, np.pi / 2)
-    for _ in range(_HALVINGS):
-        angle = (low + high) / 2
-        glass, medium = np.arcsin(np.sin(angle) / 1.5), np.arcsin(np.sin(angle) / index)
-        reached = (distance * np.tan(angle) + thickness * np.tan(glass)
-                   + (z - distance - thickness) * np.tan(medium))
-        low, high = np.where(reached < r, angle, low), np.where(reached < r, high, angle)
+    angle = angle_behind_window(r, z, thickness, 1.5, distance, index)
     way = across / np.maximum(r, 1e-12)[:, None]
     ray = np.cos(angle)[:, None] * normal + np.sin(angle)[:, None] * way
     return np.where((z > distance + thickness)[:, None], _central(lens, ray), np.nan)
@@ -214,21 +198,20 @@ def _photographs(
     rough: the board is bent and its points are off, each photograph has a smooth error of its own,
     one point in a hundred is far off.
     """
-    x, y = np.meshgrid(np.arange(11), np.arange(8))
     size = rng.uniform(0.03, 0.06)
-    board = size * np.stack([x.ravel() - 5.0, y.ravel() - 3.5, 0.0 * x.ravel()], axis=-1)
+    board = grid(11, 8, size)
     shape = board
     if rough:
         bend = 2e-3 * (board[:, 0] / (5 * size)) ** 2
         shape = board + 1e-4 * rng.normal(size=board.shape) + bend[:, None] * [0.0, 0.0, 1.0]
-    frames, count = [], int(rng.integers(10, 25))
+    frames: list[Seen] = []
+    count = int(rng.integers(10, 25))
     while len(frames) < count:
         angle, azimuth = np.radians(rng.uniform(0, 45)), rng.uniform(0, 2 * np.pi)
         away = size * 11 * np.exp(rng.uniform(np.log(0.8), np.log(4.0)))
-        place = away * np.array([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth),
-                                 np.cos(angle)])
         turn = rotation_from_vector(rng.normal(size=3) * [0.4, 0.4, 1.0])
-        uv = see(Pose(turn, place).transform(shape)) + noise * rng.normal(size=(len(board), 2))
+        place = Pose(turn, away * directions(angle, azimuth))
+        uv = see(place.transform(shape)) + noise * rng.normal(size=(len(board), 2))
         if rough:
             wave, phase = rng.uniform(-0.01, 0.01, (2, 2)), rng.uniform(0, 2 * np.pi, 2)
             uv = uv + 0.15 * np.cos(np.nan_to_num(uv) @ wave + phase)
@@ -237,9 +220,7 @@ def _photographs(
         inside = ((uv > 0) & (uv < [lens.width, lens.height])).all(axis=-1)
         if inside.mean() > 0.7:
             frames.append((np.flatnonzero(inside), uv[inside]))
-    frame = np.concatenate([np.full(len(rows), i) for i, (rows, _) in enumerate(frames)])
-    rows = np.concatenate([rows for rows, _ in frames])
-    return make_observations(frame, rows, np.concatenate([uv for _, uv in frames]), board[rows])
+    return as_table(frames, board)
 
 
 if __name__ == '__main__':

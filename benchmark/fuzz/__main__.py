@@ -5,25 +5,20 @@ Each input follows from the name of its surface and its seed; `--only NAME --see
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import multiprocessing
-import os
-import re
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from random import Random
 
+from benchmark import study
 from benchmark.fuzz.surfaces import Surface
 from benchmark.fuzz.trials import LARGEST, SLOWEST, WAITING, Outcome, every, trial_of, work
 
 _HUNG = 60.0  # s without an answer, then a worker is ended
 _CHUNK = 500  # inputs of a task
-_DOC = Path(__file__).parents[2] / 'docs' / 'results' / 'reliability.md'
 Task = tuple[str, int, int]  # surface, first seed, number of seeds
-_BEGIN, _END = '<!-- fuzz -->', '<!-- end of fuzz -->'
 
 
 def _chunks(wanted: list[Surface], total: int, first: int) -> Iterator[Task]:
@@ -133,30 +128,25 @@ def section(outcomes: dict[str, Outcome], command: str) -> str:
         whole.add(outcome)
     said = ', '.join(f'{kind} {whole.faults[kind]}' for kind in (
         'crashed', 'hung or died', 'wrong', 'slow', 'large'))
-    lines = [
+    rows = [[name, one.tried, one.refused, *(one.faults[kind] for kind in (
+        'crashed', 'hung or died', 'wrong')), f'{one.slowest:.2f}', f'{one.largest:.0f}']
+            for name, one in outcomes.items()]
+    return '\n'.join([
         f'`{command}`: {whole.tried} inputs, {whole.refused} refused, {said}. Slow is above '
         f'{SLOWEST:g} s of processor time or {WAITING:g} s on the clock, large above {LARGEST:g} '
-        'MB of memory more than ever before.', '',
-        '| surface | inputs | refused | crashed | hung or died | wrong | slowest s | most MB |',
-        '| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |',
-    ]
-    for name, one in outcomes.items():
-        faults = ' | '.join(str(one.faults[kind]) for kind in ('crashed', 'hung or died', 'wrong'))
-        lines.append(f'| {name} | {one.tried} | {one.refused} | {faults} | {one.slowest:.2f} | '
-                     f'{one.largest:.0f} |')
-    return '\n'.join(lines)
+        'MB of memory more than ever before.', '', *study.table(
+            'surface | inputs | refused | crashed | hung or died | wrong | slowest s | most MB',
+            rows, numbers=True)])
 
 
 def main() -> int:
     """Run, print, write the section; return 1 where anything is at fault."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--inputs', type=int, default=1_000_000)
-    parser.add_argument('--first', type=int, default=0, help='the first seed of each surface')
-    parser.add_argument('--workers', type=int, default=os.cpu_count())
-    parser.add_argument('--only', default='', help='surfaces whose names contain this')
+    parser = study.parser(
+        'fuzz', __doc__, None, inputs=(1_000_000, 'of all surfaces'),
+        first=(0, 'the first seed of each surface'),
+        only=('', 'surfaces whose names contain this'),
+        no_docs=(False, 'leave docs/results/reliability.md alone'))
     parser.add_argument('--seed', type=int, help='try this one, here, and show what it raises')
-    parser.add_argument('--no-docs', action='store_true',
-                        help='leave docs/results/reliability.md alone')
     args = parser.parse_args()
     wanted = [surface for surface in every() if args.only in surface.name]
     if args.seed is not None:
@@ -170,9 +160,7 @@ def main() -> int:
         for line in outcome.told[:5]:
             print(line)
     if not args.only and not args.no_docs:
-        between = f'{_BEGIN}\n{text}\n{_END}'
-        old = _DOC.read_text()
-        _DOC.write_text(re.sub(f'{_BEGIN}.*{_END}', lambda _: between, old, flags=re.DOTALL))
+        study.write_section(study.RELIABILITY, 'fuzz', text)
     return int(any(outcome.faults for outcome in outcomes.values()))
 
 

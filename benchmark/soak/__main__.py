@@ -6,9 +6,7 @@ so that every message is accounted for; in the second, nodes are as by default a
 
 from __future__ import annotations
 
-import argparse
 import os
-import re
 import sys
 import tempfile
 import time
@@ -16,6 +14,7 @@ from pathlib import Path
 
 os.environ.setdefault('ROS_DOMAIN_ID', '77')
 
+from benchmark import study
 from benchmark.soak import answers
 from benchmark.soak.victims import KINDS, Victim, Watch, Wire
 from fisheye_svp_ros.reporting.terminal import progress
@@ -24,13 +23,11 @@ _AHEAD = 1000  # messages that a node has not counted, and sets that wait, in th
 _CHUNK = 100
 _LONG = 600.0  # s for all nodes to come up, on a machine that may be busy
 _STEADY = 0.2  # of a round, after which memory is compared
-_DOC = Path(__file__).parents[2] / 'docs' / 'results' / 'reliability.md'
-_BEGIN, _END = '<!-- soak -->', '<!-- end of soak -->'
 
 
 def round_of(
     names: list[str], total: int, exactly: bool, folder: Path, wire: Wire
-) -> tuple[list[str], list[str], int]:
+) -> tuple[list[list[object]], list[str], int]:
     """Attack nodes with `total` messages; return rows, faults, the number of messages sent."""
     watch = Watch(wire)
     victims = {name: Victim(name, wire, folder, exactly) for name in names}
@@ -43,7 +40,7 @@ def round_of(
 
 def _attacked(
     victims: dict[str, Victim], watch: Watch, total: int, exactly: bool
-) -> tuple[list[str], list[str], int]:
+) -> tuple[list[list[object]], list[str], int]:
     everybody = victims.values()
     if not watch.until(victims, lambda: all(v.connected() and v.counts for v in everybody), _LONG):
         raise SystemExit(f'not all nodes have come up: {[v.trouble() for v in everybody]}')
@@ -125,38 +122,35 @@ def grown(victim: Victim) -> float:
     return max(victim.memory) - max(early) if early else 0.0
 
 
-def row(victim: Victim, answers_well: str) -> str:
+def row(victim: Victim, answers_well: str) -> list[object]:
     """Return a row of the table."""
     counts = victim.counts
     unusable = '' if victim.name == 'detector' else victim.unusable.total()
     dropped = victim.received('dropped')
     sets = [counts.get(f'sets: {end}', '')
             for end in ('taken', 'solved', 'not solved', 'dropped', 'incomplete')]
-    cells = (victim.name, victim.hostile.total(), victim.sent.total(), victim.lost.total(),
-             victim.received(), victim.received('read'), unusable, dropped,
-             *sets, counts.get('internal errors', ''), f'{grown(victim):.0f}', answers_well)
-    return '| ' + ' | '.join(map(str, cells)) + ' |'
+    return [victim.name, victim.hostile.total(), victim.sent.total(), victim.lost.total(),
+            victim.received(), victim.received('read'), unusable, dropped, *sets,
+            counts.get('internal errors', ''), f'{grown(victim):.0f}', answers_well]
 
 
-def section(rounds: list[list[str]], total: int, how: str) -> str:
+def section(rounds: list[list[list[object]]], total: int, how: str) -> str:
     """Return the section of docs/results/reliability.md."""
-    head = ('| node | hostile | sent | lost by the sender | received | read | unusable | dropped '
-            '| sets taken | solved | not solved | sets dropped | incomplete | internal errors '
-            '| memory grown MB | answers |')
-    rule = '| --- ' + '| ---: ' * 14 + '| --- |'
-    lines = [f'`{how}`: {total} hostile messages.', '', 'All counted:', '', head, rule, *rounds[0],
-             '', 'Flooded, as nodes are by default:', '', head, rule, *rounds[1]]
-    return '\n'.join(lines)
+    counted, flooded = (study.table(
+        'node | hostile | sent | lost by the sender | received | read | unusable | dropped '
+        '| sets taken | solved | not solved | sets dropped | incomplete | internal errors '
+        '| memory grown MB | answers', rows, numbers=True) for rows in rounds)
+    return '\n'.join([f'`{how}`: {total} hostile messages.', '', 'All counted:', '', *counted,
+                      '', 'Flooded, as nodes are by default:', '', *flooded])
 
 
 def main() -> int:
     """Attack, write the section; return 1 where anything is at fault."""
-    parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.soak')
-    parser.add_argument('--messages', type=int, default=1_000_000)
-    parser.add_argument('--flood', type=float, default=0.2, help='share of the second round')
+    parser = study.parser(
+        'soak', __doc__, None, workers=False, messages=(1_000_000, 'hostile ones'),
+        flood=(0.2, 'share of the second round'),
+        no_docs=(False, 'leave docs/results/reliability.md alone'))
     parser.add_argument('--nodes', nargs='*', choices=KINDS, default=[*KINDS])
-    parser.add_argument('--no-docs', action='store_true',
-                        help='leave docs/results/reliability.md alone')
     asked = parser.parse_args()
     flood = round(asked.flood * asked.messages)
     wire = Wire()
@@ -169,9 +163,7 @@ def main() -> int:
     faults = [*first[1], *second[1]]
     print(*faults, sep='\n')
     if not asked.no_docs:
-        between = f'{_BEGIN}\n{text}\n{_END}'
-        old = _DOC.read_text()
-        _DOC.write_text(re.sub(f'{_BEGIN}.*{_END}', lambda _: between, old, flags=re.DOTALL))
+        study.write_section(study.RELIABILITY, 'soak', text)
     return int(bool(faults))
 
 

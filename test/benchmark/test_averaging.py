@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmark.averaging import Outcome, draw_lens, draw_set, image_points, report
-from benchmark.true_rays import ray_error
+from benchmark.study import ray_error
 from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.optics.curves import Gennery
 

@@ -6,7 +6,7 @@ from functools import reduce
 import numpy as np
 from helpers.scenes import lens, observe, scene
 
-from benchmark.true_rays import ray_error
+from benchmark.study import ray_error
 from fisheye_svp_ros.diagnosis import NullModel
 from fisheye_svp_ros.diagnosis.lens_covariance import LensCovariance
 from fisheye_svp_ros.diagnosis.lens_evidence import _distances
