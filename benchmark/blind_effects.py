@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from benchmark import blind_optics as optics
-from benchmark.blind_hidden import Hidden, Rng, moved, plane_of, unit
-from benchmark.blind_scene import Needs, Scene, World
+from benchmark.blind_scene import Hidden, Needs, Scene, World, moved, plane_of
+from benchmark.boards import Rng, unit
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 

@@ -9,7 +9,6 @@ those that are there, and writes docs/results/blind_images.md of all.
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 from collections import Counter
@@ -21,8 +20,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from benchmark.blind_figures import Rate
+from benchmark import study
 from benchmark.blind_motion import Swing, of_rows, swing
+from benchmark.boards import Rng
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.detect.detection import detect
 from fisheye_svp_ros.detect.patterns import parse_pattern
@@ -30,20 +30,17 @@ from fisheye_svp_ros.detect.photographs import find_photographs
 from fisheye_svp_ros.diagnosis import diagnose
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import FisheyeSvpError
-from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.reporting.terminal import progress
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.simulate.render import Exposure, Field, Print, render
 from fisheye_svp_ros.simulate.targets import board_views
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.measured_poses import localize_measured, rms_px
 
-PAGE = Path('docs/results/blind_images.md')
-KEPT = Path('docs/results/blind/images.jsonl')
+KEPT = study.RESULTS / 'blind' / 'images.jsonl'
 BOARD = 'chessboard:9x6:25mm'
 NOISE = 0.0053  # px, of a corner's u and v in these photographs
 PHOTOGRAPHS = 20
@@ -52,8 +49,6 @@ LENS = Lens('blind', 640, 600, 214.0, 214.3, 320.4, 298.8, KannalaBrandt(-0.01, 
             np.radians(94.0))
 PLAIN = Print(9, 6, 0.025)
 NOTHING = '-'
-
-Rng = np.random.Generator
 
 
 class World(NamedTuple):
@@ -237,7 +232,9 @@ def _field(world: World, lens: Lens, pose: Pose) -> Field | None:
 def photographs(effect: str, size: float, seed: int, folder: str) -> World:
     """Render the photographs of a trial into a folder; return what was done in them."""
     rng = np.random.default_rng([seed, sum(map(ord, effect))])
-    swung = _moving(rng) if effect == 'rolling_shutter' else Swing(
+    swung = swing(
+        LENS, PLAIN.corners, PLAIN.columns, np.arange(PHOTOGRAPHS) / RATE, rng,
+    ) if effect == 'rolling_shutter' else Swing(
         board_views(LENS, PLAIN, PHOTOGRAPHS, (0.1, 0.28), rng), np.zeros((PHOTOGRAPHS, 6)))
     world = (CLEAN | ASIDE).get(effect)
     if world is None:
@@ -256,10 +253,6 @@ def photographs(effect: str, size: float, seed: int, folder: str) -> World:
         for i, image in enumerate(images):
             cv2.imwrite(f'{folder}/{i:02d}.png', image)
     return world
-
-
-def _moving(rng: Rng) -> Swing:
-    return swing(LENS, PLAIN.corners, PLAIN.columns, np.arange(PHOTOGRAPHS) / RATE, rng)
 
 
 def _write_video(path: str, images: Sequence[Array]) -> None:
@@ -308,7 +301,7 @@ def load() -> list[Trial]:
     return list({(t.effect, t.size, t.seed): t for t in trials}.values())
 
 
-def report(trials: Sequence[Trial], size: float) -> str:
+def report(trials: Sequence[Trial], size: float) -> list[str]:
     """Return the page."""
     mine = [trial for trial in trials if trial.size == size]
     hidden = [t for t in mine if t.effect in HIDDEN]
@@ -318,6 +311,8 @@ def report(trials: Sequence[Trial], size: float) -> str:
                          for names in t.named or [[NOTHING]]) for e in (*HIDDEN, *CLEAN, *ASIDE)}
     others = {name for c in counts.values() for name in c} - {*HIDDEN, NOTHING}
     columns = [*HIDDEN, *sorted(others), NOTHING]
+    rows = [[effect, sum(t.effect == effect for t in mine),
+             *(count[name] or '' for name in columns)] for effect, count in counts.items()]
     lines = [
         '# Blind tests through images', '',
         f'The effect was named in {_rate([t.hit for t in hidden])} of the sets. Unlike in '
@@ -334,28 +329,22 @@ def report(trials: Sequence[Trial], size: float) -> str:
         'Intervals are 95 %.', '', '```bash',
         f'python -m benchmark.blind_images --trials {len(hidden)}', '```', '',
         f'- effect named: {_rate([t.hit for t in hidden])}',
-        '- nothing else named: '
-        + _rate([t.hit and len(t.named) == 1 for t in hidden]),
+        f'- nothing else named: {_rate([t.hit and len(t.named) == 1 for t in hidden])}',
         f'- clean photographs found adequate: {_rate([t.verdict == "adequate" for t in clean])}',
         f'- no effect named in them: {_rate([not t.named for t in clean])}',
         '- over-exposed: `detect` reports all photographs in '
         f'{_rate([t.odd == PHOTOGRAPHS for t in aside])}; still found adequate: '
         f'{_rate([t.verdict == "adequate" for t in aside])}', '',
         'Trials by hidden effect (rows) and named effect (columns):', '',
-        '| hidden | trials | ' + ' | '.join(columns) + ' |', '|---' * (len(columns) + 2) + '|',
+        *study.table('hidden | trials | ' + ' | '.join(columns), [row for row in rows if row[1]]),
     ]
-    for effect, count in counts.items():
-        trials_of = sum(t.effect == effect for t in mine)
-        if trials_of:
-            lines.append(f'| {effect} | {trials_of} | ' + ' | '.join(
-                str(count[name] or '') for name in columns) + ' |')
     failed = [t for t in hidden if not t.hit] + [t for t in clean if t.verdict != 'adequate']
     if failed:
         lines += ['', 'Every trial that failed:', '', *(
             f'- {t.effect} #{t.seed}: {t.verdict}; named: '
             f'{", ".join(" or ".join(names) for names in t.named) or "nothing"}; '
             f'left: {", ".join(t.left) or "nothing"}' for t in failed)]
-    return '\n'.join(lines) + '\n'
+    return lines
 
 
 def _shown(trial: Trial, names: list[str]) -> str:
@@ -363,28 +352,27 @@ def _shown(trial: Trial, names: list[str]) -> str:
 
 
 def _rate(results: Sequence[bool]) -> str:
-    found = Rate(sum(results), len(results))
-    low, high = found.interval if results else (0.0, 1.0)
+    found = study.Rate.of(results)
+    low, high = found.interval
     return f'{found}, {100 * low:.0f} to {100 * high:.0f} %'
 
 
 def main() -> None:
     """Run the trials that are not there yet, and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--trials', type=int, default=100, help='with an effect (100)')
-    parser.add_argument('--size', type=float, default=1.0, help='times the noise')
-    parser.add_argument('--seed', type=int, default=0)
-    args = parser.parse_args()
+    args = study.parser(
+        'blind_images', __doc__, None, workers=False, trials=(100, 'with an effect (100)'),
+        size=(1.0, 'times the noise'), seed=(0, 'of the first of each effect')).parse_args()
     done = {(t.effect, t.size, t.seed) for t in load()}
-    tasks = [(effect, seed) for effect, seed in todo(args.trials, args.seed)
-             if (effect, args.size, seed) not in done]
-    with progress('blind images', len(tasks)) as advance:
-        for effect, seed in tasks:
-            trial = run_trial(effect, args.size, seed)
-            with KEPT.open('a') as file:
-                file.write(json.dumps(asdict(trial)) + '\n')
-            advance()
-    write_text(PAGE, report(load(), args.size))
+
+    def keep(task: tuple[str, int]) -> None:
+        trial = run_trial(task[0], args.size, task[1])
+        with KEPT.open('a') as file:
+            file.write(json.dumps(asdict(trial)) + '\n')
+
+    study.in_turn('blind images', keep, [
+        (effect, seed) for effect, seed in todo(args.trials, args.seed)
+        if (effect, args.size, seed) not in done])
+    study.write_lines(study.RESULTS / 'blind_images.md', report(load(), args.size))
 
 
 if __name__ == '__main__':

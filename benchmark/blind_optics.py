@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmark.blind_hidden import Hidden, Rng, centre_of, focal_of, unit
-from benchmark.blind_scene import Scene, World
+from benchmark.blind_scene import Hidden, Scene, World, centre_of, focal_of, imaged
+from benchmark.boards import Rng, angle_behind_window, unit
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.optics.curve_base import ImageHeight
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, Gennery
@@ -103,14 +103,9 @@ def aspect(scene: Scene, rng: Rng) -> Hidden:
 
 def skew(scene: Scene, rng: Rng) -> Hidden:
     sign, lens = rng.choice([-1.0, 1.0]), scene.lens
-
-    def world(world: World, amount: float) -> World:
-        shear = sign * amount * lens.fx / lens.fy
-        return world.mapped(
-            lambda uv: uv + shear * (uv[..., 1:] - lens.cy) * np.array([1.0, 0.0])
-        )
-
-    return Hidden(1e-4, world=world, truth=lambda a: {'shear': sign * a})
+    slope = sign * lens.fx / lens.fy * np.array([1.0, 0.0])
+    return Hidden(1e-4, world=imaged(lambda uv, a: uv + a * slope * (uv[..., 1:] - lens.cy)),
+                  truth=lambda a: {'shear': sign * a})
 
 
 def decentering(scene: Scene, rng: Rng) -> Hidden:
@@ -118,19 +113,14 @@ def decentering(scene: Scene, rng: Rng) -> Hidden:
     way, power = unit(rng, 2), rng.uniform(0.05, 0.2)
     centre, focal = centre_of(scene.lens), focal_of(scene.lens)
 
-    def world(world: World, amount: float) -> World:
-        off = amount * way
+    def bent(m: Array) -> Array:
+        return np.asarray(m + power * (m * m).sum(axis=-1, keepdims=True) * m)
 
-        def bent(m: Array) -> Array:
-            return np.asarray(m + power * (m * m).sum(axis=-1, keepdims=True) * m)
+    def change(uv: Array, amount: float) -> Array:
+        m, off = (uv - centre) / focal, amount * way
+        return np.asarray(uv + focal * (bent(m - off) + off - bent(m)))
 
-        def mapping(uv: Array) -> Array:
-            m = (uv - centre) / focal
-            return np.asarray(uv + focal * (bent(m - off) + off - bent(m)))
-
-        return world.mapped(mapping)
-
-    return Hidden(1e-4, world=world)
+    return Hidden(1e-4, world=imaged(change))
 
 
 def sensor_tilt(scene: Scene, rng: Rng) -> Hidden:
@@ -138,21 +128,17 @@ def sensor_tilt(scene: Scene, rng: Rng) -> Hidden:
     angle, lens = rng.uniform(0, 2 * np.pi), scene.lens
     centre, focal = centre_of(lens), focal_of(lens)
 
-    def world(world: World, amount: float) -> World:
+    def change(uv: Array, amount: float) -> Array:
         turn = rotation_from_vector(amount * np.array([np.cos(angle), np.sin(angle), 0.0]))
-
-        def mapping(uv: Array) -> Array:
-            m = (uv - centre) / focal
-            ray = np.concatenate([m, np.ones_like(m[..., :1])], axis=-1)
-            # The pupil is at (0, 0, -1), the plane passes through the origin.
-            along = turn[2, 2] / (ray @ turn[:, 2])
-            met = along[..., None] * ray - np.array([0.0, 0.0, 1.0])
-            return np.asarray(centre + focal * (met @ turn[:, :2]))
-
-        return world.mapped(mapping)
+        m = (uv - centre) / focal
+        ray = np.concatenate([m, np.ones_like(m[..., :1])], axis=-1)
+        # The pupil is at (0, 0, -1), the plane passes through the origin.
+        along = turn[2, 2] / (ray @ turn[:, 2])
+        met = along[..., None] * ray - np.array([0.0, 0.0, 1.0])
+        return np.asarray(centre + focal * (met @ turn[:, :2]))
 
     return Hidden(
-        1e-4, world=world,
+        1e-4, world=imaged(change),
         truth=lambda a: {'about_x': a * np.cos(angle), 'about_y': a * np.sin(angle)},
     )
 
@@ -161,24 +147,19 @@ def flat_port(scene: Scene, rng: Rng) -> Hidden:
     """Every ray is traced through the window, Snell's law on both faces."""
     index = float(rng.choice([1.47, 1.49, 1.52]))
 
-    def optics(lens: Lens, points: Array, thickness: float) -> Array:
-        radius, z = np.linalg.norm(points[..., :2], axis=-1), points[..., 2]
-        low, high = np.zeros_like(z), np.full_like(z, np.pi / 2 - 1e-6)
-        shift = lens.viewpoint_shift
-        for _ in range(52):
-            theta = (low + high) / 2
-            origin = shift.value_and_slope(theta, np.tan(theta / 2))[0] if shift else 0.0
-            inside = np.arcsin(np.sin(theta) / index)
-            reached = (z - thickness - origin) * np.tan(theta) + thickness * np.tan(inside)
-            short = reached < radius
-            low, high = np.where(short, theta, low), np.where(short, high, theta)
-        way = points[..., :2] / np.maximum(radius, 1e-12)[..., None]
-        height = lens.image_height.value_and_slope(theta)[0]
-        uv = centre_of(lens) + np.array([lens.fx, lens.fy]) * height[..., None] * way
-        return np.where((z > 0.02)[..., None], uv, np.nan)
+    def world(world: World, thickness: float) -> World:
+        def optics(lens: Lens, points: Array) -> Array:
+            radius, z = np.linalg.norm(points[..., :2], axis=-1), points[..., 2]
+            shift = lens.viewpoint_shift
+            theta = angle_behind_window(
+                radius, z, thickness, index, origin=lambda angle: shift.value_and_slope(
+                    angle, np.tan(angle / 2))[0] if shift else 0.0)
+            way = points[..., :2] / np.maximum(radius, 1e-12)[..., None]
+            height = lens.image_height.value_and_slope(theta)[0]
+            uv = centre_of(lens) + focal_of(lens) * height[..., None] * way
+            return np.where((z > 0.02)[..., None], uv, np.nan)
 
-    def world(world: World, amount: float) -> World:
-        return replace(world, optics=lambda lens, points: optics(lens, points, amount))
+        return replace(world, optics=optics)
 
     return Hidden(1e-4, world=world, detail=f'index {index}')
 
@@ -189,13 +170,9 @@ def focal_drift(scene: Scene, rng: Rng) -> Hidden:
     pace = duration * rng.uniform(0.2, 1.5)
     warm = 1 - np.exp(-(scene.times - scene.times[0]) / pace)
     warm = (warm - warm.mean())[scene.frame] * rng.choice([-1.0, 1.0])
-    centre = centre_of(scene.lens)
-
-    def world(world: World, amount: float) -> World:
-        growth = amount * warm[:, None, None]
-        return world.mapped(lambda uv: uv + growth * (uv - centre))
-
-    return Hidden(1e-4, world=world, detail=f'pace {pace / duration:.2f}')
+    growth, centre = warm[:, None, None], centre_of(scene.lens)
+    return Hidden(1e-4, world=imaged(lambda uv, a: uv + a * growth * (uv - centre)),
+                  detail=f'pace {pace / duration:.2f}')
 
 
 def session_step(scene: Scene, rng: Rng) -> Hidden:
@@ -204,28 +181,22 @@ def session_step(scene: Scene, rng: Rng) -> Hidden:
     way = unit(rng, 3) * (1.0, 300.0, 300.0)
     centre = centre_of(scene.lens)
 
-    def world(world: World, amount: float) -> World:
-        def mapping(uv: Array) -> Array:
-            return np.asarray(uv + after * amount * (way[0] * (uv - centre) + way[1:]))
-
-        return world.mapped(mapping)
-
-    return Hidden(1e-4, world=world, detail=f'from frame {start}')
+    return Hidden(
+        1e-4, world=imaged(lambda uv, a: uv + after * a * (way[0] * (uv - centre) + way[1:])),
+        detail=f'from frame {start}')
 
 
 def detector_bias(scene: Scene, rng: Rng) -> Hidden:
     """Peak locking: towards the middle of the pixels or away from it, not quite a sine."""
     sign, sharpness = rng.choice([-1.0, 1.0]), float(rng.choice([0.0, 0.2, 0.4]))
 
-    def world(world: World, amount: float) -> World:
-        def mapping(uv: Array) -> Array:
-            phase = 2 * np.pi * uv
-            return np.asarray(uv + sign * amount * np.sin(phase) / (1 + sharpness * np.cos(phase)))
-
-        return world.mapped(mapping)
+    def change(uv: Array, amount: float) -> Array:
+        phase = 2 * np.pi * uv
+        return np.asarray(uv + sign * amount * np.sin(phase) / (1 + sharpness * np.cos(phase)))
 
     # Beyond the largest one, the order of two points within a pixel would change.
     return Hidden(
-        0.01, largest=(1 - sharpness) / (2 * np.pi), world=world, detail=f'sharpness {sharpness}',
+        0.01, largest=(1 - sharpness) / (2 * np.pi), world=imaged(change),
+        detail=f'sharpness {sharpness}',
         truth=lambda a: {} if sharpness else {'sine': sign * a},
     )

@@ -1,4 +1,7 @@
-"""The yardstick: the likelihood-ratio test that is told which effect to look for."""
+"""The yardstick: the likelihood-ratio test that is told which effect to look for.
+
+Its algebra is its own: plain least squares beside what is free.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,55 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import optimize, stats
 
-from benchmark.blind_hidden import Hidden
-from benchmark.blind_projection import Nuisance, basis
-from benchmark.blind_scene import Scene, World
-from fisheye_svp_ros.arrays import Array
+from benchmark.blind_scene import Hidden, Scene
+from fisheye_svp_ros.arrays import Array, flat_rows
 from fisheye_svp_ros.diagnosis import SIGNIFICANCE
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
+from fisheye_svp_ros.mixed_model import group_basis
 from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, group_by_frame
+
+IDENTIFIABLE = 1e-4  # of a column's norm: what is left less cannot be told from what is free
+
+
+class Nuisance:
+    """The space of what is free: poses, rig, intrinsics.
+
+    residual (F, M): the whitened residual outside that space; rows, rank: its dimensions.
+    """
+
+    def __init__(self, linear: Linearization) -> None:
+        self.shape = linear.residual.shape
+        self.rows = int(linear.row_mask.sum())
+        self._blocks = group_basis(linear.frame_columns)
+        norms = np.sqrt((linear.shared_columns**2).sum(axis=(0, 1)))
+        self._shared = basis(self.outside_blocks(linear.shared_columns), norms)
+        blocks = int((np.abs(self._blocks).sum(axis=1) > 0).sum())
+        self.rank = blocks + self._shared.shape[-1]
+        self.residual = self.outside(linear.residual[..., None])[..., 0]
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of the residual."""
+        return self.rows - self.rank
+
+    def outside(self, columns: Array) -> Array:
+        """Return columns (F, M, P) less their part inside the space."""
+        flat = flat_rows(self.outside_blocks(columns))
+        return (flat - self._shared @ (self._shared.T @ flat)).reshape(columns.shape)
+
+    def outside_blocks(self, columns: Array) -> Array:
+        """Return columns (F, M, P) less what poses take up of them."""
+        return columns - self._blocks @ (np.swapaxes(self._blocks, -1, -2) @ columns)
+
+
+def basis(columns: Array, norms: Array) -> Array:
+    """Return an orthonormal basis (rows, R) of columns (F, M, P), relative to norms (P,)."""
+    flat = flat_rows(columns) / np.maximum(norms, 1e-300)
+    u, s, _ = np.linalg.svd(flat, full_matrices=False)
+    return np.asarray(u[:, s > IDENTIFIABLE])
 
 
 class LinearScene:
@@ -53,13 +95,6 @@ class LinearScene:
         rows = self.nuisance.outside_blocks(self.rows(seen - self.ideal)[..., None])
         return float(np.sqrt(2 * (rows**2).sum() / self.nuisance.rows)) * self.scene.noise
 
-    @staticmethod
-    def angles(world: World) -> Array:
-        """Incidence angles (S, N), rad, as far as scatter is concerned."""
-        places = world.in_camera(world.points, world.times[:, None])
-        off_axis = np.linalg.norm(places[..., :2], axis=-1)
-        return np.asarray(np.arctan2(off_axis, places[..., 2]))
-
 
 def oracle_finds(
     linear: LinearScene, name: str, hidden: Hidden, amount: float, given: Array
@@ -72,7 +107,7 @@ def oracle_finds(
     rows = linear.rows(given - linear.ideal)
     residual = linear.nuisance.outside(rows[..., None])[..., 0]
     level = SIGNIFICANCE / _testable(linear)
-    if hidden.moves:
+    if hidden.world:
         moved = hidden.world(linear.scene.world(), amount).image() - linear.ideal
         return _f_test(linear, name, linear.rows(moved), residual, level)
     if name == 'noise_vs_angle':

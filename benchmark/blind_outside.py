@@ -1,4 +1,7 @@
-"""Effects that no catalogue holds: they must come out as unexplained, without a name."""
+"""What no catalogue holds: effects that must come out without a name, and what real data have.
+
+Real data have local errors of target, frames and image of their own, which have no name.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmark.blind_hidden import Hidden, Rng
-from benchmark.blind_scene import Scene, World
+from benchmark.blind_scene import Hidden, Scene, World, centre_of, imaged
+from benchmark.boards import Rng, draw_fields
 from fisheye_svp_ros.arrays import Array
+
+_OUTLYING = 0.01  # at most so many points
+_BUMPS = 12
 
 
 def ripple(scene: Scene, rng: Rng) -> Hidden:
@@ -51,16 +57,15 @@ def wobble(scene: Scene, rng: Rng) -> Hidden:
 
 def colour(scene: Scene, rng: Rng) -> Hidden:
     """Every other landmark shines in another colour, which the lens magnifies more."""
-    odd = (scene.landmark % 2 - 0.5)[None, :, None]
-    centre = np.array([scene.lens.cx, scene.lens.cy])
-    return Hidden(1e-5, world=lambda w, a: w.mapped(lambda uv: uv + a * odd * (uv - centre)))
+    odd, centre = (scene.landmark % 2 - 0.5)[None, :, None], centre_of(scene.lens)
+    return Hidden(1e-5, world=imaged(lambda uv, a: uv + a * odd * (uv - centre)))
 
 
 def centre_swing(scene: Scene, rng: Rng) -> Hidden:
     """The principal point swings with time (a stabilised lens)."""
     swing = np.sin(rng.uniform(3, 8) * scene.times + rng.uniform(0, 2 * np.pi))[scene.frame]
     moves = swing[:, None, None] * rng.normal(size=2)
-    return Hidden(0.01, world=lambda w, a: w.mapped(lambda uv: uv + a * moves))
+    return Hidden(0.01, world=imaged(lambda uv, a: uv + a * moves))
 
 
 # Each with the variables of which the report should name one.
@@ -75,10 +80,35 @@ OUTSIDE: dict[str, tuple[Callable[[Scene, Rng], Hidden], frozenset[str]]] = {
 
 
 def _warped(scene: Scene, change: Callable[[Array], Array]) -> Hidden:
-    lens = scene.lens
-    centre, edge = np.array([lens.cx, lens.cy]), lens.width / 2
+    centre, edge = centre_of(scene.lens), scene.lens.width / 2
+    return Hidden(0.01, world=imaged(lambda uv, a: uv + a * change((uv - centre) / edge)))
+
+
+def background(scene: Scene, rng: Rng) -> Callable[[World, float], World]:
+    """Draw local errors; what it returns adds them, of an amount, to a world.
+
+    Offsets of single landmarks, a smooth static field over the image and one of each frame, in
+    parts that are drawn too.
+    """
+    parts = rng.dirichlet(np.ones(3))
+    offsets = rng.normal(size=scene.points.shape) * parts[0]
+    distance = np.median(np.linalg.norm(scene.points - scene.points.mean(axis=0), axis=1))
+    static, framed = (draw_fields(scene.lens, rng, count, _BUMPS, (0.1, 0.4))
+                      for count in (1, int(scene.frame.max()) + 1))
 
     def world(world: World, amount: float) -> World:
-        return world.mapped(lambda uv: uv + amount * change((uv - centre) / edge))
+        moved = replace(world, points=world.points + amount * offsets * distance / scene.lens.fx)
+        return moved.mapped(lambda uv: uv + amount * (
+            parts[1] * static(uv, np.zeros(len(uv), dtype=np.int64))
+            + parts[2] * framed(uv, scene.frame)
+        ))
 
-    return Hidden(0.01, world=world)
+    return world
+
+
+def with_outliers(given: Array, scene: Scene, rng: Rng) -> Array:
+    """Return image points (S, N, 2) of which a random few lie 10 to 100 times the noise off."""
+    few = rng.random(given.shape[:2]) < rng.uniform(0, _OUTLYING)
+    turn = rng.uniform(0, 2 * np.pi, given.shape[:2])
+    far = scene.noise * 10 ** rng.uniform(1, 2, given.shape[:2])
+    return given + (few * far)[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)

@@ -1,4 +1,4 @@
-"""Random scenes for blind tests, and what a camera really sees in them.
+"""Random scenes for blind tests, what a camera really sees in them, and what may hide there.
 
 The forward chain here is its own: poses at the instant of every point, exact geometry.  From the
 package come the lens as it is handed over and its projection, rigid transforms and the table.
@@ -6,12 +6,13 @@ package come the lens as it is handed over and its projection, rigid transforms 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from benchmark.boards import Rng, directions, facing
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
@@ -111,10 +112,6 @@ class Scene:
         )
 
 
-def _plain(lens: Lens, points: Array) -> Array:
-    return project(lens, points).uv
-
-
 @dataclass(frozen=True)
 class World:
     """What really happens; a hidden effect replaces one part.
@@ -129,7 +126,7 @@ class World:
     times: Array
     points: Array
     lens: Lens
-    optics: Callable[[Lens, Array], Array] = _plain
+    optics: Callable[[Lens, Array], Array] = lambda lens, points: project(lens, points).uv
     mappings: tuple[Callable[[Array], Array], ...] = ()
     readout: float = 0.0
     dots: Array | None = None
@@ -145,6 +142,17 @@ class World:
         rims = self.points[:, :, None] + self.dots
         corners = self._seen(rims.reshape(len(rims), -1, 3)).reshape(*rims.shape[:3], 2)
         return _area_centroid(corners)
+
+    @property
+    def places(self) -> Array:
+        """Where the landmarks (S, N, 3) are in the cameras."""
+        return self.in_camera(self.points, self.times[:, None])
+
+    @property
+    def angles(self) -> Array:
+        """Incidence angles (S, N), rad."""
+        places = self.places
+        return np.asarray(np.arctan2(np.linalg.norm(places[..., :2], axis=-1), places[..., 2]))
 
     def in_camera(self, points: Array, t: Array) -> Array:
         """Return points (S, N, 3) in the cameras at instants (S, N) or (S, 1)."""
@@ -174,7 +182,7 @@ def _area_centroid(corners: Array) -> Array:
 
 
 def draw_scene(
-    rng: np.random.Generator, needs: Needs, held_out: bool = False, landmarks: int = 54
+    rng: Rng, needs: Needs, held_out: bool = False, landmarks: int = 54
 ) -> Scene:
     """Draw a scene that has what is needed, with frames in between to hold out if asked for.
 
@@ -205,9 +213,7 @@ def draw_scene(
 
 def _visible(scene: Scene) -> Mask:
     world = scene.world()
-    places = world.in_camera(world.points, world.times[:, None])
-    distance = np.linalg.norm(places, axis=-1)
-    theta = np.arctan2(np.linalg.norm(places[..., :2], axis=-1), places[..., 2])
+    distance, theta = np.linalg.norm(world.places, axis=-1), world.angles
     uv = world.image()
     size = np.array([scene.lens.width, scene.lens.height])
     inside = np.isfinite(uv).all(axis=-1) & (uv > 2).all(axis=-1) & (uv < size - 3).all(axis=-1)
@@ -215,7 +221,7 @@ def _visible(scene: Scene) -> Mask:
     return np.asarray(inside & near & (theta < scene.lens.max_incidence - _EDGE))
 
 
-def _draw_lens(rng: np.random.Generator, needs: Needs) -> tuple[Lens, bool]:
+def _draw_lens(rng: Rng, needs: Needs) -> tuple[Lens, bool]:
     """Return a lens and whether its intrinsics are free."""
     names = list(_LENSES)
     if needs.fixed_intrinsics:
@@ -238,7 +244,7 @@ def _draw_lens(rng: np.random.Generator, needs: Needs) -> tuple[Lens, bool]:
     return Lens(name, size, size, f, f, cx, cy, curve, edge, shift), True
 
 
-def _draw_trajectory(rng: np.random.Generator) -> Trajectory:
+def _draw_trajectory(rng: Rng) -> Trajectory:
     size = np.array([0.16, 0.16, 0.2, 0.3, 0.3, 0.7]) * rng.uniform(0.7, 1.2)
     share = rng.dirichlet(np.ones(3), size=6).T
     return Trajectory(
@@ -246,7 +252,7 @@ def _draw_trajectory(rng: np.random.Generator) -> Trajectory:
     )
 
 
-def _draw_rig(rng: np.random.Generator, stereo: bool) -> Pose:
+def _draw_rig(rng: Rng, stereo: bool) -> Pose:
     rig = identity(1 + stereo)
     if stereo:
         rig.position[1] = np.array([0.15, 0.0, 0.0]) + 0.005 * rng.normal(size=3)
@@ -255,7 +261,7 @@ def _draw_rig(rng: np.random.Generator, stereo: bool) -> Pose:
     return rig
 
 
-def _boards(rng: np.random.Generator, count: int) -> tuple[Array, Index]:
+def _boards(rng: Rng, count: int) -> tuple[Array, Index]:
     """Return the points of three or four flat boards about the axis, and their labels."""
     boards = int(rng.integers(3, 5))
     across = 4 if boards == 4 else 5
@@ -266,25 +272,66 @@ def _boards(rng: np.random.Generator, count: int) -> tuple[Array, Index]:
     for number in range(boards):
         azimuth = first + 2 * np.pi * (number + rng.uniform(-0.25, 0.25)) / boards
         theta = rng.uniform(0.2, 0.95)
-        gaze = np.array([
-            np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)
-        ])
+        gaze = directions(theta, azimuth)
         distance = np.exp(rng.uniform(np.log(0.5), np.log(1.9)))
         width = distance * rng.uniform(0.4, 0.9)
         # Facing the camera, then tilted.
-        side = np.cross([0.0, 1.0, 0.0], gaze)
-        side /= np.linalg.norm(side)
-        facing = np.stack([side, np.cross(gaze, side), gaze], axis=1)
-        axes = facing @ rotation_from_vector(rng.uniform(-0.6, 0.6, 3))
+        axes = facing(gaze) @ rotation_from_vector(rng.uniform(-0.6, 0.6, 3))
         points.append(distance * gaze + width * grid @ axes[:, :2].T)
     return np.concatenate(points), np.repeat(np.arange(boards), len(grid))
 
 
-def _cloud(rng: np.random.Generator, count: int, lens: Lens) -> tuple[Array, Index]:
+def _cloud(rng: Rng, count: int, lens: Lens) -> tuple[Array, Index]:
     """Return points all about the camera, on one rigid structure."""
     edge = np.cos(min(lens.max_incidence - 0.35, 1.35))
     cos, azimuth = rng.uniform(edge, 1.0, count), rng.uniform(0, 2 * np.pi, count)
-    sin = np.sqrt(1 - cos * cos)
-    gaze = np.stack([sin * np.cos(azimuth), sin * np.sin(azimuth), cos], axis=-1)
+    gaze = directions(np.arccos(cos), azimuth)
     distance = np.exp(rng.uniform(np.log(0.5), np.log(2.2), count))
     return gaze * distance[:, None], np.zeros(count, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """One effect with its structure drawn and its amount left open.
+
+    start: an amount that would be small; largest: the largest that can be; lasting: whether other
+    frames show the same; world: what really happens for an amount, where image points move;
+    scatter: factor (S, N, 1 or 2) on the noise; recorded: what the table gets, the amount in px;
+    detail: the structure; truth: the values of the catalogue's parameters for an amount, where
+    it has the same ones.
+    """
+
+    start: float = 1e-3
+    largest: float = np.inf
+    lasting: bool = True
+    world: Callable[[World, float], World] | None = None
+    scatter: Callable[[Array, float, Rng], Array | float] | None = None
+    recorded: Callable[[Array, float, Rng], Array] | None = None
+    detail: str = ''
+    truth: Callable[[float], Mapping[str, float]] = lambda amount: {}
+
+
+def imaged(change: Callable[[Array, float], Array]) -> Callable[[World, float], World]:
+    """Move image points, px: the change takes them and the amount, and returns where they are."""
+    return lambda world, amount: world.mapped(lambda uv: change(uv, amount))
+
+
+def moved(moves: Array) -> Callable[[World, float], World]:
+    """Move the landmarks along (N, 3), m for a unit amount."""
+    return lambda world, amount: replace(world, points=world.points + amount * moves)
+
+
+def centre_of(lens: Lens) -> Array:
+    """Return the principal point, px."""
+    return np.array([lens.cx, lens.cy])
+
+
+def focal_of(lens: Lens) -> Array:
+    """Return the focal lengths along u and v, px."""
+    return np.array([lens.fx, lens.fy])
+
+
+def plane_of(points: Array) -> tuple[Array, Array]:
+    """Return the centre and the axes (3, 3; rows, the normal last) of flat points."""
+    centre = points.mean(axis=0)
+    return centre, np.linalg.svd(points - centre)[2]

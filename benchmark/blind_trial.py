@@ -8,12 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmark.blind_background import background, with_outliers
 from benchmark.blind_effects import HIDDEN
-from benchmark.blind_hidden import Hidden
 from benchmark.blind_oracle import LinearScene, oracle_finds
-from benchmark.blind_outside import OUTSIDE
-from benchmark.blind_scene import Needs, Scene, World, draw_scene
+from benchmark.blind_outside import OUTSIDE, background, with_outliers
+from benchmark.blind_scene import Hidden, Needs, Scene, World, draw_scene
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import Diagnosis, EffectTests, NullModel, diagnose
 from fisheye_svp_ros.mixed_model import eliminate
@@ -49,11 +47,11 @@ class Outcome:
     task: Task
     scene: str
     hidden: list[str]
-    verdict: str
-    causes: dict[str, list[str]]
-    remaining: list[str]
-    hit: bool
-    extra: list[str]
+    verdict: str = ''
+    causes: dict[str, list[str]] = field(default_factory=dict)
+    remaining: list[str] = field(default_factory=list)
+    hit: bool = False
+    extra: list[str] = field(default_factory=list)
     oracle: list[bool] = field(default_factory=list)
     recovered: float | None = None
     errors: dict[str, float] = field(default_factory=dict)
@@ -91,26 +89,29 @@ def run_trial(task: Task) -> Outcome:
     An error of the diagnosis is an outcome too, and a miss.
     """
     case = draw_case(task)
-    scene = case.scene
+    scene, whole = case.scene, list(zip(task.names, case.hidden, case.amounts, strict=True))
     test = scene.table(case.given, held_out=True) if scene.held_out.any() else None
-    hidden = [
-        f'{name}{f" ({one.detail})" if one.detail else ""} {amount:.3g}'
-        for name, one, amount in zip(task.names, case.hidden, case.amounts, strict=True)
-    ]
-    oracle = [
-        oracle_finds(case.linear, name, one, amount, case.given)
-        for name, one, amount in zip(task.names, case.hidden, case.amounts, strict=True)
-        if name in HIDDEN
-    ]
+    outcome = Outcome(
+        task, _described(scene),
+        [f'{name}{f" ({one.detail})" if one.detail else ""} {amount:.3g}'
+         for name, one, amount in whole],
+        oracle=[oracle_finds(case.linear, name, one, amount, case.given)
+                for name, one, amount in whole if name in HIDDEN],
+        background=case.background)
     try:
         found = diagnose(
             scene.table(case.given), scene.lens, free_intrinsics=scene.free, held_out=test
         )
     except Exception as error:
-        verdict = f'error: {type(error).__name__}: {error}'
-        return Outcome(task, _described(scene), hidden, verdict, {}, [], False, [], oracle)
-    outcome = _judged(task, case, found, hidden)
-    outcome.oracle, outcome.background = oracle, case.background
+        outcome.verdict = f'error: {type(error).__name__}: {error}'
+        return outcome
+    outcome.verdict = found.verdict
+    outcome.causes = {cause.effect: cause.indistinguishable_from for cause in found.causes}
+    outcome.remaining = [structure.variable for structure in found.remaining]
+    outcome.hit = set(outcome.causes).union(*outcome.causes.values()).issuperset(task.names)
+    outcome.extra = [
+        e for e, same in outcome.causes.items() if not {e, *same} & set(task.names)]
+    outcome.trace = [f'{s.effect}: corrected p {s.corrected:.1e}, {s.why}' for s in found.trace]
     if task.mode in ('one', 'background') and task.names:
         outcome.errors = _errors(case, task, found)
         lasting = test is not None and not case.background
@@ -118,20 +119,6 @@ def run_trial(task: Task) -> Outcome:
     if task.mode == 'clean':
         outcome.p_values = _null_p_values(found, scene.free)
     return outcome
-
-
-def _judged(task: Task, case: Case, found: Diagnosis, hidden: list[str]) -> Outcome:
-    classes = {cause.effect: cause.indistinguishable_from for cause in found.causes}
-    named = set(classes).union(*classes.values())
-    return Outcome(
-        task, _described(case.scene), hidden, found.verdict, classes,
-        [structure.variable for structure in found.remaining],
-        hit=named.issuperset(task.names),
-        extra=[e for e, same in classes.items() if not {e, *same} & set(task.names)],
-        trace=[
-            f'{s.effect}: corrected p {s.corrected:.1e}, {s.why}' for s in found.trace
-        ],
-    )
 
 
 def draw_case(task: Task) -> Case:
@@ -162,7 +149,7 @@ def _hide(task: Task, scene: Scene, rng: np.random.Generator) -> Case | None:
     world = scene.world()
     ideal = world.image()
     linear = LinearScene(scene, ideal)
-    theta = linear.angles(world)
+    theta = world.angles
     hidden, amounts = [], []
     for name in task.names:
         draw = HIDDEN[name][0] if name in HIDDEN else OUTSIDE[name][0]
@@ -170,7 +157,7 @@ def _hide(task: Task, scene: Scene, rng: np.random.Generator) -> Case | None:
         amount = _amount(one, task.size, scene, linear, theta, rng)
         if amount is None:
             return None
-        world = one.world(world, amount) if one.moves else world
+        world = one.world(world, amount) if one.world else world
         hidden.append(one)
         amounts.append(amount)
     level = 0.0
@@ -182,12 +169,14 @@ def _hide(task: Task, scene: Scene, rng: np.random.Generator) -> Case | None:
         return None
     noise = scene.noise * rng.standard_normal(exact.shape)
     for one, amount in zip(hidden, amounts, strict=True):
-        noise = noise * one.scatter(theta, amount, rng)
+        if one.scatter:
+            noise = noise * one.scatter(theta, amount, rng)
     given = exact + noise
     if level:
         given = with_outliers(given, scene, rng)
     for one, amount in zip(hidden, amounts, strict=True):
-        given = one.recorded(given, amount, rng)
+        if one.recorded:
+            given = one.recorded(given, amount, rng)
     return Case(scene, hidden, amounts, linear, ideal, exact, given, level)
 
 
@@ -210,23 +199,20 @@ def _amount(
     The size is the RMS, over the noise, of what is left once poses and free intrinsics are
     fitted; for scatter the RMS of its relative change.
     """
-    world = scene.world()
-
     def rms(amount: float) -> float:
-        if not hidden.moves:
+        if hidden.scatter:
             factor = np.broadcast_to(hidden.scatter(theta, amount, rng), linear.ideal.shape)
             return float(np.sqrt(np.mean((factor[scene.seen] - 1) ** 2)))
-        moved = hidden.world(world, amount).image() - linear.ideal
+        assert hidden.world
+        moved = hidden.world(scene.world(), amount).image() - linear.ideal
         whole, left = linear.rms(moved), linear.rms(moved, outside=True)
         known = np.isfinite(whole) and whole < _LARGEST and left > _WEAKEST * whole
         return left / scene.noise if known else np.nan
 
-    if hidden.recorded(linear.ideal, 1.0, rng) is not linear.ideal:
+    if hidden.recorded:
         return size * scene.noise
-    if hidden.moves or float(np.ptp(hidden.scatter(theta, 0.1, np.random.default_rng(0)))) > 0:
-        amount = _solved(rms, hidden.start, size)
-        return amount if amount is not None and amount <= hidden.largest else None
-    return None
+    amount = _solved(rms, hidden.start, size)
+    return amount if amount is not None and amount <= hidden.largest else None
 
 
 def _solved(rms: Callable[[float], float], start: float, size: float) -> float | None:
@@ -269,7 +255,7 @@ def _errors(case: Case, task: Task, found: Diagnosis) -> dict[str, float]:
 
 def _recovered(case: Case, found: Diagnosis) -> float | None:
     """Return (before - after) / (before - true model) of the held-out residual variance, px^2."""
-    if not (case.hidden[0].moves and case.hidden[0].lasting):
+    if not (case.hidden[0].world and case.hidden[0].lasting):
         return None
     moves = np.where(case.scene.seen[..., None], case.exact - case.ideal, 0.0)
     truth = LinearScene(case.scene, case.ideal, held_out=True).pose_rms(case.given - moves)

@@ -8,11 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.image_field import ImageField
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import rotation_from_vector
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import Observations, make_observations
+from fisheye_svp_ros.simulate.render import Print
+from fisheye_svp_ros.simulate.simulation import simulate
 
 WIDTH, HEIGHT = 1280, 800
 FEW, FRAMES = (5, 9), (14, 19)  # photographs of a set: least number, and one more than the most
@@ -93,6 +97,22 @@ def angle_behind_window(
             z - distance - thickness) * np.tan(beyond)
         low, high = np.where(reached < radius, angle, low), np.where(reached < radius, high, angle)
     return np.asarray(angle)
+
+
+def draw_waves(rng: Rng, length: float, size: float) -> Callable[[Array], Array]:
+    """Draw a smooth field: of image points (N, 2), px, of six waves of a length and size, px."""
+    waves, phase = rng.uniform(-1, 1, (6, 2)) / length, rng.uniform(0, 2 * np.pi, 6)
+    heights = size * rng.normal(size=(6, 2))
+    return lambda uv: np.asarray(np.cos(uv @ waves.T + phase) @ heights)
+
+
+def photographed(
+    lens: Lens, printed: Print, points: Array, poses: Pose, noise: float, rng: Rng
+) -> Observations:
+    """Return what a lens sees of a board whose corners are at points (L, 3), not as printed."""
+    seen = simulate(ForwardModel(lens), Landmarks(np.arange(len(points)), points), poses, noise,
+                    rng)
+    return replace(seen, xyz=printed.corners[seen.landmark], sigma=np.full(len(seen), np.nan))
 
 
 def draw_lens(rng: Rng) -> Lens:

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmark import study
-from benchmark.boards import joined
+from benchmark.boards import draw_waves, joined, photographed
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.diagnosis import Diagnosis, ErrorParts, LensErrors, pose_maps
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -34,10 +34,8 @@ from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.reporting.progress import progress
-from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.render import Print
-from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.simulate.targets import board_views
 from fisheye_svp_ros.solve.bundle_adjustment import adjust_poses
 from fisheye_svp_ros.solve.initial_rig import localize_frames
@@ -188,16 +186,13 @@ def simulated(number: int) -> Simulated:
     printed = Print(11, 8, 0.03)
     poses = board_views(lens, printed, 30, (0.2, 0.7), rng)
     points = printed.corners + rng.normal(size=printed.corners.shape) * [4e-5, 4e-5, 2e-4]
-    seen = simulate(ForwardModel(lens), Landmarks(np.arange(len(points)), points), poses, NOISE,
-                    rng)
-    waves = rng.uniform(-1, 1, (6, 2)) / 60.0
-    phase, size = rng.uniform(0, 2 * np.pi, 6), 0.06 * rng.normal(size=(6, 2))
+    seen = photographed(lens, printed, points, poses, NOISE, rng)
+    field = draw_waves(rng, 60.0, 0.06)
 
     def moved(uv: Array) -> Array:
-        return np.asarray(uv + np.cos(uv @ waves.T + phase) @ size)
+        return np.asarray(uv + field(uv))
 
-    table = replace(seen, uv=moved(seen.uv), xyz=printed.corners[seen.landmark],
-                    sigma=np.full(len(seen), np.nan))
+    table = replace(seen, uv=moved(seen.uv))
     return Simulated(table, (1280, 960), poses,
                      lambda points: moved(ForwardModel(lens).project(points).uv))
 

@@ -21,21 +21,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmark import study
+from benchmark.boards import Rng, draw_waves, photographed
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
-from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.scene.observations import Landmarks, Observations
+from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.render import Print
-from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.simulate.targets import board_views
 
 SHIFTS, BENDS = (0.0, 3e-3, 7e-3), (0.0, 4e-4, 1.2e-3)  # m
 BOARDS = ((9, 6, 0.025, 0.12), (11, 8, 0.03, 0.2), (6, 4, 0.04, 0.2))  # square and nearest, m
 SIZE = (1280, 960)
-Rng = np.random.Generator
 
 
 class Taken(NamedTuple):
@@ -46,7 +44,7 @@ class Taken(NamedTuple):
     bend: float
 
 
-def photographed(number: int) -> Taken:
+def draw_set(number: int) -> Taken:
     """Return a set of photographs with everything that real ones have."""
     rng = np.random.default_rng([99, number])
     shift, bend = SHIFTS[number % 3], BENDS[number // 3 % 3]
@@ -59,11 +57,9 @@ def photographed(number: int) -> Taken:
     printed = Print(columns, rows, square)
     poses = board_views(lens, printed, int(rng.integers(15, 35)), (nearest, 0.7), rng)
     points = bent(printed.corners, bend, rng)
-    seen = simulate(ForwardModel(lens), Landmarks(np.arange(len(points)), points), poses,
-                    rng.uniform(0.08, 0.2), rng)
+    seen = photographed(lens, printed, points, poses, rng.uniform(0.08, 0.2), rng)
     far = 2 * (rng.random((len(seen), 1)) < 0.004) * rng.normal(size=(len(seen), 2))
-    table = replace(seen, uv=seen.uv + own_errors(seen, centre, rng) + far,
-                    xyz=printed.corners[seen.landmark], sigma=np.full(len(seen), np.nan))
+    table = replace(seen, uv=seen.uv + own_errors(seen, centre, rng) + far)
     return Taken(table.take(rng.random(len(seen)) < rng.uniform(0.9, 1.0)), shift, bend)
 
 
@@ -90,8 +86,7 @@ def own_errors(seen: Observations, centre: Array, rng: Rng) -> Array:
     p = 3e-4 * reach * rng.normal(size=2)
     decentering = np.stack([p[0] * (3 * x * x + y * y) + 2 * p[1] * x * y,
                             p[1] * (3 * y * y + x * x) + 2 * p[0] * x * y], axis=-1)
-    waves, phase = rng.uniform(-1, 1, (6, 2)) / 80.0, rng.uniform(0, 2 * np.pi, 6)
-    static = np.cos(seen.uv @ waves.T + phase) @ (0.04 * rng.normal(size=(6, 2)))
+    static = draw_waves(rng, 80.0, 0.04)(seen.uv)
     powers = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     framed = 0.03 * rng.normal(size=(int(seen.frame.max()) + 1, 2, 6))[seen.frame]
     return np.asarray(ripple + decentering + static + (framed @ powers[..., None])[..., 0])
@@ -99,7 +94,7 @@ def own_errors(seen: Observations, centre: Array, rng: Rng) -> Array:
 
 def trial(number: int) -> dict[str, Any]:
     """Return what was hidden, what was named, and e0 with its standard error, mm."""
-    table, shift, bend = photographed(number)
+    table, shift, bend = draw_set(number)
     lens, diagnosis = study.calibrated_and_diagnosed(table, SIZE)
     options = DiagnosisOptions(included=('viewpoint_shift',))
     found, asked = diagnosis.to_dict(), diagnose(table, lens, options=options).to_dict()

@@ -72,7 +72,7 @@ def _around(
     """Return landmarks (S, N, 3), m, within a cone ahead of cameras, and their poses (S,)."""
     d = _within(cone, (count, points), rng)
     pose = identity(count).retract(rng.normal(size=(count, 6)) * [1, 1, 1, 2, 2, 2])
-    return pose.transform(d * rng.uniform(near, far, (count, points, 1))), pose
+    return pose.reshape(count, 1).transform(d * rng.uniform(near, far, (count, points, 1))), pose
 
 
 def spoilt(

@@ -25,15 +25,13 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
 import numpy as np  # noqa: E402
 
 import fisheye_svp_ros as fsvp  # noqa: E402
-from benchmark.compare.halves import (  # noqa: E402
-    all_pairs,
-    differences,
-    half_sets,
-    honesty_table,
+from benchmark.compare.peers import (  # noqa: E402
+    PEERS,
+    Fitted,
+    NotHereError,
+    residuals,
+    rms,
 )
-from benchmark.compare.peers import PEERS, Fitted, NotHereError  # noqa: E402
-from benchmark.compare.python_peers import PYTHON_PEERS  # noqa: E402
-from benchmark.compare.scoring import residuals, rms  # noqa: E402
 from benchmark.compare.sets import (  # noqa: E402
     BOARDS,
     Set,

@@ -5,16 +5,25 @@ Each input follows from the name of its surface and its seed; `--only NAME --see
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
 import sys
-import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from random import Random
 
 from benchmark import study
 from benchmark.fuzz.surfaces import Surface
-from benchmark.fuzz.trials import LARGEST, SLOWEST, WAITING, Outcome, every, trial_of, work
+from benchmark.fuzz.trials import (
+    LARGEST,
+    SLOWEST,
+    WAITING,
+    Outcome,
+    every,
+    prepare,
+    run_chunk,
+    trial_of,
+)
 
 _HUNG = 60.0  # s without an answer, then a worker is ended
 _CHUNK = 500  # inputs of a task
@@ -30,49 +39,6 @@ def _chunks(wanted: list[Surface], total: int, first: int) -> Iterator[Task]:
                 yield name, first + begin, min(_CHUNK, end - begin)
 
 
-class _Worker:
-    """A process that tries chunks of seeds, one at a time."""
-
-    def __init__(self) -> None:
-        context = multiprocessing.get_context('spawn')
-        self._pipe, theirs = context.Pipe()
-        # No daemon: the detector's search has a process of its own.
-        self._process = context.Process(target=work, args=(theirs,))
-        self._process.start()
-        theirs.close()
-        self.task: Task | None = None
-        self._since = 0.0
-
-    def give(self, task: Task) -> None:
-        """Begin a chunk."""
-        self.task, self._since = task, time.monotonic()
-        self._pipe.send(task)
-
-    def outcome(self) -> Outcome | None:
-        """Return what has become of the chunk, None while it is under way or lost."""
-        if self.task is None or not self._pipe.poll(0.01):
-            return None
-        with contextlib.suppress(EOFError, OSError):
-            found: Outcome = self._pipe.recv()
-            self.task = None
-            return found
-        return None
-
-    def lost(self) -> str:
-        """Say whether the process has died with its chunk, or takes too long for it."""
-        if self.task is None:
-            return ''
-        if not self._process.is_alive():
-            return 'crashed'
-        long = time.monotonic() - self._since > _HUNG * max(1, self.task[2] / 20)
-        return 'hung' if long else ''
-
-    def end(self) -> None:
-        """End the process."""
-        self._process.kill()
-        self._process.join()
-
-
 def run_all(wanted: list[Surface], total: int, first: int, workers: int) -> dict[str, Outcome]:
     """Try inputs of all surfaces, in processes; one that dies or hangs is a fault, too.
 
@@ -80,45 +46,49 @@ def run_all(wanted: list[Surface], total: int, first: int, workers: int) -> dict
     """
     outcomes = {surface.name: Outcome() for surface in wanted}
     pending = list(_chunks(wanted, total, first))[::-1]
-    running = [_Worker() for _ in range(workers)]
-    chunks = len(pending)
-    try:
-        while pending or any(worker.task for worker in running):
-            if sys.stderr.isatty():
-                print(f'\r{chunks - len(pending)} of {chunks} chunks', end='', file=sys.stderr)
-            for number, worker in enumerate(running):
-                _look_after(worker, pending, outcomes)
-                if worker.lost():
-                    worker.end()
-                    running[number] = _Worker()
-                    pending += _halves(worker, outcomes)
-    except KeyboardInterrupt:
-        print('interrupted: what was tried so far', file=sys.stderr)
-    finally:
-        for worker in running:
-            worker.end()
+    with ThreadPoolExecutor(workers) as threads:
+        try:
+            for tried in [threads.submit(_try_pending, pending) for _ in range(workers)]:
+                for name, outcome in tried.result():
+                    outcomes[name].add(outcome)
+        except KeyboardInterrupt:
+            print('interrupted: what was tried so far', file=sys.stderr)
+            pending.clear()
     return outcomes
 
 
-def _look_after(worker: _Worker, pending: list[Task], outcomes: dict[str, Outcome]) -> None:
-    """Take the outcome of a chunk, give the next."""
-    task = worker.task
-    found = worker.outcome()
-    if task and found:
-        outcomes[task[0]].add(found)
-    if worker.task is None and pending:
-        worker.give(pending.pop())
+def _try_pending(pending: list[Task]) -> list[tuple[str, Outcome]]:
+    """Try chunks in a process, in another one after each that it dies or hangs of."""
+    found, pool = [], None
+    while task := _take(pending):
+        name, first, count = task
+        pool = pool or ProcessPoolExecutor(1, multiprocessing.get_context('spawn'), prepare)
+        try:
+            outcome = pool.submit(run_chunk, *task).result(_HUNG * max(1, count / 20))
+        except (BrokenProcessPool, TimeoutError):
+            for process in (pool._processes or {}).values():
+                process.kill()
+            pool, outcome = None, Outcome()
+            if count > 1:  # to find out which input it was
+                half = count // 2
+                pending += [(name, first + half, count - half), (name, first, half)]
+            else:
+                outcome.tried = 1
+                outcome.fault('hung or died', name, first, 'the process')
+        found.append((name, outcome))
+    if pool:
+        pool.shutdown()
+    return found
 
 
-def _halves(worker: _Worker, outcomes: dict[str, Outcome]) -> list[Task]:
-    """Return the halves of a lost chunk, to find out which input it was, or count the fault."""
-    assert worker.task
-    name, first, count = worker.task
-    if count == 1:
-        outcomes[name].tried += 1
-        outcomes[name].fault('hung or died', name, first, 'the process')
-        return []
-    return [(name, first + count // 2, count - count // 2), (name, first, count // 2)]
+def _take(pending: list[Task]) -> Task | None:
+    """Return the next chunk, None where another thread has taken the last one."""
+    if sys.stderr.isatty():
+        print(f'\r{len(pending)} chunks to go ', end='', file=sys.stderr)
+    try:
+        return pending.pop()
+    except IndexError:
+        return None
 
 
 def section(outcomes: dict[str, Outcome], command: str) -> str:

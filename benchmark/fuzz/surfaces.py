@@ -136,10 +136,6 @@ def _table(path: Path) -> tuple[Any, bool]:
     return tabulate(bag.records(is_tabulated)), bool(bag.damage)
 
 
-def _bag_observations(path: Path) -> str:
-    return table_trouble(read_observations_bag(path))
-
-
 def _written(folder: Path, name: str, write: Callable[[Path], Any]) -> Files:
     path = folder / f'written_{name}'
     write(path)
@@ -189,15 +185,6 @@ def _recording(folder: Path) -> bytes:
                 bag.write(topic, kind, serialize_message(message))
             bag.flush()
     return next((folder / 'bag').glob('*.mcap')).read_bytes()
-
-
-def _bags(folder: Path) -> Trial:
-    return _unchanged(_table, {'a.mcap': _recording(folder)}, folder)
-
-
-def _bags_of_points(folder: Path) -> Trial:
-    return of_files({'a.mcap': _recording(folder)}, lambda f: _bag_observations(f / 'a.mcap'),
-                    folder, binary=True)
 
 
 def _orpc(folder: Path) -> Trial:
@@ -296,10 +283,6 @@ def _parts(folder: Path) -> Trial:
     return of_files({'000000000.json': data}, read, folder)
 
 
-def _write_foreign(lens: Lens, form: str, path: Path) -> None:
-    path.write_text(write_foreign(lens, form))
-
-
 def _foreign(folder: Path) -> Trial:
     """Return the surface of the lens models that are read, but not written."""
     files = {
@@ -338,16 +321,6 @@ def _foreign(folder: Path) -> Trial:
     return trial
 
 
-def _parquet(folder: Path) -> Trial:
-    files = _written(folder, 'a.parquet',
-                     lambda path: write_columns(path.with_suffix(''), _COLUMNS))
-    return _unchanged(_parquet_columns, files, folder)
-
-
-def _parquet_columns(path: Path) -> tuple[Any, bool]:
-    return read_columns(path), False
-
-
 _COLUMNS = {'n': [1, 2, 3], 'x': [0.1, None, 3.5], 'name': ['a', 'b', None]}
 
 
@@ -357,11 +330,11 @@ def surfaces() -> list[Surface]:
     short = replace(load_lens(lens_path('fish180')), image_height=KannalaBrandt(-0.011, 0.004))
     table = simulate_scenario(Scenario(style='parallel', noise_px=0.1)).observations
     few = table.take(np.arange(12))
-    found = simulate_scenario(Scenario(noise_px=0.1))
-    saved = library.localize(found.observations, lens)
+    saved = library.localize(simulate_scenario(Scenario(noise_px=0.1)).observations, lens)
     made = [
         Surface('lens YAML', _file('a.yaml', partial(save_lens, lens), _lens), 90),
-        *(Surface(f'lens, {form}', _file('a.txt', partial(_write_foreign, short, form), _lens), 40)
+        *(Surface(f'lens, {form}', _file(
+            'a.txt', lambda p, f=form: p.write_text(write_foreign(short, f)), _lens), 40)
           for form in WRITABLE),
         Surface('lens, other models', _foreign, 40),
         Surface('observations CSV', _file('a.csv', lambda p: write_observations(p, few),
@@ -379,13 +352,19 @@ def surfaces() -> list[Surface]:
         Surface('boards, target YAML', _boards, 50),
         Surface('photographs', _photographs, 50),
         *([] if missing_rclpy() else [  # which writes their messages
-            Surface('recording, table', _bags, 12),
-            Surface('recording, points', _bags_of_points, 12)]),
+            Surface('recording, table', lambda folder: _unchanged(
+                _table, {'a.mcap': _recording(folder)}, folder), 12),
+            Surface('recording, points', lambda folder: of_files(
+                {'a.mcap': _recording(folder)},
+                lambda f: table_trouble(read_observations_bag(f / 'a.mcap')), folder, True), 12)]),
         Surface('table CSV', _file('a.csv', lambda p: write_columns(p.with_suffix(''), _COLUMNS),
                                    _quietly(read_columns)), 50),
         Surface('parts of a sweep', _parts, 20),
         Surface('result JSON', _file('a.json', saved.save, _quietly(library.Localized.load)), 40),
     ]
     if arrow()[0] is not None:
-        made.append(Surface('table Parquet', _parquet, 20))
+        made.append(Surface('table Parquet', lambda folder: _unchanged(
+            lambda path: (read_columns(path), False),
+            _written(folder, 'a.parquet', lambda p: write_columns(p.with_suffix(''), _COLUMNS)),
+            folder), 20))
     return made

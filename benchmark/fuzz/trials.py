@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from random import Random
-from typing import Any
 
 from benchmark.fuzz.nodes import node_surfaces
 from benchmark.fuzz.surfaces import Surface, Trial, surfaces
@@ -107,15 +106,9 @@ def _memory() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def _begin() -> None:
+def prepare() -> None:
+    """Prepare a process: quiet, and left alone by Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     warnings.simplefilter('ignore')
     devnull = os.open(os.devnull, os.O_WRONLY)
     os.dup2(devnull, 2)  # what nodes log about what they refuse
-
-
-def work(pipe: Any) -> None:
-    """Try chunks of seeds, as they come from a pipe, until None does."""
-    _begin()
-    while (task := pipe.recv()) is not None:
-        pipe.send(run_chunk(*task))

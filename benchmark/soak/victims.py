@@ -5,16 +5,17 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from random import Random
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import psutil
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
@@ -23,6 +24,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
+from benchmark import study
 from benchmark.soak import hostile
 from benchmark.soak.hostile import Attack
 
@@ -115,8 +117,7 @@ class Victim:
         self._log = folder / f'{self.name}_{exactly}.log'
         with self._log.open('ab') as log:
             self._process = subprocess.Popen(
-                [sys.executable, '-m', 'fisheye_svp_ros.cli', 'run', self.name, '--ros-args', '-r',
-                 f'__ns:={self._space}', *(w for text in given for w in ('-p', text))],
+                [*study.node_command(self.name, *given), '-r', f'__ns:={self._space}'],
                 stdout=log, stderr=log, env={**os.environ, 'OMP_NUM_THREADS': '1'})
 
     def _writer(self, topic: str, kind: Any) -> Any:
@@ -195,7 +196,10 @@ class Victim:
 
     def measure(self) -> None:
         """Note the memory of the node and its children, MB."""
-        self.memory.append(sum(_resident(pid) for pid in _tree(self._process.pid)))
+        with suppress(psutil.Error):  # it may be dead
+            node = psutil.Process(self._process.pid)
+            self.memory.append(sum(one.memory_info().rss / 2**20 for one in (
+                node, *node.children(recursive=True))))
 
     def end(self) -> str:
         """End the node; return what it said of internal errors."""
@@ -216,24 +220,6 @@ def _publish(publisher: Any, data: bytes) -> bool:
     except RuntimeError:  # RCLError
         return False
     return True
-
-
-def _tree(pid: int) -> Iterator[int]:
-    yield pid
-    try:
-        for child in Path(f'/proc/{pid}/task/{pid}/children').read_text().split():
-            yield from _tree(int(child))
-    except OSError:
-        return
-
-
-def _resident(pid: int) -> float:
-    try:
-        status = Path(f'/proc/{pid}/status').read_text()
-    except OSError:
-        return 0.0
-    return next((int(line.split()[1]) / 1024 for line in status.splitlines()
-                 if line.startswith('VmRSS')), 0.0)
 
 
 class Watch:

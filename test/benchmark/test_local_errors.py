@@ -1,6 +1,6 @@
 """What is hidden in sets like real ones is found; rates are in docs/results/local_errors.md."""
 
-from benchmark.local_errors import photographed, report, trial
+from benchmark.local_errors import draw_set, report, trial
 
 
 def test_a_shift_is_found_beside_local_errors():
@@ -14,7 +14,7 @@ def test_a_shift_is_found_beside_local_errors():
 
 
 def test_a_set_is_what_it_says():
-    (table, shift, bend), same = photographed(4), photographed(4)
+    (table, shift, bend), same = draw_set(4), draw_set(4)
     assert (shift, bend) == (3e-3, 4e-4)
     assert (table.uv == same.table.uv).all()
     assert 14 < len(table.frames) < 35
