@@ -67,13 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         deals=(0, 'random ones, to halves'), cameras=(20, 'simulated ones'))
     parser.add_argument('tables', type=Path, nargs='*', help='of one camera and board')
     asked = parser.parse_args(arguments)
-    sets = [simulated(number) for number in range(asked.cameras)]
-    if asked.tables:
-        tables = [read_observations(path) for path in asked.tables]
-        table = joined([replace(one, frame=1000 * i + one.frame) for i, one in enumerate(tables)])
-        unknown = np.full(len(table), np.nan)
-        sets = [Simulated(replace(table, sigma=unknown, t=unknown),
-                          study.image_size(asked.image_size), None, None)]
+    sets = [simulated(number) for number in range(asked.cameras)] if not asked.tables else [
+        measured(asked.tables, study.image_size(asked.image_size))]
     halves: list[Array] = []
     poses: list[Array] = []
     lenses: list[Lens] = []
@@ -103,6 +98,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     saved = json.loads(asked.output.read_text()) if asked.output.is_file() else {}
     write_text(asked.output, json.dumps(saved | {name: told}, indent=1) + '\n')
     sys.stdout.write(json.dumps(told, indent=1) + '\n')
+
+
+def measured(paths: Sequence[Path], size: tuple[int, int]) -> Simulated:
+    """Return what a real camera saw of one board, in one table."""
+    table = joined([replace(one, frame=1000 * i + one.frame)
+                    for i, one in enumerate(map(read_observations, paths))])
+    unknown = np.full(len(table), np.nan)
+    return Simulated(replace(table, sigma=unknown, t=unknown), size, None, None)
 
 
 def coverage(pulls: Iterable[Array]) -> dict[str, Any]:

@@ -98,26 +98,24 @@ def call(words: Sequence[str], before: Sequence[str] = ()) -> subprocess.Popen[s
         start_new_session=True, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 
 
-def done(words: Sequence[str]) -> tuple[int, str]:
+def done(words: Sequence[str], before: Sequence[str] = ()) -> tuple[int, str]:
     """Run a command to its end; return its status and what it said on stderr."""
-    process = call(words)
+    process = call(words, before)
     _, said = process.communicate()
     return process.returncode, said
 
 
-def files(folder: Path) -> dict[str, int]:
-    """Return the sizes of a command's files by name, temporary ones among them."""
-    found = {}
+def files(folder: Path) -> tuple[dict[str, int], list[str]]:
+    """Return the sizes of a command's files by name, and the names of temporary ones."""
+    found, rest = {}, []
     for path in sorted(folder.rglob('*')):
         name = path.relative_to(folder)
         if path.is_file() and not _WORK & set(name.parts):
-            found[str(name)] = path.stat().st_size
-    return found
-
-
-def temporary(names: Sequence[str]) -> list[str]:
-    """Return those of some names that are of temporary files."""
-    return [name for name in names if Path(name).name.startswith('.')]
+            if name.name.startswith('.'):
+                rest.append(str(name))
+            else:
+                found[str(name)] = path.stat().st_size
+    return found, rest
 
 
 def left_running(session: int) -> list[int]:
@@ -160,8 +158,8 @@ def moments(count: int, rng: random.Random) -> Iterator[float]:
 
 def tables(folder: Path) -> dict[str, bytes]:
     """Return the tables of a command's folder by name, as they are."""
-    return {name: (folder / name).read_bytes() for name in files(folder)
-            if name.endswith('.csv') and not temporary([name])}
+    return {name: (folder / name).read_bytes() for name in files(folder)[0]
+            if name.endswith('.csv')}
 
 
 def killed(
@@ -175,9 +173,10 @@ def killed(
     out = folder / 'whole'
     begun = time.monotonic()
     status, said = done([word.format(out=out) for word in words])
-    length, whole = time.monotonic() - begun, files(out)
-    if status or temporary([*whole]):
-        outcome.fault('whole run', f'status {status}, {[*whole]}, {said}')
+    length = time.monotonic() - begun
+    whole, rest = files(out)
+    if status or rest:
+        outcome.fault('whole run', f'status {status}, {[*whole, *rest]}, {said}')
         return outcome
     count = max(2, min(count, round(_LONGEST / (4 * length))))
     for number, moment in enumerate(moments(2 * count, rng)):
@@ -187,7 +186,7 @@ def killed(
         # The next one goes through where this one was killed.
         status, said = done([word.format(out=out) for word in words])
         other = words[0] not in _MEASURED and tables(out) != tables(folder / 'whole')
-        if status or other or not _same(files(out), whole):
+        if status or other or not _same(files(out)[0], whole):
             outcome.fault('rerun', f'status {status}, other tables {other}, {said[-300:]}')
         shutil.rmtree(out, ignore_errors=True)
     return outcome
@@ -216,12 +215,9 @@ def kill(
     for number in alive:
         outcome.fault('orphan', f'{how.name} after {after:.2f} s')
         os.kill(number, signal.SIGKILL)
-    found = files(out)
-    rest = temporary([*found])
+    found, rest = files(out)
     if rest and how == signal.SIGTERM:
         outcome.fault('temporary file', f'{how.name} after {after:.2f} s: {rest}')
-    for name in rest:
-        del found[name]
     # SIGKILL may come between two renames, which nothing makes one: each file is whole then.
     wanted = whole if how == signal.SIGTERM else {n: whole[n] for n in found if n in whole}
     if not found:
@@ -234,9 +230,8 @@ def kill(
 
 def _same(found: dict[str, int], whole: dict[str, int]) -> bool:
     """Whether the files of a set are all there, and about as long as they ought to be."""
-    shown = {name: size for name, size in found.items() if not temporary([name])}
-    return shown.keys() == whole.keys() and all(
-        0.8 * whole[name] <= size <= 1.25 * whole[name] for name, size in shown.items())
+    return found.keys() == whole.keys() and all(
+        0.8 * whole[name] <= size <= 1.25 * whole[name] for name, size in found.items())
 
 
 def killed_node(words: Sequence[str], folder: Path, count: int, rng: random.Random) -> Outcome:
@@ -291,14 +286,14 @@ def refused(words: Sequence[str], folder: Path, size: int) -> Outcome:
 def _judge(
     outcome: Outcome, what: str, out: Path, words: Sequence[str], before: Sequence[str] = ()
 ) -> None:
-    process = call([word.format(out=out) for word in words], before)
-    _, said = process.communicate()
+    status, said = done([word.format(out=out) for word in words], before)
     outcome.kills[what] += 1
     lines = [line for line in said.splitlines() if ': note: ' not in line]
-    if process.returncode != 2 or len(lines) != 1:
-        outcome.fault('line', f'{what}: status {process.returncode}, {lines[-3:]}')
-    if found := files(out):
-        outcome.fault('part', f'{what}: {[*found]}')
+    if status != 2 or len(lines) != 1:
+        outcome.fault('line', f'{what}: status {status}, {lines[-3:]}')
+    found, rest = files(out)
+    if found or rest:
+        outcome.fault('part', f'{what}: {[*found, *rest]}')
     else:
         outcome.nothing += 1
 
@@ -346,7 +341,7 @@ def main() -> int:
                 else:
                     ended[name] = killed(words, folder, asked.kills, rng)
                     if os.geteuid() == 0:
-                        size = sum(files(folder / 'whole').values())
+                        size = sum(files(folder / 'whole')[0].values())
                         kept_out[name] = refused(words, folder, size)
                 advance()
     said = ' '.join(['python -m benchmark.kills', *sys.argv[1:]])

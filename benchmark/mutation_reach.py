@@ -12,9 +12,9 @@ import re
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from coverage import CoverageData
 from coverage.exceptions import DataError
@@ -52,29 +52,21 @@ class Reach(NamedTuple):
         The module's own tests come first, then the others; of both, the quickest first.
         """
         syntax = ast.parse((tree / path).read_text(encoding='utf-8'))
-        statement, function = _innermost(syntax, line)
-        if function is not None:
-            found = self._within(path, statement)
+        around = [one for one in ast.walk(syntax) if isinstance(one, ast.stmt)
+                  and _first_line(one) <= line <= (one.end_lineno or 0)]
+        statement = around[-1] if around else syntax  # the innermost: `walk` goes by depth
+        if any(isinstance(one, ast.FunctionDef) and line >= one.body[0].lineno for one in around):
+            found = self._tests(path, _head(statement))
         elif isinstance(statement, ast.FunctionDef):  # a default or a decorator
-            found = self._within(path, statement, whole=True)
+            found = self._tests(path, _bodies(statement))
         else:  # what runs once, when the module is imported, shows where its names are used
-            found = self._uses(tree, _targets(statement)) or self._within(path, syntax)
+            found = self._uses(tree, _targets(statement)) or self._tests(path, _bodies(syntax))
         own = f'/test_{Path(path).stem}.py'
         return sorted(found & self.seconds.keys(),
                       key=lambda test: (own not in test, self.seconds[test], test))
 
-    def _within(self, path: str, node: ast.AST, whole: bool = False) -> set[str]:
-        """Return the tests of a statement, of its head alone if it is a compound one."""
+    def _tests(self, path: str, lines: Iterable[int]) -> set[str]:
         by_line = self.tests.get(path, {})
-        if isinstance(node, ast.Module):
-            lines = _lines_of_functions(node)
-        elif whole:
-            lines = _lines_of_functions(ast.Module([node], []))  # type: ignore[list-item]
-        else:
-            body = getattr(node, 'body', None)
-            within = isinstance(body, list)
-            last = body[0].lineno - 1 if within else node.end_lineno  # type: ignore
-            lines = set(range(node.lineno, max(last, node.lineno) + 1))  # type: ignore
         return set().union(*(by_line.get(line, set()) for line in lines))
 
     def _uses(self, tree: Path, names: set[str]) -> set[str]:
@@ -85,7 +77,7 @@ class Reach(NamedTuple):
             if any(name in text for name in names):
                 for function in _functions(ast.parse(text)):
                     if names & _mentions(function):
-                        found |= self._within(path, function, whole=True)
+                        found |= self._tests(path, _bodies(function))
         return found
 
 
@@ -141,30 +133,17 @@ def _functions(node: ast.AST) -> Iterator[ast.FunctionDef]:
     return (one for one in ast.walk(node) if isinstance(one, ast.FunctionDef))
 
 
-def _lines_of_functions(node: ast.AST) -> set[int]:
-    return {line for function in _functions(node)
-            for line in range(function.body[0].lineno, (function.end_lineno or 0) + 1)}
+def _bodies(node: ast.AST) -> Iterator[int]:
+    """Yield the lines of the bodies of all functions in a node."""
+    for function in _functions(node):
+        yield from range(function.body[0].lineno, (function.end_lineno or 0) + 1)
 
 
-def _innermost(syntax: ast.Module, line: int) -> tuple[ast.AST, ast.FunctionDef | None]:
-    """Return the innermost statement of a line, and the function in whose body it stands."""
-    statement: ast.AST = syntax
-    function: ast.FunctionDef | None = None
-    body: list[ast.stmt] = syntax.body
-    while body:
-        first = body[0]
-        inside = [one for one in body if _first_line(one) <= line <= (one.end_lineno or 0)]
-        if not inside:
-            break
-        if isinstance(statement, ast.FunctionDef) and line >= first.lineno:
-            function = statement
-        statement = inside[0]
-        body = [one for name in ('body', 'orelse', 'finalbody', 'handlers', 'cases')
-                for one in getattr(statement, name, ())
-                if isinstance(one, ast.stmt | ast.ExceptHandler | ast.match_case)]
-        body = [inner for one in body
-                for inner in ([one] if isinstance(one, ast.stmt) else one.body)]
-    return statement, function
+def _head(statement: Any) -> range:
+    """Return the lines of a statement, of its head alone if it is a compound one."""
+    body = getattr(statement, 'body', None)
+    last = body[0].lineno - 1 if body else statement.end_lineno
+    return range(statement.lineno, max(last, statement.lineno) + 1)
 
 
 def _first_line(statement: ast.stmt) -> int:

@@ -76,18 +76,13 @@ def _attacked(
 def _settle(watch: Watch, victims: dict[str, Victim]) -> None:
     """Wait until no node has anything left to look at."""
     before: list[dict[str, int]] = []
-
-    def steady() -> bool:
-        nonlocal before
-        now = [{k: n for k, n in v.counts.items() if ': read' in k or 'sets: w' in k}
-               for v in victims.values()]
-        same, before = now == before, now
-        return same
-
     for _ in range(60):
         watch.until(victims, lambda: False, 2.5)
-        if steady():
+        now = [{k: n for k, n in v.counts.items() if ': read' in k or 'sets: w' in k}
+               for v in victims.values()]
+        if now == before:
             return
+        before = now
 
 
 def judged(victim: Victim, exactly: bool) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterator, Sequence
 from random import Random
 from typing import Any, NamedTuple
@@ -36,13 +37,7 @@ class Attack(NamedTuple):
         """Return the message with a stamp, ns, unless the stamp itself is spoilt."""
         if not self.stamped:
             return self.data
-        return self.data[:4] + messages_stamp(stamp) + self.data[12:]
-
-
-def messages_stamp(stamp: int) -> bytes:
-    """Return sec and nanosec of a stamp, ns, as on the wire."""
-    sec, nanosec = divmod(stamp, 10**9)
-    return sec.to_bytes(4, 'little') + nanosec.to_bytes(4, 'little')
+        return self.data[:4] + struct.pack('<II', *divmod(stamp, 10**9)) + self.data[12:]
 
 
 def pool(
