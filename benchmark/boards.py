@@ -13,8 +13,7 @@ from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.image_field import ImageField
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.scene.landmarks import Landmarks
-from fisheye_svp_ros.scene.observations import Observations, make_observations
+from fisheye_svp_ros.scene.observations import Landmarks, Observations, make_observations
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.simulation import simulate
 

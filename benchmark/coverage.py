@@ -33,7 +33,7 @@ from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
-from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.terminal import progress
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.targets import board_views

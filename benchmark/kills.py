@@ -27,7 +27,7 @@ from pathlib import Path
 import psutil
 
 from benchmark import study
-from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.terminal import progress
 
 _WRITING = 0.15  # of a run: the end, where most is written
 _PATIENCE = 20.0  # s to end after SIGTERM, and for children to go with their parent

@@ -21,7 +21,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.terminal import progress
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.ray_errors import RANGES, points_on_rays, without_motion

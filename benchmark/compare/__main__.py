@@ -8,6 +8,7 @@ Writes docs/results/compare.md.
 
 from __future__ import annotations
 
+import argparse
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,14 +25,15 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
 import numpy as np  # noqa: E402
 
 import fisheye_svp_ros as fsvp  # noqa: E402
-from benchmark import study  # noqa: E402
-from benchmark.compare.peers import (  # noqa: E402
-    PEERS,
-    Fitted,
-    NotHereError,
-    residuals,
-    rms,
+from benchmark.compare.halves import (  # noqa: E402
+    all_pairs,
+    differences,
+    half_sets,
+    honesty_table,
 )
+from benchmark.compare.peers import PEERS, Fitted, NotHereError  # noqa: E402
+from benchmark.compare.python_peers import PYTHON_PEERS  # noqa: E402
+from benchmark.compare.scoring import residuals, rms  # noqa: E402
 from benchmark.compare.sets import (  # noqa: E402
     BOARDS,
     Set,
@@ -47,6 +49,7 @@ from fisheye_svp_ros.diagnosis import (  # noqa: E402
     diagnose,
     predict_other_data,
 )
+from fisheye_svp_ros.io.files import write_text  # noqa: E402
 from fisheye_svp_ros.library_results import Localized  # noqa: E402
 from fisheye_svp_ros.scene.observations import Observations  # noqa: E402
 from fisheye_svp_ros.solve.initial_rig import localize_frames  # noqa: E402
@@ -55,6 +58,8 @@ from fisheye_svp_ros.solve.measured_poses import (  # noqa: E402
 )
 from fisheye_svp_ros.solve.rig_state import group_by_frame  # noqa: E402
 
+_DOC = Path(__file__).parents[2] / 'docs' / 'results' / 'compare.md'
+_MARK = '<!-- figures -->'
 _OV = (1280, 800)
 TOOLS = {**PEERS, **PYTHON_PEERS}
 SETS: dict[str, Callable[[Path], Set]] = {
@@ -218,20 +223,28 @@ def page(sets: list[tuple[Set, list[Row]]], halves: list[str], honesty: list[str
 
 def main() -> None:
     """Compare on every set that is there, write the page."""
-    parser = study.parser('compare', __doc__, study.RESULTS / 'compare.md', workers=False)
+    parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.compare')
     parser.add_argument('data', type=Path)
     parser.add_argument('--only', nargs='+', choices=SETS, default=list(SETS))
+    parser.add_argument('--workers', type=int, default=os.cpu_count(), help='processes for halves')
+    parser.add_argument('-o', '--output', type=Path, default=_DOC)
     asked = parser.parse_args()
-    there = [name for name in asked.only if (asked.data / name).is_dir()]
-    lines = [_versions(), '']
-    with progress('comparing', len(there)) as advance:
-        for name in there:
-            data = SETS[name](asked.data)
-            lines += section(data, compared(data))
-            advance()
-    print('\n'.join(lines))
+    sets = [SETS[name](asked.data) for name in asked.only if (asked.data / name).is_dir()]
+    # Whole sets one by one: their seconds are compared.
+    rows = in_processes('comparing', compared, sets, 1)
+    halves, honesty = ({data.name: list(parts(data)) for data in sets}
+                       for parts in (half_sets, all_pairs))
+    scores = iter(in_processes('halves', compared, [*chain(*halves.values())], asked.workers))
+    apart = iter(in_processes('errors', differences, [*chain(*honesty.values())], asked.workers))
+    text = page(
+        list(zip(sets, rows, strict=True)),
+        halves_table({name: [next(scores) for _ in many] for name, many in halves.items()}),
+        honesty_table({name: [one for _ in many for one in next(apart)]
+                       for name, many in honesty.items()}))
+    print(text)
     if asked.only == list(SETS):
-        study.write_figures(asked.output, ['', *lines[:-1]])
+        head = asked.output.read_text(encoding='utf-8').split(_MARK)[0]
+        write_text(asked.output, f'{head}{_MARK}\n\n{text}')
 
 
 def _versions() -> str:

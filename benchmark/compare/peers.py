@@ -1,7 +1,4 @@
-"""What a user would take instead: OpenCV's calibrations, and mrcal's; how well they do.
-
-Held-out points: a pose is fitted to each view, all else is as it was fitted before.
-"""
+"""What a user would take instead: OpenCV's calibrations, and mrcal's."""
 
 from __future__ import annotations
 
@@ -16,20 +13,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 
+from benchmark.compare.scoring import Project
 from benchmark.compare.sets import Grid, Set, one_board_a_frame
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 
-Project = Callable[[Array], Array]
 MRCAL = 'mrcal-calibrate-cameras'
 PLANE_LIMIT = 89.0  # degrees: models of x / z end here
 ANGLES = (180.0, 85.0, 80.0, 75.0, 70.0, 65.0, 60.0)  # degrees
 _FEWEST = 12  # points in a view for OpenCV to start from
 _MOST_LEFT_OUT = 10
-_LOST = 1e3  # px: what a point counts that a model cannot project
 _TERMS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-10)
 
 
@@ -235,35 +229,6 @@ def warped_places(table: Observations, grid: Grid, board: Array) -> Array:
         places[mine] = (board[steps[:, 1], steps[:, 0]] - flat.mean(axis=0)) @ turn
         places[mine] += nominal.mean(axis=0)
     return places
-
-
-def residuals(project: Project, frame: Index, xyz: Array, uv: Array, pose: Pose) -> Array:
-    """Return distances (N,), px, once the six numbers of each view's pose are fitted.
-
-    project: points (M, 3), m, in the camera to image points (M, 2), px; xyz (N, 3): the target as
-    the model has it; pose: of the camera, one a frame in ascending order, to start from.
-    """
-    apart = np.empty(len(frame))
-    for i, number in enumerate(np.unique(frame)):
-        mine = frame == number
-        apart[mine] = np.linalg.norm(_fitted(project, xyz[mine], uv[mine], pose.take(i)), axis=1)
-    return apart
-
-
-def _fitted(project: Project, xyz: Array, uv: Array, pose: Pose) -> Array:
-    size = np.repeat([np.median(np.linalg.norm(pose.into_body(xyz), axis=1)), 1.0], 3)
-
-    def misfit(change: Array) -> Array:
-        seen = project(pose.retract(size * change).into_body(xyz))
-        return np.nan_to_num(uv - seen, nan=_LOST, posinf=_LOST, neginf=-_LOST).ravel()
-
-    found = least_squares(misfit, np.zeros(6), method='lm', x_scale=1e-2)
-    return np.asarray(found.fun).reshape(-1, 2)
-
-
-def rms(apart: Array) -> float:
-    """Return the root mean square of distances (N,)."""
-    return float(np.sqrt((apart**2).mean()))
 
 
 _SPLINED = 'LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx={}_Ny={}_fov_x_deg=200'

@@ -10,15 +10,18 @@ import pytest
 from helpers.targets import plane, poses_around
 
 import fisheye_svp_ros as fsvp
-from benchmark.compare.peers import (
-    PEERS,
-    NotHereError,
-    _bent,
-    opencv_fisheye,
-    residuals,
-    rms,
-    vnlog,
+from benchmark.compare.__main__ import Row, halves_table
+from benchmark.compare.halves import (
+    Difference,
+    all_pairs,
+    fixed_halves,
+    half_sets,
+    honesty_table,
+    whole,
 )
+from benchmark.compare.peers import PEERS, NotHereError, opencv_fisheye, vnlog, warped_places
+from benchmark.compare.python_peers import PYTHON_PEERS
+from benchmark.compare.scoring import residuals, rms
 from benchmark.compare.sets import BOARDS, Set, grid_of, one_board_a_frame
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ObservationError
