@@ -22,12 +22,11 @@ from benchmark import study
 from benchmark.boards import grid
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, diagnose
-from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.scene.observations import Observations, make_observations, views_of
-from fisheye_svp_ros.simulate.simulation import predict_points
+from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.solve.hand_eye import Transforms
 from fisheye_svp_ros.solve.lens_calibration import Calibration, calibrate, calibrate_hand_eye
 
@@ -78,9 +77,8 @@ def draw_case(seed: int, hidden: bool, bent: bool) -> Case:
     bend = bent * _BEND * rng.uniform(0.3, 1.0) * (across[:, 0] ** 2 + across[:, 1] * across[:, 0])
     points = said + bend[:, None] * [0.0, 0.0, 1.0] + rng.normal(0, 3e-5, said.shape)
     camera = _camera_poses(rng)
-    seen = predict_points(
-        ForwardModel(lens), camera, views_of(points, np.zeros((_FRAMES, len(points), 2))))
-    uv = seen.uv + rng.normal(0, _NOISE_PX, seen.uv.shape)
+    uv = project(lens, camera.into_body(points)).uv
+    uv = uv + rng.normal(0, _NOISE_PX, uv.shape)
     inside = ((uv > 0) & (uv < (lens.width, lens.height))).all(axis=-1)
     frame, landmark = np.nonzero(inside)
     table = make_observations(frame, landmark, np.asarray(uv[frame, landmark]),
