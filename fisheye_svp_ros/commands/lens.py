@@ -10,8 +10,8 @@ import numpy as np
 
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.outputs import output_file, say
+from fisheye_svp_ros.effects.extension import LANDMARKS
 from fisheye_svp_ros.effects.forward import project
-from fisheye_svp_ros.effects.target import LANDMARKS
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_files import cameras_in, read_lens_file, save_lens
@@ -21,8 +21,7 @@ from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import IMAGE_FIELD, PORT, Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.rectify.maps import MAX_RANGE
-from fisheye_svp_ros.rectify.svp import nearest_svp_lens
+from fisheye_svp_ros.rectify.maps import MAX_RANGE, nearest_svp_lens
 from fisheye_svp_ros.reporting.terminal import print_table, range_text
 from fisheye_svp_ros.scene.observations import STEREO
 

@@ -20,8 +20,8 @@ from fisheye_svp_ros.diagnosis.model_errors import (
     pose_maps,
 )
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
+from fisheye_svp_ros.effects.extension import Target
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.effects.target import Target
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.mixed_model import LAMBDA_ABSENT, Variances
 from fisheye_svp_ros.optics.lens import Lens, field_of_view, intrinsic_names, parameter_values

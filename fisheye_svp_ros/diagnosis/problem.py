@@ -11,7 +11,7 @@ import numpy as np
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.detection_effects import QuantisationEffect
-from fisheye_svp_ros.effects.target import LANDMARKS, landmark_rows, on_boards
+from fisheye_svp_ros.effects.extension import LANDMARKS, landmark_rows, on_boards
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose

@@ -1,16 +1,128 @@
-"""A lens extended by effects: each goes to its place in the lens, so that all mean the same."""
+"""A lens extended by effects, each in its place, and the target that some of them belong to.
+
+Corrections of a target are applied where it is seen, and only there.  A view shows the target if
+at least half of the landmarks seen in it have the number and the place that they had in the data
+the corrections were found on.  Corrections that say nothing of their landmarks, written by hand or
+by an older version, are applied to whatever is seen.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import reduce
+from typing import Any
 
-from fisheye_svp_ros.effects.base import Term
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.effects.base import Scene, Term
 from fisheye_svp_ros.effects.catalogue import load_effects
-from fisheye_svp_ros.effects.target import LANDMARKS, landmark_rows
+from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.lens import Lens, curve_limit, monotone_limit
-from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.observations import Observations, Views, group_views
+
+LANDMARKS = 'landmarks'
+_POSITION_TOLERANCE = 1e-5  # m; no two targets are told apart by less
+
+
+@dataclass(frozen=True)
+class Target:
+    """Corrections of one target and its landmarks: numbers, boards (L,) and places (L, 3), m.
+
+    Numbers ascend; None where the target is not known by its landmarks.
+    """
+
+    terms: tuple[Term, ...]
+    landmark: Index | None
+    board: Index
+    points: Array
+
+    @classmethod
+    def from_entries(cls, entries: Mapping[str, Any], where: str) -> Target | None:
+        """Return the target of a lens from its `target` mapping; None where that is empty.
+
+        Raises LensError, naming `where` and the entry, for one that is impossible.
+        """
+        if not entries:
+            return None
+        effects = {name: entry for name, entry in entries.items() if name != LANDMARKS}
+        terms = load_effects(effects, f'{where}: target')
+        rows = entries.get(LANDMARKS)
+        if rows is None:
+            return cls(terms, None, np.empty(0, dtype=np.int64), np.empty((0, 3)))
+        try:
+            table = np.array(rows, dtype=float).reshape(-1, 5)
+        except (TypeError, ValueError) as cause:
+            raise LensError(f'{where}: target.{LANDMARKS} must be a list of [landmark, board, x, '
+                            'y, z]') from cause
+        ids, first = np.unique(table[:, 0].astype(np.int64), return_index=True)
+        return cls(terms, ids, table[first, 1].astype(np.int64), table[first, 2:])
+
+    def assign_boards(self, views: Views) -> Views:
+        """Return views with the target's landmarks on the boards that they belong to.
+
+        Those that it was found without are where the views say; where these have no boards, or
+        others (as on topics), on that of the nearest landmark.
+        """
+        if self.landmark is None or not len(self.landmark):
+            return views
+        slot, known, same = self._lookup(views)
+        board = np.where(same, self.board[slot], views.board)
+        new = views.used & ~known
+        if new.any() and (board != views.board)[same & views.used].any():
+            away = np.linalg.norm(views.points[new][:, None] - self.points, axis=-1)
+            board[new] = self.board[away.argmin(axis=1)]
+        return views._replace(board=board)
+
+    def landmark_mask(self, views: Views) -> Mask:
+        """Return which landmarks (S, N) are the target's, or may be, in views that show it."""
+        if self.landmark is None:
+            return np.ones(views.landmark.shape, dtype=bool)
+        if not len(self.landmark):
+            return np.zeros(views.landmark.shape, dtype=bool)
+        _, known, same = self._lookup(views)
+        count = (same & views.used).sum(axis=1)
+        shows = (count > 0) & (2 * count >= views.used.sum(axis=1))
+        return np.asarray(shows[:, None] & (same | ~known))
+
+    def displacement(self, scene: Scene, stage: str) -> Array | float:
+        """Displacement (S, N, D) by the corrections at a stage, in views that show the target."""
+        terms = [term for term in self.terms if term[0].stage == stage]
+        if not terms:
+            return 0.0
+        parts = [effect.displacement(scene, values) for effect, values in terms]
+        return np.asarray(np.sum(parts, axis=0) * self.landmark_mask(scene.views)[..., None])
+
+    def _lookup(self, views: Views) -> tuple[Index, Mask, Mask]:
+        """Return places in the table (S, N), whether the number is there, whether the place is."""
+        assert self.landmark is not None
+        slot = np.searchsorted(self.landmark, views.landmark).clip(max=len(self.landmark) - 1)
+        known = self.landmark[slot] == views.landmark
+        off = np.abs(self.points[slot] - views.points).max(axis=-1)
+        return slot, known, known & (off < _POSITION_TOLERANCE)
+
+
+def landmark_rows(seen: Observations) -> list[list[float]]:
+    """Return what a target is known by: [landmark, board, x, y, z] of each of its landmarks, m."""
+    ids, first = np.unique(seen.landmark, return_index=True)
+    boards, places = seen.board[first].tolist(), seen.xyz[first].tolist()
+    return [[*pair, *xyz] for *pair, xyz in zip(ids.tolist(), boards, places, strict=True)]
+
+
+def on_boards(seen: Observations, rows: Sequence[Sequence[float]] | None) -> Observations:
+    """Return observations of a target on the boards that its `landmark_rows` say.
+
+    A recording of topics tells of no boards, another table may call them otherwise.
+    """
+    if rows is None:
+        return seen
+    target, views = Target.from_entries({LANDMARKS: rows}, seen.source), group_views(seen)
+    assert target is not None
+    mine = views.used & target.landmark_mask(views).any(axis=1, keepdims=True)
+    board = seen.board.copy()
+    board[views.row[mine]] = target.assign_boards(views).board[mine]
+    return replace(seen, board=board)
 
 
 def extend_lens(lens: Lens, terms: Iterable[Term], seen: Observations | None = None) -> Lens:

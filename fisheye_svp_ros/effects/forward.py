@@ -17,9 +17,8 @@ from fisheye_svp_ros.arrays import Array, Index, Mask, gather_rows
 from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
 from fisheye_svp_ros.effects.base import Term as Term
 from fisheye_svp_ros.effects.catalogue import load_effects
-from fisheye_svp_ros.effects.extension import curved_lens
+from fisheye_svp_ros.effects.extension import Target, curved_lens
 from fisheye_svp_ros.effects.of_cameras import OfCameras, camera_terms
-from fisheye_svp_ros.effects.target import Target
 from fisheye_svp_ros.optics import camera, engines
 from fisheye_svp_ros.optics.camera import Image, Incidence, LinearImage, Rays, lens_columns
 from fisheye_svp_ros.optics.lens import Lens

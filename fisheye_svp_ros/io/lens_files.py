@@ -13,8 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from fisheye_svp_ros.effects.catalogue import load_effects
-from fisheye_svp_ros.effects.extension import extend_lens
-from fisheye_svp_ros.effects.target import LANDMARKS, Target
+from fisheye_svp_ros.effects.extension import LANDMARKS, Target, extend_lens
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.files import dump_yaml, parse_yaml, read_text, write_text
 from fisheye_svp_ros.io.lens_formats import READABLE, Foreign, read_foreign

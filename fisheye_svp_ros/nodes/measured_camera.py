@@ -18,7 +18,7 @@ from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes.camera import CameraNode, rows_by_frame
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.rectify.svp import svp_equivalent
+from fisheye_svp_ros.rectify.maps import svp_equivalent
 from fisheye_svp_ros.scene.observations import Landmarks, Observations
 from fisheye_svp_ros.study.settings import CameraSettings
 

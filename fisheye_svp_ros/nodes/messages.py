@@ -39,8 +39,7 @@ from fisheye_svp_ros.io.decoding import (
 from fisheye_svp_ros.optics.camera import incidence
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation
-from fisheye_svp_ros.rectify.maps import Rectification
-from fisheye_svp_ros.rectify.svp import svp_equivalent
+from fisheye_svp_ros.rectify.maps import Rectification, svp_equivalent
 from fisheye_svp_ros.scene.observations import Landmarks
 
 _NS = 10**9

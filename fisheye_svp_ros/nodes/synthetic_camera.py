@@ -21,7 +21,7 @@ from fisheye_svp_ros.nodes.messages import camera_shape, landmarks_shape, rays_s
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.rectify.svp import svp_equivalent
+from fisheye_svp_ros.rectify.maps import svp_equivalent
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.simulate.scenario import (

@@ -29,7 +29,7 @@ class Lens:
     image points beside curves and port.  corrections: effects of the
     lens's own that have no other place in it, by name, as `effects.base.Effect.to_dict` gives
     them; target: those of the target that they were found on, and its landmarks, see
-    `effects.target`; both are changed by `effects.extension.extend_lens`.  calibration: where a
+    `effects.extension`; both are changed by `effects.extension.extend_lens`.  calibration: where a
     fit came from; uncertainty: of what a diagnosis found, see `diagnosis.lens_errors`.
     """
 

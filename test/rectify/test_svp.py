@@ -13,7 +13,7 @@ from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.rectify.svp import nearest_svp_lens
+from fisheye_svp_ros.rectify.maps import nearest_svp_lens
 
 
 def image_error(lens: Lens, svp: Lens, range_m: float) -> float:
