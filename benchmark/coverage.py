@@ -41,7 +41,7 @@ from fisheye_svp_ros.solve.bundle_adjustment import adjust_poses
 from fisheye_svp_ros.solve.initial_rig import localize_frames
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
-from fisheye_svp_ros.study.pose_errors import depth_errors, localize_with_errors
+from fisheye_svp_ros.study.trust import depth_errors, localize_with_errors
 
 WITHIN = 1.959964  # standard deviations, 95 %
 LEVELS = ('noise', 'noise and parameters', 'with the misfit')

@@ -35,7 +35,7 @@ from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.rig_calibration import RigCalibration, calibrate_rig
 from fisheye_svp_ros.solve.rig_state import group_by_frame
-from fisheye_svp_ros.study.lens_trust import assess_lens, with_covariance
+from fisheye_svp_ros.study.trust import assess_lens, with_covariance
 
 TRIALS = 60
 _LENS = Lens('around', 1280, 800, 400.0, 400.0, 639.5, 399.5, KannalaBrandt(-0.01, 0.002),

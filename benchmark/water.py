@@ -27,7 +27,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
-from fisheye_svp_ros.study.lens_trust import (
+from fisheye_svp_ros.study.trust import (
     assess_lens,
     calibrate_without_outliers,
     with_covariance,

@@ -125,7 +125,7 @@ def localize(
     table, known = table_and_lens(observations, lens)
     if model_error:
         from fisheye_svp_ros.diagnosis import LensErrors
-        from fisheye_svp_ros.study.pose_errors import localize_with_errors
+        from fisheye_svp_ros.study.trust import localize_with_errors
 
         measured, _ = localize_with_errors(LensErrors.from_lens(known), table)
     else:
@@ -155,7 +155,7 @@ def calibrate(
     Raises LensError for an unknown model or parameter, ParameterError for an image size that is
     none, ObservationError or GeometryError where the data do not fix a lens.
     """
-    from fisheye_svp_ros.study.lens_trust import (
+    from fisheye_svp_ros.study.trust import (
         assess_lens,
         calibrate_without_outliers,
         with_covariance,
@@ -219,7 +219,7 @@ def stereo_depth(
     covariance = None
     if model_error:
         from fisheye_svp_ros.diagnosis import LensErrors
-        from fisheye_svp_ros.study.pose_errors import depth_errors
+        from fisheye_svp_ros.study.trust import depth_errors
 
         errors = [LensErrors.from_lens(load_lens(lens)) for lens in (left, right)]
         covariance = depth_errors(errors[0], errors[1], rig, solved.points).total

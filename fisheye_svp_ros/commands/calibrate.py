@@ -11,6 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from fisheye_svp_ros.commands.detect import (
+    add_observation_arguments,
+    image_sizes,
+    read_input,
+    search_options,
+)
 from fisheye_svp_ros.commands.lenses import add_port_arguments, load_with_notes, port_of
 from fisheye_svp_ros.commands.outputs import (
     counted,
@@ -19,12 +25,6 @@ from fisheye_svp_ros.commands.outputs import (
     output_file,
     output_path,
     say,
-)
-from fisheye_svp_ros.commands.photographs import (
-    add_observation_arguments,
-    image_sizes,
-    read_input,
-    search_options,
 )
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, ParameterError
 from fisheye_svp_ros.io.files import write_json, write_text, write_together
@@ -194,7 +194,7 @@ def _calibrate_camera(
     table: Observations, args: argparse.Namespace, size: tuple[int, int], name: str
 ) -> CalibratedCamera:
     """Return the lens, the rows that it is of, without outliers, and what may be trusted."""
-    from fisheye_svp_ros.study.lens_trust import (
+    from fisheye_svp_ros.study.trust import (
         assess_lens,
         calibrate_without_outliers,
         with_covariance,

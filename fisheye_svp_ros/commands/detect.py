@@ -1,20 +1,43 @@
-"""`fisheye-svp detect`: photographs of a board to observations."""
+"""`fisheye-svp detect`: photographs of a board to observations.
+
+Other commands take photographs in place of observations: the arguments for it, the search.
+"""
 
 from __future__ import annotations
 
 import argparse
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fisheye_svp_ros.commands.outputs import output_file, output_folder
-from fisheye_svp_ros.commands.photographs import add_board_arguments, search
+from fisheye_svp_ros.commands.outputs import output_file, output_folder, say
+from fisheye_svp_ros.detect.finders import DETECTORS
+from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
+from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_json, write_together
-from fisheye_svp_ros.io.readers import write_observations
+from fisheye_svp_ros.io.readers import (
+    Sizes,
+    photographs_beside,
+    read_observations,
+    write_observations,
+)
+from fisheye_svp_ros.scene.observations import Observations
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.detect.detection import Detection
+
+_MAX_LISTED = 12
+_UNCERTAIN = 0.9
+_MIN_LARGER_SHARE = 0.2  # of all boards: a wrong count shows where the next squares are visible
+_MIN_BEYOND_SHARE = 0.05  # of all tags: another board in the background has few
+_TIME = re.compile(r'([\d.]+) *(s|ms|us|ns)')
+_UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -91,3 +114,155 @@ def _document(detection: Detection, board: str) -> dict[str, Any]:
             for one, frame, sure in rows
         ],
     }
+
+
+def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False) -> None:
+    """Declare what a search for a board in photographs needs."""
+    parser.add_argument('--board', required=required, metavar='SPEC',
+                        help='the board in the photographs: chessboard:9x6:24.23mm (inner '
+                        'corners), charuco:7x5:30mm:22mm:DICT_5X5_100, '
+                        'aprilgrid:target.yaml, circles:7x5:20mm[:asymmetric], '
+                        'squares:3x4:30mm:30mm (side, gap)')
+    parser.add_argument('--detector', choices=DETECTORS, default='',
+                        help='detector; default: the most accurate one for the board')
+    parser.add_argument('--every', type=positive_count, default=1, metavar='N',
+                        help='use every Nth photograph or video frame')
+    parser.add_argument('--sync', type=_seconds, metavar='TIME',
+                        help='for a rig: largest difference between the stamps of simultaneous '
+                        'images (of messages, or in file names); default: 5ms')
+
+
+def search_options(args: argparse.Namespace) -> tuple[str, ...]:
+    """Return the options with which another command finds the same board in photographs."""
+    options = ['--board', args.board]
+    options += ['--detector', args.detector] if args.detector else []
+    options += ['--sync', f'{args.sync}s'] if args.sync else []
+    return (*options, *(['--every', str(args.every)] if args.every > 1 else []))
+
+
+def add_observation_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare OBS, and what a search needs where these are photographs."""
+    parser.add_argument('observations', metavar='OBS',
+                        help='observations (CSV file, folder of ORPC files, recording), or '
+                        'photographs, with --board')
+    add_board_arguments(parser)
+
+
+def read_input(path: str, args: argparse.Namespace) -> tuple[Observations, Sizes]:
+    """Return observations from a file, or from photographs, with the image size of each camera.
+
+    Raises ObservationError for anything missing or malformed, ParameterError for photographs
+    without a board.
+    """
+    from fisheye_svp_ros.detect.photographs import is_photographs
+
+    # Beside photographs other observations (held out, of another day) may be a table already.
+    if args.board and Path(path).suffix.lower() != '.csv':
+        detection = search([path], args)
+        return detection.observations, detection.image_sizes
+    if is_photographs(Path(path)):
+        raise ParameterError(f'{path}: these are photographs; name their board, for example '
+                             '--board chessboard:9x6:24mm')
+    table = read_observations(path)
+    return replace(table, photographs=photographs_beside(Path(path), table.cameras)), {}
+
+
+def image_sizes(text: str) -> Sizes:
+    """Return the image size of each camera, or of all under '', of a text such as 1280x800."""
+    parts = [part.rpartition('=') for part in text.split(',')]
+    sizes = {camera.strip(): image_size(size) for camera, _, size in parts}
+    if len(sizes) < len(parts):
+        raise argparse.ArgumentTypeError(
+            f'{text!r} has two sizes for one camera; use left=1280x960,right=640x480')
+    return sizes
+
+
+def image_size(text: str) -> tuple[int, int]:
+    """Return width and height, px, of a text such as 1280x800."""
+    width, _, height = text.lower().partition('x')
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f'{text!r} is not of the form 1280x800')
+    return int(width), int(height)
+
+
+def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
+    """Search photographs for the board; say which have none, and which are odd."""
+    from fisheye_svp_ros.detect.detection import LARGER_BOARD, detect
+    from fisheye_svp_ros.detect.photographs import (
+        count_photographs,
+        doubtful_folders,
+        find_photographs,
+    )
+    from fisheye_svp_ros.reporting.terminal import progress
+
+    pattern = parse_pattern(args.board)
+    if args.detector and pattern.kind not in DETECTORS[args.detector][0]:
+        raise ParameterError(f'--detector {args.detector} does not find {args.board}')
+    count = count_photographs(paths, args.every)
+    for line in doubtful_folders(paths):
+        say(line)
+    with progress('searching', count) as done:
+        detection = detect(find_photographs(paths, args.every), pattern, args.detector,
+                           progress=done, source=', '.join(paths), sync=args.sync)
+    odd = [f'{one.name}: {"; ".join(filter(None, (one.reason, *one.notes)))}'
+           for one in sorted(detection.searched, key=lambda one: not one.reason)
+           if one.reason or one.notes]
+    for line in odd[:_MAX_LISTED]:
+        say(line)
+    if len(odd) > _MAX_LISTED:
+        say(f'and {len(odd) - _MAX_LISTED} more such photographs')
+    _note_alone(detection)
+    unsure = int((detection.certainty < _UNCERTAIN).sum())
+    if unsure:
+        say(f'{unsure} photographs: their orientation is less than {100 * _UNCERTAIN:.0f} % sure, '
+            f'since {args.board} looks the same when turned')
+    found = sum(one.points is not None for one in detection.searched)
+    larger = sum(LARGER_BOARD in one.notes for one in detection.searched)
+    if larger and larger >= _MIN_LARGER_SHARE * found:
+        say(f'{larger} of {found} boards look larger than {args.board}; count its inner corners '
+            'again, otherwise photographs may number different corners alike')
+    _note_tags(detection, pattern)
+    if 2 * found < len(detection.searched):
+        counted = ' (inner corners)' if pattern.kind == 'chessboard' else ''
+        say(f'no {args.board} in most photographs; check kind and size{counted} of the board')
+    return detection
+
+
+def _note_tags(detection: Detection, pattern: Pattern) -> None:
+    """Say where many tags have numbers that the board, as it was described, does not have."""
+    seen, beyond = np.sum([one.tags for one in detection.searched], axis=0).tolist()
+    if beyond > _MIN_BEYOND_SHARE * seen:
+        words = 'tagCols and tagRows' if pattern.kind == 'aprilgrid' else 'its columns and rows'
+        say(f'{beyond} of {seen} tags have ids beyond the {pattern.columns}x{pattern.rows} board; '
+            f'check {words}')
+
+
+def _note_alone(detection: Detection) -> None:
+    """Say which photographs of a rig have no partner of the same moment."""
+    alone = [detection.searched[i].name for i in detection.pairing.alone]
+    if len(alone) == len(detection.searched):
+        say(f'no photographs of two cameras are simultaneous, by {detection.pairing.way}; give '
+            'simultaneous ones the same name or number, or name them by their stamps and raise '
+            '--sync')
+    elif alone:
+        more = f' and {len(alone) - _MAX_LISTED} more' if len(alone) > _MAX_LISTED else ''
+        say(f'{len(alone)} of {len(detection.searched)} photographs have no simultaneous partner, '
+            f'by {detection.pairing.way}: {", ".join(alone[:_MAX_LISTED])}{more}')
+
+
+def _seconds(text: str) -> float:
+    match = _TIME.fullmatch(text)
+    try:
+        value = float(match[1]) * _UNITS[match[2]] if match else 0.0
+    except ValueError:
+        value = 0.0
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text!r} is not a time with a unit, such as 5ms')
+    return value
+
+
+def positive_count(text: str) -> int:
+    """Return a whole number above 0 of a text."""
+    if not text.isdecimal() or not int(text):
+        raise argparse.ArgumentTypeError(f'{text!r} is not a whole number above 0')
+    return int(text)

@@ -9,6 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fisheye_svp_ros.commands.detect import (
+    add_observation_arguments,
+    read_input,
+    search_options,
+)
 from fisheye_svp_ros.commands.lenses import (
     Lenses,
     add_dome_arguments,
@@ -23,11 +28,6 @@ from fisheye_svp_ros.commands.outputs import (
     note_left_out,
     note_unconnected,
     output_folder,
-)
-from fisheye_svp_ros.commands.photographs import (
-    add_observation_arguments,
-    read_input,
-    search_options,
 )
 from fisheye_svp_ros.commands.plan import view_count, view_limits
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.reporting.terminal import stages
     from fisheye_svp_ros.solve.measured_poses import poses_by_frame, rig_lenses
     from fisheye_svp_ros.solve.rig_state import free_parameters
-    from fisheye_svp_ros.study.pose_errors import known_errors
+    from fisheye_svp_ros.study.trust import known_errors
 
     _check_options(args)
     given = load_lenses(args.lens)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.commands.detect import add_observation_arguments, read_input
 from fisheye_svp_ros.commands.lenses import add_lens_argument, lenses_of, load_lenses
 from fisheye_svp_ros.commands.outputs import (
     note_doubtful,
@@ -20,7 +21,6 @@ from fisheye_svp_ros.commands.outputs import (
     output_folder,
     say,
 )
-from fisheye_svp_ros.commands.photographs import add_observation_arguments, read_input
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.csv_files import write_table
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> None:
         with progress('localizing'):
             if args.model_error:
                 from fisheye_svp_ros.diagnosis import LensErrors, pose_summary
-                from fisheye_svp_ros.study.pose_errors import localize_with_errors
+                from fisheye_svp_ros.study.trust import localize_with_errors
 
                 measured, parts = localize_with_errors(LensErrors.from_lens(lens), table)
                 uncertainty = pose_summary(parts)

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from fisheye_svp_ros.commands.detect import image_size
 from fisheye_svp_ros.commands.lenses import Lenses, lenses_of, load_lenses
 from fisheye_svp_ros.commands.outputs import output_folder, say
-from fisheye_svp_ros.commands.photographs import image_size
 from fisheye_svp_ros.detect.photographs import (
     IMAGES,
     count_photographs,

@@ -20,7 +20,7 @@ from fisheye_svp_ros.solve.measured_poses import rms_px
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.solve.lens_calibration import Calibration
-    from fisheye_svp_ros.study.lens_trust import LensTrust
+    from fisheye_svp_ros.study.trust import LensTrust
 
 STANDARD_ERRORS = ('standard errors include local errors of target, frames and image, and the '
                    'shape and scale of the target')

@@ -226,7 +226,7 @@ def _own_errors(setup: Setup, points: Array) -> dict[str, dict[str, Array]]:
     if setup.lens.uncertainty is None:
         return {}
     from fisheye_svp_ros.diagnosis import LensErrors
-    from fisheye_svp_ros.study.pose_errors import depth_errors
+    from fisheye_svp_ros.study.trust import depth_errors
 
     errors, lens = LensErrors.from_lens(setup.lens), ForwardModel(setup.lens)
     some = points[:, ::_STEREO_CAPS]

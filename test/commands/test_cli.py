@@ -405,7 +405,7 @@ class TestCalibrate:
         def trust(*_):
             raise np.linalg.LinAlgError('SVD did not converge')
 
-        monkeypatch.setattr('fisheye_svp_ros.study.lens_trust.assess_lens', trust)
+        monkeypatch.setattr('fisheye_svp_ros.study.trust.assess_lens', trust)
         assert 'the fitted lens has no rays to some of the observed points' in refused(
             capsys, 'calibrate', scene[0] / 'observations.csv', '--image-size', '1280x960')
 

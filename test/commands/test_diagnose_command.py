@@ -39,7 +39,7 @@ from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
 from fisheye_svp_ros.solve.rig_state import Linearization, with_effect
-from fisheye_svp_ros.study.pose_errors import known_errors
+from fisheye_svp_ros.study.trust import known_errors
 
 # Rays beyond 90 degrees: no plane window can be mistaken for a viewpoint shift.
 LENS = Lens('made', 1280, 960, 300.0, 300.0, 650.0, 470.0, KannalaBrandt(-0.03), 2.0)

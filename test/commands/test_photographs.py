@@ -19,9 +19,9 @@ from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, write
 
 import fisheye_svp_ros as fsvp
 from fisheye_svp_ros import cli
+from fisheye_svp_ros.commands.detect import read_input
 from fisheye_svp_ros.commands.diagnose import _read as read_views
 from fisheye_svp_ros.commands.lenses import lenses_of, load_lenses
-from fisheye_svp_ros.commands.photographs import read_input
 from fisheye_svp_ros.errors import LensError, ParameterError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_observations, read_poses, write_observations

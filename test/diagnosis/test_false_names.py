@@ -19,7 +19,7 @@ from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame, with_effect
-from fisheye_svp_ros.study.pose_errors import known_errors
+from fisheye_svp_ros.study.trust import known_errors
 
 SIGMA = 0.2
 

@@ -28,7 +28,7 @@ from fisheye_svp_ros.scene.observations import make_observations, views_of
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
 from fisheye_svp_ros.study.budget import Setup, make_budget
-from fisheye_svp_ros.study.pose_errors import depth_errors, localize_with_errors
+from fisheye_svp_ros.study.trust import depth_errors, localize_with_errors
 
 pytestmark = pytest.mark.usefixtures('undrawn')
 

@@ -18,7 +18,7 @@ from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.outliers import find_outliers
 from fisheye_svp_ros.solve.port_fit import MEDIUM_INDEX, PORT_PLACE
 from fisheye_svp_ros.solve.rig_state import group_by_frame
-from fisheye_svp_ros.study.lens_trust import assess_lens, with_covariance
+from fisheye_svp_ros.study.trust import assess_lens, with_covariance
 
 pytestmark = pytest.mark.usefixtures('undrawn')
 

@@ -35,7 +35,7 @@ from fisheye_svp_ros.solve.measured_poses import posable_observations
 from fisheye_svp_ros.solve.outliers import FRAME, find_outliers
 from fisheye_svp_ros.solve.rig_checks import rig_is_inconsistent
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
-from fisheye_svp_ros.study.pose_errors import known_errors
+from fisheye_svp_ros.study.trust import known_errors
 
 pytestmark = pytest.mark.usefixtures('undrawn')
 

@@ -47,7 +47,7 @@ from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve import reliability
 from fisheye_svp_ros.solve.localization import localize
-from fisheye_svp_ros.study.pose_errors import localize_with_errors
+from fisheye_svp_ros.study.trust import localize_with_errors
 
 
 class Endpoint(NamedTuple):

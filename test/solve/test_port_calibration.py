@@ -9,7 +9,7 @@ from helpers.water import AIR, photographs
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import DomeGlass, FlatGlass
 from fisheye_svp_ros.solve.lens_calibration import calibrate, calibrate_port
-from fisheye_svp_ros.study.lens_trust import assess_lens
+from fisheye_svp_ros.study.trust import assess_lens
 
 FLAT = FlatGlass(0.035, 1.333, 0.02, -0.01)
 DOME = DomeGlass(0.06, 1.333, 0.004, -0.003, 0.012)
