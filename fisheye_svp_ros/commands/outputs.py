@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.errors import OutputError
-from fisheye_svp_ros.scene.observations import frame_name, list_frames
+from fisheye_svp_ros.scene.observations import Observations, frame_name, list_frames
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.scene.observations import Observations
     from fisheye_svp_ros.solve.outliers import Outliers
 
 _PHOTOGRAPHS = ('observations', 'photographs', 'inputs')  # arguments whose folders are read again
