@@ -42,7 +42,7 @@ from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import quaternion_from_rotation
 from fisheye_svp_ros.reporting.calibration_text import (
-    HAND_EYE_HEADER,
+    ROBOT_HEADER,
     STANDARD_ERRORS,
     CalibratedCamera,
     hand_eye_rows,
@@ -243,7 +243,7 @@ def _print(found: CalibratedCamera) -> None:
     print(f'  max_incidence_deg {np.degrees(lens.max_incidence):.2f}, image points up to '
           f'{np.degrees(found.result.reached):.2f}; {STANDARD_ERRORS}')
     if found.hand_eye:
-        print_table(hand_eye_sentence(found.hand_eye), HAND_EYE_HEADER, hand_eye_rows(found.hand_eye))
+        print_table(hand_eye_sentence(found.hand_eye), ROBOT_HEADER, hand_eye_rows(found.hand_eye))
 
 
 def _document(found: CalibratedCamera) -> dict[str, Any]:

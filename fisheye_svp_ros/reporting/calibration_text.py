@@ -28,7 +28,7 @@ _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens s
 _MODEL_ERROR_RATIO = 2.0  # times the noise, from which residuals show a model error
 _MAX_CENTER_OFFSET = 0.1  # of the image, by which a principal point is seldom off its centre
 _MIN_COVERED_RADIUS = 0.7  # of the way to the nearest edge; less is poor coverage
-HAND_EYE_HEADER = ('transform', 'x, mm', 'y, mm', 'z, mm', 'rx, deg', 'ry, deg', 'rz, deg')
+ROBOT_HEADER = ('transform', 'x, mm', 'y, mm', 'z, mm', 'rx, deg', 'ry, deg', 'rz, deg')
 _LARGE_SHARE = 0.5  # of the squares of all frames: such a pose is wrong
 _MIN_FRAMES = 6
 _MAX_SCALE = 2.0  # of lengths, either way: more is another unit, or the size of another board
@@ -128,7 +128,7 @@ def hand_eye_sentence(found: HandEye) -> str:
 
 
 def hand_eye_rows(found: HandEye) -> list[tuple[str, ...]]:
-    """Return both transforms as HAND_EYE_HEADER has them, each with its standard errors below it."""
+    """Return both transforms as ROBOT_HEADER has them, each with its standard errors below it."""
     return [*_rows('camera in flange', found.camera, found.stderr[:6]),
             *_rows('target in base', found.target, found.stderr[6:12])]
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from fisheye_svp_ros.diagnosis import Comparison, Diagnosis, Transfer, TwoCameras, TwoDatasets
 from fisheye_svp_ros.reporting.calibration_text import (
-    HAND_EYE_HEADER,
+    ROBOT_HEADER,
     hand_eye_rows,
     hand_eye_sentence,
     hand_eye_warnings,
@@ -58,8 +58,8 @@ def _of_robot(found: HandEye) -> Section:
     sentence = ('The given poses are those of the flange, not of the camera, which is at '
                 f'{x:.2f}, {y:.2f}, {z:.2f} mm in the flange. They were not used as camera poses: '
                 f'{hand_eye_sentence(found)}.')
-    warnings = [f' {one[0].upper()}{one[1:]}.' for one in hand_eye_warnings(found)]
-    return Section(ROBOT_TITLE, sentence + ''.join(warnings), [], HAND_EYE_HEADER, hand_eye_rows(found))
+    sentence += ''.join(f' {one[0].upper()}{one[1:]}.' for one in hand_eye_warnings(found))
+    return Section(ROBOT_TITLE, sentence, [], ROBOT_HEADER, hand_eye_rows(found))
 
 
 def _of_cameras(pair: TwoCameras) -> Section:

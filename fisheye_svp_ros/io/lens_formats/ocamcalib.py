@@ -16,7 +16,6 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_formats import Foreign, models
 from fisheye_svp_ros.io.lens_formats.fields import MAX_NUMBER
 
-_NUMBERS = re.compile(r'^[-+.\deE\s]+$')
 _LINES = ('direct polynomial', 'inverse polynomial', 'center', 'affine c, d, e', 'image size')
 _MARK = re.compile(r'affine.*"?c"?, *"?d"?, *"?e"?', re.IGNORECASE)
 _SAMPLES = 4001
