@@ -19,7 +19,6 @@ import numpy as np
 
 from benchmark import study
 from benchmark.boards import HEIGHT, WIDTH, draw_set
-from fisheye_svp_ros.diagnosis.stages import extended_lenses
 from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK, NOISE
 from fisheye_svp_ros.reporting.plots import legend_below, picture
 

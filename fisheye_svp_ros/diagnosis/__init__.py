@@ -12,18 +12,18 @@
 Other rooms import what stands here, and nothing else.
 """
 
-from fisheye_svp_ros.diagnosis.advice import (
+from fisheye_svp_ros.diagnosis.causes import CONFOUNDED_P, Cause
+from fisheye_svp_ros.diagnosis.checks.two_cameras import Transfer, TwoCameras, deviations
+from fisheye_svp_ros.diagnosis.checks.two_datasets import SharedParameter, TwoDatasets
+from fisheye_svp_ros.diagnosis.conclusion import (
     DIAGNOSE_AIR,
     RETAKE,
     TURNED,
     UNLIKE,
     USE_EXTENDED,
     Advice,
+    frames_of,
 )
-from fisheye_svp_ros.diagnosis.causes import CONFOUNDED_P, Cause
-from fisheye_svp_ros.diagnosis.checks.two_cameras import Transfer, TwoCameras, deviations
-from fisheye_svp_ros.diagnosis.checks.two_datasets import SharedParameter, TwoDatasets
-from fisheye_svp_ros.diagnosis.conclusion import frames_of
 from fisheye_svp_ros.diagnosis.cross_validation import (
     Comparison,
     HeldOut,

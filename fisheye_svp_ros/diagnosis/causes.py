@@ -50,6 +50,16 @@ class Cause:
         """The class of the effect, which says what it is."""
         return CATALOGUE[self.effect]
 
+    @property
+    def stage(self) -> str:
+        """The part of the variance budget that it belongs to: lens, target, frame or noise."""
+        return self.effect_class.budget_stage()
+
+    @property
+    def parts(self) -> list[str]:
+        """What its parameters are of (PART.NAME): single boards or landmarks, say."""
+        return list(dict.fromkeys(name.partition('.')[0] for name in self.parameters))
+
 
 def selected_causes(
     tests: EffectTests, found: Sequence[PlacedEffect], errors: Array, shares: dict[str, float],

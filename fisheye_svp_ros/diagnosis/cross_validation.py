@@ -1,26 +1,52 @@
 """Cross-validation: residuals of frames that were not used, and errors where the truth is known.
 
 Poses are fitted to the frames, all else is predicted from the others or from other data.
+Contiguous blocks of the frames are a warning, no decision: a cause that the camera has for part of
+the recording only, or that stands in for something else, may make a block worse although it
+predicts single frames better.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets, refit
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets, refit
 from fisheye_svp_ros.diagnosis.null_model import NullModel
-from fisheye_svp_ros.mixed_model import pseudo_inverse
+from fisheye_svp_ros.mixed_model import (
+    FactoredEquations,
+    RandomColumns,
+    Variances,
+    factor_equations,
+    make_equations,
+    pseudo_inverse,
+)
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.table_checks import is_another_target
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
-from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
+from fisheye_svp_ros.solve.initial_rig import localize_frames
+from fisheye_svp_ros.solve.outliers import Outliers, find_outliers
+from fisheye_svp_ros.solve.rig_checks import has_no_rig, rig_differs, unpair_cameras
+from fisheye_svp_ros.solve.rig_state import (
+    Linearization,
+    RigState,
+    RigViews,
+    group_by_frame,
+)
 
 _RESAMPLES = 2000
 _PREDICTED_RATIO = 5.0  # times the median frame
 _LINEAR_PX = 3.0  # rms: how far a step that is taken to be linear may move image points
+BLOCKS = 3
+_MIN_FRAMES = 9
+_MAX_SQUARE_RATIO = 1.02  # times the sum of squares without: less is chance
+
+Ends = tuple[int, int]  # the first and the last frame of a block
 
 
 class HeldOut(NamedTuple):
@@ -158,7 +184,7 @@ def fit_without_causes(null: NullModel, names: Sequence[str], free: Sequence[str
     By one linear step; where that is too long to be linear, step by step.
     """
     linear = null.linear
-    kept, change, _ = refit_shared(null, null.information, names, ())
+    kept, change, _ = refit_shared(null, null.information, names)
     shared = np.zeros(null.column_count)
     shared[kept] = change
     moves = (linear.shared_columns @ shared)[linear.row_mask] / linear.row_weight[linear.row_mask]
@@ -170,7 +196,7 @@ def fit_without_causes(null: NullModel, names: Sequence[str], free: Sequence[str
 
 
 def refit_shared(
-    null: NullModel, information: Array, names: Collection[str], held: Collection[str]
+    null: NullModel, information: Array, names: Collection[str] = (), held: Collection[str] = ()
 ) -> tuple[Index, Array, Array]:
     """Return the columns that are fitted, their change, and (m,) what is left.
 
@@ -216,11 +242,15 @@ def cross_validate(
     for frame, information in enumerate(null.information_without_frames(at)):
         _, _, combination = refit_shared(null, information, without, held)
         rows = null.fixed.border if offsets is None else null.leave_one_out.rows
-        left, poses = rows[frame][:, at] @ combination * ratio[frame], linear.frame_columns[frame]
-        left -= repeating[frame]
-        poses = poses * ratio[frame][:, None]
-        residual[frame] = left - poses @ (np.linalg.pinv(poses, rcond=1e-9) @ left)
-    return sum_squares(linear, residual / ratio)
+        residual[frame] = rows[frame][:, at] @ combination
+    left = refit_poses((residual * ratio - repeating)[..., None],
+                       linear.frame_columns * ratio[..., None])
+    return sum_squares(linear, left[..., 0] / ratio)
+
+
+def refit_poses(rows: Array, columns: Array) -> Array:
+    """Return rows (F, M, C) without what poses of columns (F, M, 6), fitted to them, take up."""
+    return np.asarray(rows - columns @ (np.linalg.pinv(columns, rcond=1e-9) @ rows))
 
 
 def noise_ratio(linear: Linearization) -> Array:
@@ -235,3 +265,126 @@ def sum_squares(linear: Linearization, whitened: Array) -> HeldOut:
     weight = linear.row_weight
     px = np.where(weight > 0, whitened / np.maximum(weight, 1e-12), 0.0)
     return HeldOut((px**2).sum(axis=1), (weight > 0).sum(axis=1) / 2)
+
+
+@dataclass(frozen=True)
+class HeldOutData:
+    """Other frames of the same cameras, posed, without outliers.
+
+    rig_differs: whether the cameras do not stand as in the data, so that each view was posed by
+    itself; another_target: whether landmarks of one number stand in other places.
+    """
+
+    data: RigViews
+    pose: Pose
+    outliers: Outliers
+    rig_differs: bool
+    another_target: bool
+
+    @classmethod
+    def prepare(cls, held_out: Observations, model: Linearization) -> HeldOutData:
+        """Pose other frames by the extended model, and set outliers aside.
+
+        These are no measure of a model; the same points are left out for all.
+        """
+        trained = model.data
+        another_target = is_another_target(trained.observations, held_out)
+        table = group_by_frame(held_out)
+        if has_no_rig(trained):
+            table = unpair_cameras(table)
+        state = valid_state(model.state, table, trained, another_target)
+        data, outliers = find_outliers(table, localize_frames(table, state))
+        differs = rig_differs(data, state)
+        if differs:
+            table = unpair_cameras(table)
+            data, outliers = find_outliers(table, localize_frames(table, state))
+        return cls(data, localize_frames(data, state).pose, outliers, differs, another_target)
+
+
+def valid_state(
+    state: RigState, test: RigViews, trained: RigViews, another_target: bool
+) -> RigState:
+    """Return the state without what trained frames or their target had, and the test has not."""
+    t, known = test.observations.t, trained.observations.t
+    return replace(state, terms=tuple(
+        term for term in state.terms if term[0].holds_for(t, known)
+        and not (another_target and term[0].place == 'target')))
+
+
+def contiguous_blocks(data: RigViews) -> tuple[Index, list[Ends]]:
+    """Return the block (F,) of each frame, and the first and the last frame of each block.
+
+    Views of one frame that no rig holds together are in one block.
+    """
+    first = np.unique(data.frame_of, return_index=True)[1]
+    numbers, place = np.unique(data.views.frame[first], return_inverse=True)
+    of_number = np.arange(len(numbers)) * BLOCKS // len(numbers)
+    parts = [numbers[of_number == i] for i in range(BLOCKS)]
+    return of_number[place.reshape(-1)], [
+        (int(part[0]), int(part[-1])) for part in parts if len(part)]
+
+
+def split_frames(
+    fitted: FittedModel, variances: Variances, out: Mask
+) -> tuple[FactoredEquations, RandomColumns]:
+    """Return the equations of all frames but some, factored, and the random columns of those.
+
+    out (F,): the frames that are left out.  The border holds the columns of the model, each over
+    its scale, and the residual.
+    """
+    linear, columns = fitted.linear, fitted.random.columns
+    height = linear.residual.shape[1]
+    row = np.arange(out.size * height).reshape(out.size, height)
+    trained, tested = (columns._replace(
+        group=columns.group[part], offset=columns.offset[part], unit=columns.unit[part],
+        shared=columns.shared[row[part].ravel()]) for part in (~out, out))
+    border = np.concatenate(
+        [linear.shared_columns / fitted.scale, linear.residual[..., None]], axis=-1)
+    eq = make_equations(trained, linear.frame_columns[~out], border[~out])
+    return factor_equations(eq.with_ridge(1e-9), variances.lam, variances.weight), tested
+
+
+def misfits(linear: Linearization, out: Mask, rows: Array) -> Array:
+    """Return sums of squares (C,), px^2, of whitened rows (F, M, C) of frames, poses refitted."""
+    left, weight = refit_poses(rows, linear.frame_columns[out]), linear.row_weight[out]
+    used = weight > 0
+    return np.asarray(((left[used] / weight[used][:, None]) ** 2).sum(axis=0))
+
+
+def refuting_blocks(null: NullModel, fitted: FittedModel) -> dict[str, tuple[Ends, ...]]:
+    """Return, by lasting effect, the contiguous thirds that the others predict worse with it.
+
+    Nothing of few frames; random effects are not predicted.
+    """
+    linear, own = null.linear, null.included_columns
+    lasting = [term for term in null.terms if not (term[0].per_frame or term[0].of_recording)]
+    block, ends = contiguous_blocks(linear.data)
+    if linear.data.frames < _MIN_FRAMES or len(ends) < BLOCKS:
+        return {}
+    models = [own, *(np.setdiff1d(own, columns) for _, columns, _ in lasting)]
+    found: dict[str, tuple[Ends, ...]] = {}
+    for i, edge in enumerate(ends):
+        out = block == i
+        information = split_frames(fitted, null.variances, out)[0].information
+        predicted = np.stack([_predict(null, information, model) for model in models], axis=-1)
+        border = np.concatenate([linear.shared_columns[out] / null.scale[own],
+                                 linear.residual[out][..., None]], axis=-1)
+        whole, *without = misfits(linear, out, border @ predicted)
+        for (effect, _, _), square in zip(lasting, without, strict=True):
+            if whole > _MAX_SQUARE_RATIO * square:
+                found[effect.name] = (*found.get(effect.name, ()), edge)
+    return found
+
+
+def _predict(null: NullModel, information: Array, included: Index) -> Array:
+    """Return the residual with some of the model's columns, fitted to other frames.
+
+    As a combination (own + 1,) of the columns of the model and its residual.
+    """
+    own = null.included_columns
+    at = np.append(own, len(null.scale))
+    part = null.restrict_information(information, included, at)
+    combination = null.residual_combination(included)[at]
+    combination[included] -= np.linalg.lstsq(
+        part[np.ix_(included, included)], part[included, -1], rcond=1e-13)[0]
+    return np.asarray(combination)

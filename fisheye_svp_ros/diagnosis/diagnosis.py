@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.advice import Advice
-from fisheye_svp_ros.diagnosis.averaging import AveragedModel
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.turned_boards import (
     TurnedFrame,
@@ -18,7 +16,7 @@ from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras
 from fisheye_svp_ros.diagnosis.checks.two_datasets import (
     TwoDatasets,
 )
-from fisheye_svp_ros.diagnosis.conclusion import Conclusion
+from fisheye_svp_ros.diagnosis.conclusion import Advice, Conclusion
 from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause
 from fisheye_svp_ros.diagnosis.cross_validation import Comparison
 from fisheye_svp_ros.diagnosis.decision import Decision, FileFigure
@@ -37,6 +35,7 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
     Component,
     Structure,
 )
+from fisheye_svp_ros.diagnosis.written_lens import AveragedModel
 from fisheye_svp_ros.effects.target_map import BoardMap, board_maps
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose

@@ -13,26 +13,26 @@ from itertools import pairwise
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.diagnosis.averaging import AveragedModel
 from fisheye_svp_ros.diagnosis.causes import Cause, selected_causes
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.checks.similar_views import similar_views
 from fisheye_svp_ros.diagnosis.cross_validation import (
     Comparison,
     HeldOut,
+    HeldOutData,
     cross_validate,
     fit_without_causes,
     held_out_gain,
     predict_other_data,
+    refuting_blocks,
+    valid_state,
 )
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
-from fisheye_svp_ros.diagnosis.frame_blocks import refuting_blocks
-from fisheye_svp_ros.diagnosis.held_out_data import HeldOutData, valid_state
-from fisheye_svp_ros.diagnosis.image_fields import WrittenField
 from fisheye_svp_ros.diagnosis.lens_errors import stated_parameters
 from fisheye_svp_ros.diagnosis.model_errors import ModelErrors, shared_names
 from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.diagnosis.problem import extended_lenses
 from fisheye_svp_ros.diagnosis.selection import Selection
 from fisheye_svp_ros.diagnosis.uncertainty import (
     OtherModel,
@@ -47,13 +47,11 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
     noise_px,
     variance_budget,
 )
+from fisheye_svp_ros.diagnosis.written_lens import AveragedModel, WrittenField
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
-from fisheye_svp_ros.solve.rig_state import (
-    Linearization,
-    is_shared,
-    rms_px,
-)
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, is_shared, rms_px
 
 MAX_RMS_RATIO = 1.01  # a rise by less is none: noise that grows with the angle has weights
 
@@ -110,7 +108,8 @@ class Evaluation:
         if views is not None:
             noise *= float(np.sqrt(1 - views.share))
         held_out = selection.problem.inputs.held_out
-        test = None if held_out is None else HeldOutData.prepare(held_out, selection)
+        test = None if held_out is None else HeldOutData.prepare(
+            held_out, selection.null.linear)
         return cls(selection, fitted, offsets, noise, test, medium)
 
     @property
@@ -147,6 +146,11 @@ class Evaluation:
     def written_model(self) -> Linearization:
         """The model whose lens is written, without random effects: poses are fitted anew."""
         return _with_poses_anew(self.averaged_model.linear)
+
+    def extended_lenses(self, state: RigState) -> dict[str, Lens]:
+        """Return the lenses of a state, with its effects, for every command and node."""
+        problem = self.selection.problem
+        return extended_lenses(problem.inputs.lenses, state, problem.observations)
 
     @cached_property
     def uncertainty(self) -> dict[str, dict[str, float]]:
@@ -369,7 +373,7 @@ class Evaluation:
         selection = self.selection
         written = self.averaged_model
         alone = self._errors_of(self.null, self.other_models) if written.kinds else self.errors
-        errors = written.widen_errors(alone)
+        errors = np.sqrt(np.diag(written.widen(np.diag(alone**2))))
         after = dict(zip(shared_names(written.linear), errors, strict=True))
         given = stated_parameters(selection.problem.inputs.lenses)
         before = self._errors_of(selection.first)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis.averaging import OpenShifts
+from fisheye_svp_ros.arrays import Array, Index, Mask, flat_rows
 from fisheye_svp_ros.diagnosis.cross_validation import (
     HeldOut,
     gain_and_confidence,
     noise_ratio,
-    refit_shared,
+    refit_poses,
     sum_squares,
 )
 from fisheye_svp_ros.diagnosis.decision import (
@@ -23,10 +22,10 @@ from fisheye_svp_ros.diagnosis.decision import (
     least_likely_offset,
 )
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
-from fisheye_svp_ros.diagnosis.image_fields import WrittenField
-from fisheye_svp_ros.diagnosis.lens_covariance import LensCovariance
 from fisheye_svp_ros.diagnosis.lens_errors import InAir, stated_parameters
 from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.diagnosis.uncertainty import LensCovariance
+from fisheye_svp_ros.diagnosis.written_lens import OpenShifts
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.mixed_model import pseudo_inverse, solve_lower
 from fisheye_svp_ros.optics.lens import Lens
@@ -39,7 +38,7 @@ from fisheye_svp_ros.solve.ray_errors import (
     typical_points,
     without_motion,
 )
-from fisheye_svp_ros.solve.rig_state import Linearization, RigState, is_shared
+from fisheye_svp_ros.solve.rig_state import Linearization, is_shared
 
 _BOUNDED_EFFECTS = ('viewpoint_shift', 'sensor_tilt', 'decentering')
 _NORMAL_95 = 1.96
@@ -50,8 +49,6 @@ _DIRECTIONS = 64  # more than a lens has parameters
 _NEGLIGIBLE = 1e-8  # of a variance
 _ROUNDING = 1e-10  # of the variance of an angle: below it, a covariance has no root
 _NEAR_RANGE = 1  # of ray_errors.RANGES: 1 m
-
-LensesOf = Callable[[RigState], Mapping[str, Lens]]
 
 
 def lens_columns(linear: Linearization) -> Mask:
@@ -86,27 +83,17 @@ def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
     of_lens = np.append(lens_columns(linear), np.ones(len(shifts.columns), dtype=bool))
     at = null.columns_and_residual(shifts.columns)
     refit_rig = _rig_response(null, at[:-1])
-    residual = np.zeros((2, *linear.residual.shape))
+    residual = np.zeros((*linear.residual.shape, 2))
     for frame, information in enumerate(null.information_without_frames(at)):
-        _, change, combination = refit_shared(null, information, (), ())
-        likely = shifts.posterior(null, information)
-        added = np.append(likely.follow @ likely.mean, likely.mean * null.scale[shifts.columns])
-        combination[:-1] -= added
+        change, added, combination = shifts.refit(null, information)
         new = np.append(now + change - given, np.zeros(len(shifts.columns)))
         off = np.where(of_lens, new * null.scale[at[:-1]] + added, 0.0)
         off[:len(refit_rig)] -= refit_rig @ off
-        extended = null.leave_one_out.rows[frame][:, at] @ combination
-        other = null.fixed.border[frame][:, at[:-1]] @ off
-        residual[:, frame] = _refit_pose(
-            np.stack([extended + other, extended]), linear.frame_columns[frame], ratio[frame])
-    before, after = (sum_squares(linear, one / ratio) for one in residual)
-    return before, after
-
-
-def _refit_pose(whitened: Array, columns: Array, ratio: Array) -> Array:
-    """Return residuals (..., M) of even noise without what a pose with columns (M, 6) takes up."""
-    residual, poses = whitened * ratio, columns * ratio[:, None]
-    return np.asarray(residual - residual @ np.linalg.pinv(poses, rcond=1e-9).T @ poses.T)
+        residual[frame] = (null.leave_one_out.rows[frame][:, at] @ combination)[:, None]
+        residual[frame, :, 0] += null.fixed.border[frame][:, at[:-1]] @ off
+    even = ratio[..., None]
+    left = refit_poses(residual * even, linear.frame_columns * even) / even
+    return sum_squares(linear, left[..., 0]), sum_squares(linear, left[..., 1])
 
 
 def _rig_response(null: NullModel, at: Index) -> Array:
@@ -116,11 +103,8 @@ def _rig_response(null: NullModel, at: Index) -> Array:
     otherwise a center that the rig would absorb counts as an error of the lens as given.
     """
     count = 6 * (null.linear.data.cameras - 1)
-    products = np.zeros((count, len(at)))
-    for frame, poses in enumerate(null.linear.frame_columns):
-        columns = null.fixed.border[frame][:, at]
-        left = columns - poses @ (np.linalg.pinv(poses, rcond=1e-9) @ columns)
-        products += left[:, :count].T @ left
+    left = flat_rows(refit_poses(null.fixed.border[..., at], null.linear.frame_columns))
+    products = left[:, :count].T @ left
     return pseudo_inverse(products[:, :count])[0] @ products
 
 
@@ -175,8 +159,7 @@ def _effect_bound(
 def _edge_cost(null: NullModel, moves: Array) -> tuple[float, float]:
     """Return what whitened moves (F, M) are at the edge once poses took up theirs, px and mrad."""
     linear = null.linear
-    left = np.stack([move - columns @ np.linalg.lstsq(columns, move, rcond=1e-9)[0]
-                     for move, columns in zip(moves, linear.frame_columns, strict=True)])
+    left = refit_poses(moves[..., None], linear.frame_columns)[..., 0]
     weight = np.where(linear.row_weight > 0, linear.row_weight, np.inf)
     px = np.hypot(*np.moveaxis((left / weight).reshape(len(left), -1, 2), -1, 0))
     theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))[:, ::2]
@@ -196,28 +179,27 @@ class LensRays:
     offset: LensOffset | None
 
 
-def find_lens_rays(
-    evaluation: Evaluation, lenses: Mapping[str, Lens], lenses_of: LensesOf
-) -> LensRays:
-    """Compare the rays of lenses as given and as extended.
+def find_lens_rays(evaluation: Evaluation, lenses: Mapping[str, Lens]) -> LensRays:
+    """Compare the rays of lenses as given, by camera, and as extended.
 
-    lenses: as given, by camera; lenses_of: makes extended ones of a state.  The range that the
-    user asks for comes last.
+    The range that the user asks for comes last.
     """
     if evaluation.medium is not None:
         return LensRays({}, None)
-    known, written = LensCovariance.from_evaluation(evaluation), evaluation.written_field
-    before, views = lenses_of(evaluation.simulation.state), known.linear.data.views
+    quick = evaluation.selection.problem.options.quick
+    known = LensCovariance.from_model(
+        evaluation.null, evaluation.averaged_model, None if quick else evaluation.other_models)
+    before = evaluation.extended_lenses(evaluation.simulation.state)
+    views = known.linear.data.views
     errors, offsets, asked = {}, [], evaluation.selection.problem.options.range_m
     for number, (name, given) in enumerate(lenses.items()):
         mine = views.used & ((views.camera == number) | (len(lenses) == 1))[:, None]
         uv = typical_points(views.uv[mine])
-        model, there = _written_rays(known, written, lenses_of, number, name, uv)
+        model, there = _written_rays(evaluation, known, number, name, uv)
         off = _difference(model, points_on_rays(given, uv[there]))
         errors[name] = {'given': model.errors(off), 'extended': model.errors()}
         if asked is not None and asked not in RANGES:
-            wider, near = _written_rays(
-                known, written, lenses_of, number, name, uv, (*RANGES, asked))
+            wider, near = _written_rays(evaluation, known, number, name, uv, (*RANGES, asked))
             more = _difference(wider, points_on_rays(given, uv[near], wider.ranges))
             errors[name]['given'].append(wider.errors(more)[-1])
             errors[name]['extended'].append(wider.errors()[-1])
@@ -228,17 +210,17 @@ def find_lens_rays(
 
 
 def _written_rays(
-    known: LensCovariance, written: WrittenField | None, lenses_of: LensesOf, camera: int,
-    name: str, uv: Array, ranges: tuple[float, ...] = RANGES,
+    evaluation: Evaluation, known: LensCovariance, camera: int, name: str, uv: Array,
+    ranges: tuple[float, ...] = RANGES,
 ) -> tuple[RayModel, Mask]:
     """Return the rays of the lens of a camera that is written, and which points (G,) have some."""
-    linear = known.linear
+    linear, written = known.linear, evaluation.written_field
     of_lens, frames = lens_columns(linear), np.zeros((linear.data.frames, 6))
 
     def extend_lens(step: Array) -> Lens:
         shared = np.zeros(len(of_lens))
         shared[of_lens] = step
-        lens = lenses_of(linear.state.retract(linear.free, frames, shared))[name]
+        lens = evaluation.extended_lenses(linear.state.retract(linear.free, frames, shared))[name]
         return lens if written is None else written.add_to(lens, camera)
 
     model, there = ray_model(

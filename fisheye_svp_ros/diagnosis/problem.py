@@ -1,4 +1,10 @@
-"""First stage, the problem: inputs checked, outliers rejected, the simulation fitted as it is."""
+"""First stage, the problem: inputs checked, outliers rejected, the simulation fitted as it is.
+
+Known poses of the camera are held: they show what free poses hide.  Those of a robot's flange, or
+poses with noise of their own, are not, and what holds them would be blamed on the lens.  So they
+are held only if the whole catalogue, fitted beside them, explains the images as well as free
+poses do; else the hand-eye transform and the noise of the robot are fitted.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +14,19 @@ from functools import cached_property
 
 import numpy as np
 
+from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.detection_effects import QuantisationEffect
-from fisheye_svp_ros.effects.extension import LANDMARKS, landmark_rows, on_boards
-from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.effects.extension import (
+    LANDMARKS,
+    extend_lens,
+    landmark_rows,
+    on_boards,
+)
+from fisheye_svp_ros.effects.of_cameras import camera_terms
+from fisheye_svp_ros.errors import GeometryError, ObservationError, ParameterError
+from fisheye_svp_ros.mixed_model import eliminate
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.boards import is_flat
@@ -27,6 +41,7 @@ from fisheye_svp_ros.scene.table_checks import (
     thin_out,
 )
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.hand_eye import HandEye, fit_hand_eye, flange_poses
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.measured_poses import rig_lenses
 from fisheye_svp_ros.solve.outliers import Outliers, find_outliers
@@ -48,6 +63,9 @@ from fisheye_svp_ros.solve.rig_state import (
 Progress = Callable[[str, float], None]
 
 _STEP_OVER_NOISE = 0.1  # a step this small beside the noise is how numbers are written
+# F ratio of what known poses leave and free ones do not.  With poses of the camera: about 1, 1 to
+# 2 beside local errors of board and image that imitate motions; with those of robots: 30 and more.
+_MAX_RATIO = 4.0
 
 
 def can_be_included(name: str) -> bool:
@@ -193,3 +211,66 @@ class Problem:
     def given_effects(self) -> tuple[Effect, ...]:
         """The effects that the lens came with."""
         return tuple(effect for effect, _ in self.base.terms)
+
+
+def prepare_problem(inputs: Inputs) -> tuple[Problem, bool]:
+    """Return the problem, its poses free where the given ones are not the camera's, and if so.
+
+    Raises ObservationError where they are not those of a robot's flange either.
+    """
+    if inputs.poses is None:
+        return Problem.prepare(inputs), False
+    free = Problem.prepare(replace(inputs, poses=None))
+    if _misfit_ratio(free, inputs.poses) <= _MAX_RATIO:
+        return Problem.prepare(inputs), False
+    find_hand_eye(free.linear, inputs.poses)
+    return free, True
+
+
+def find_hand_eye(linear: Linearization, poses: dict[int, Pose]) -> HandEye:
+    """Return the hand-eye calibration of a fitted model, from poses of the flange by frame.
+
+    Raises ObservationError where the poses do not determine it, or no transform explains them.
+    """
+    data = linear.data
+    try:
+        return fit_hand_eye(data, linear.state, linear.free, *flange_poses(data, poses))[1]
+    except GeometryError as cause:
+        raise ObservationError(
+            f'{data.observations.source}: the given poses fit neither the camera in the world nor '
+            f'a flange that carries it: {cause}; or leave the poses out') from cause
+
+
+def _misfit_ratio(problem: Problem, poses: dict[int, Pose]) -> float:
+    """Return the F ratio of known poses against free ones, all effects of the catalogue free.
+
+    problem: with free poses.  Infinite where the camera could not see from the known poses what
+    it did.
+    """
+    data, left_out = problem.data, problem.options.left_out
+    known, _ = flange_poses(data, poses)
+    held, state = replace(data, poses=known), replace(problem.base, pose=known)
+    if not np.isfinite(Linearization(held, state, problem.free).residual).all():
+        return np.inf
+    free = NullModel.estimate(data, problem.base, problem.free, left_out=left_out)
+    fixed = free.relinearize(held, state, problem.free, left_out, finest=False)
+    before, after = (float(eliminate(one.information, np.concatenate(
+        [one.included_columns, one.fixed.own + one.fixed.forms.generic]))[-1, -1])
+        for one in (fixed, free))
+    unknown = free.full.group_rank
+    return max(before - after, 0.0) / unknown / (after / (free.full.rows - unknown))
+
+
+def extended_lenses(
+    lenses: Mapping[str, Lens], state: RigState, observations: Observations
+) -> dict[str, Lens]:
+    """Return the lenses that were fitted, with their effects, for every command and node."""
+    # What happened to one recording is no part of the lens.
+    lasting = [term for term in state.terms if not term[0].of_recording]
+    extended = {}
+    for camera, (name, fitted) in enumerate(zip(lenses, state.lenses, strict=True)):
+        # A fitted height curve may turn a little earlier than the one the lens came with.
+        limit = min(lenses[name].max_incidence, fitted.image_height.limit * (1 - 1e-6))
+        own = replace(fitted, calibration=lenses[name].calibration, max_incidence=limit)
+        extended[name] = extend_lens(own, camera_terms(lasting, camera), observations)
+    return extended

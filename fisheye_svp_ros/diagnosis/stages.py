@@ -11,10 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.advice import advise, turn_advice
 from fisheye_svp_ros.diagnosis.causes import Cause, growth_cause, outlier_rows, table_causes
 from fisheye_svp_ros.diagnosis.checks.medium import behind_port, find_medium
-from fisheye_svp_ros.diagnosis.checks.robot_poses import find_hand_eye, prepare_problem
 from fisheye_svp_ros.diagnosis.checks.turned_boards import (
     TurnedFrame,
     find_turned_frames,
@@ -23,14 +21,20 @@ from fisheye_svp_ros.diagnosis.checks.turned_boards import (
 )
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras, agree_on_target
 from fisheye_svp_ros.diagnosis.checks.two_datasets import DatasetModel, compare_datasets
-from fisheye_svp_ros.diagnosis.conclusion import advice_on_lens, conclude
+from fisheye_svp_ros.diagnosis.conclusion import advice_on_lens, advise, conclude, turn_advice
 from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause, confirm
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, Figures, SearchRecord
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
 from fisheye_svp_ros.diagnosis.lens_errors import with_uncertainty
-from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, Inputs, Progress
+from fisheye_svp_ros.diagnosis.problem import (
+    DiagnosisOptions,
+    Inputs,
+    Progress,
+    find_hand_eye,
+    prepare_problem,
+)
 from fisheye_svp_ros.diagnosis.selection import select_causes
 from fisheye_svp_ros.diagnosis.variance_budget import (
     Component,
@@ -39,14 +43,11 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
     remaining_structure,
     significant_components,
 )
-from fisheye_svp_ros.effects.extension import extend_lens
-from fisheye_svp_ros.effects.of_cameras import camera_terms
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.table_checks import ROUNDING, check_distinct, dither
-from fisheye_svp_ros.solve.rig_state import RigState
 
 
 def diagnose(
@@ -185,15 +186,12 @@ def _conclude(
     causes = evaluation.causes(components) + noise_causes
     significant = significant_components(components)
 
-    def lenses_of(state: RigState) -> dict[str, Lens]:
-        return extended_lenses(problem.inputs.lenses, state, observations)
-
     lenses = with_uncertainty(
         evaluation.model_errors, averaged.linear, evaluation.noise_px,
-        evaluation.uncertainty['image_px']['misfit'], lenses_of)
+        evaluation.uncertainty['image_px']['misfit'], evaluation.extended_lenses)
     advice = advise(evaluation, causes, significant)
     conclusion = conclude(
-        evaluation, causes, components, advice, candidates, problem.inputs.lenses, lenses_of,
+        evaluation, causes, components, advice, candidates,
         any(pair.verdict == 'contradict' for pair in cameras))
     lenses = {
         name: conclusion.with_ray_error(averaged.with_shift_entry(lens, name), name)
@@ -236,18 +234,3 @@ def _remaining(
     remaining = add_outliers(remaining, selection.revision.outliers, len(observations))
     hidden = {name for cause in noise_causes for name in cause.effect_class.hidden_structure}
     return [one for one in remaining if one.variable not in hidden]
-
-
-def extended_lenses(
-    lenses: Mapping[str, Lens], state: RigState, observations: Observations
-) -> dict[str, Lens]:
-    """Return the lenses that were fitted, with their effects, for every command and node."""
-    # What happened to one recording is no part of the lens.
-    lasting = [term for term in state.terms if not term[0].of_recording]
-    extended = {}
-    for camera, (name, fitted) in enumerate(zip(lenses, state.lenses, strict=True)):
-        # A fitted height curve may turn a little earlier than the one the lens came with.
-        limit = min(lenses[name].max_incidence, fitted.image_height.limit * (1 - 1e-6))
-        own = replace(fitted, calibration=lenses[name].calibration, max_incidence=limit)
-        extended[name] = extend_lens(own, camera_terms(lasting, camera), observations)
-    return extended

@@ -137,7 +137,7 @@ def _choose_question(
         return number, (), _effects_with(number, after)
     fitted = {effect.name for effect, _ in after.state.terms}
     mine = [c for c in causes if c.effect in fitted
-            and c.effect_class.budget_stage() in ('lens', 'target')]
+            and c.stage in ('lens', 'target')]
     for cause in mine:
         if cause.indistinguishable_from:
             alike = tuple(cause.indistinguishable_from)

@@ -8,9 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fisheye_svp_ros.diagnosis.advice import _measure_landmarks
 from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.conclusion import _largest_error
+from fisheye_svp_ros.diagnosis.conclusion import _largest_error, _measure_landmarks
 from fisheye_svp_ros.diagnosis.decision import (
     Bound,
     FileFigure,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from helpers.water import AIR, photographs
 
+from fisheye_svp_ros.diagnosis.cross_validation import contiguous_blocks, refuting_blocks
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
-from fisheye_svp_ros.diagnosis.frame_blocks import contiguous_blocks, refuting_blocks
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.solve.bundle_adjustment import adjust

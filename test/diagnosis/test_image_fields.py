@@ -11,7 +11,7 @@ import pytest
 from helpers.water import AIR, photographs
 
 from fisheye_svp_ros.diagnosis import Diagnosis, diagnose
-from fisheye_svp_ros.diagnosis.image_fields import MIN_GAIN
+from fisheye_svp_ros.diagnosis.written_lens import MIN_GAIN
 from fisheye_svp_ros.effects.forward import back_project, project
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences

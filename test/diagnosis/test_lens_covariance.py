@@ -8,10 +8,9 @@ from helpers.scenes import lens, observe, scene
 
 from benchmark.study import ray_error
 from fisheye_svp_ros.diagnosis import NullModel
-from fisheye_svp_ros.diagnosis.lens_covariance import LensCovariance
 from fisheye_svp_ros.diagnosis.lens_evidence import _distances
-from fisheye_svp_ros.diagnosis.stages import extended_lenses
-from fisheye_svp_ros.diagnosis.uncertainty import likely_models, total_errors
+from fisheye_svp_ros.diagnosis.problem import extended_lenses
+from fisheye_svp_ros.diagnosis.uncertainty import LensCovariance, likely_models, total_errors
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state

@@ -5,8 +5,7 @@ import pytest
 from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import NullModel
-from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes
-from fisheye_svp_ros.diagnosis.lens_evidence import _refit_pose
+from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes, refit_poses
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import initial_state
@@ -31,11 +30,10 @@ def test_without_a_cause_the_rest_is_fitted_anew_however_large_it_is(size):
     assert rms[0] == pytest.approx(rms[1], rel=1e-3)
 
 
-def test_a_pose_takes_up_nothing_else_where_the_noise_is_uneven():
+def test_a_pose_takes_up_what_its_columns_do_and_nothing_else():
     rng = np.random.default_rng(0)
-    columns, ratio = rng.normal(size=(20, 6)), rng.uniform(0.5, 2.0, 20)
-    whitened = rng.normal(size=(2, 20))
-    left = _refit_pose(whitened, columns, ratio)
-    np.testing.assert_allclose(left @ (columns * ratio[:, None]), 0.0, atol=1e-12)
-    moved = _refit_pose(whitened + columns @ rng.normal(size=6), columns, ratio)
+    columns, rows = rng.normal(size=(3, 20, 6)), rng.normal(size=(3, 20, 2))
+    left = refit_poses(rows, columns)
+    np.testing.assert_allclose(np.swapaxes(columns, -1, -2) @ left, 0.0, atol=1e-12)
+    moved = refit_poses(rows + columns @ rng.normal(size=(3, 6, 2)), columns)
     np.testing.assert_allclose(moved, left, atol=1e-12)

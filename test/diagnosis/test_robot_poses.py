@@ -7,8 +7,7 @@ import pytest
 from helpers.robot import LENS, TRUTH, robot
 
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
-from fisheye_svp_ros.diagnosis.checks.robot_poses import prepare_problem
-from fisheye_svp_ros.diagnosis.problem import Inputs
+from fisheye_svp_ros.diagnosis.problem import Inputs, prepare_problem
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.solve.hand_eye import Transforms

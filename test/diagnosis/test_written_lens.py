@@ -9,15 +9,14 @@ import pytest
 from helpers.water import AIR, photographs
 
 from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, diagnose
-from fisheye_svp_ros.diagnosis.averaging import (
+from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
+from fisheye_svp_ros.diagnosis.lens_evidence import find_lens_rays
+from fisheye_svp_ros.diagnosis.written_lens import (
     PRIOR_ODDS,
     SHIFT_SIGMA,
     AveragedModel,
     OpenShifts,
 )
-from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
-from fisheye_svp_ros.diagnosis.lens_evidence import find_lens_rays
-from fisheye_svp_ros.diagnosis.stages import extended_lenses
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.reporting.first_screen import first_screen
@@ -90,9 +89,7 @@ def test_ray_errors_file_figure_and_summary_are_of_the_lens_that_is_written() ->
     closed = diagnosed(0.004, 0.1, options=DiagnosisOptions(left_out=('viewpoint_shift',)))
     assert found.figures.named.rms_px == pytest.approx(closed.figures.named.rms_px, rel=1e-3)
     assert found.file.extended_px < closed.file.extended_px
-    given = found.problem.inputs.lenses
-    rays = find_lens_rays(found.evaluation, found.lenses, lambda state: extended_lenses(
-        given, state, found.problem.observations)).errors['']
+    rays = find_lens_rays(found.evaluation, found.lenses).errors['']
     for one, other in zip(rays['given'], rays['extended'], strict=True):
         assert one.value == pytest.approx(other.value, rel=1e-6)  # no difference to itself
     known, bare = (d.uncertainty['image_px'] for d in (found, closed))
