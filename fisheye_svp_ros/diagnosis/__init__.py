@@ -14,7 +14,7 @@ Other rooms import what stands here, and nothing else.
 
 from fisheye_svp_ros.diagnosis.causes import CONFOUNDED_P, Cause
 from fisheye_svp_ros.diagnosis.checks.two_cameras import Transfer, TwoCameras, deviations
-from fisheye_svp_ros.diagnosis.checks.two_datasets import SharedParameter, TwoDatasets
+from fisheye_svp_ros.diagnosis.checks.two_datasets import TwoDatasets
 from fisheye_svp_ros.diagnosis.conclusion import (
     DIAGNOSE_AIR,
     RETAKE,
@@ -26,94 +26,28 @@ from fisheye_svp_ros.diagnosis.conclusion import (
 )
 from fisheye_svp_ros.diagnosis.cross_validation import (
     Comparison,
-    HeldOut,
     compare_errors,
     predict_other_data,
 )
 from fisheye_svp_ros.diagnosis.decision import Decision
-from fisheye_svp_ros.diagnosis.diagnosis import (
-    Diagnosis,
-    Figures,
-    SearchRecord,
-)
-from fisheye_svp_ros.diagnosis.effect_forms import simplest_form
+from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
-from fisheye_svp_ros.diagnosis.evaluation import (
-    MAX_RMS_RATIO,
-    Evaluation,
-    FitQuality,
-    Intrinsic,
-)
-from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets, refit
-from fisheye_svp_ros.diagnosis.lens_errors import InAir, LensErrors
-from fisheye_svp_ros.diagnosis.model_errors import (
-    ErrorParts,
-    ModelErrors,
-    pose_maps,
-    pose_summary,
-)
+from fisheye_svp_ros.diagnosis.evaluation import MAX_RMS_RATIO
+from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
+from fisheye_svp_ros.diagnosis.model_errors import ErrorParts, LensErrors, pose_maps, pose_summary
 from fisheye_svp_ros.diagnosis.null_model import NullModel
-from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, Problem, can_be_included
-from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
-from fisheye_svp_ros.diagnosis.selection import Selection
+from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, can_be_included
 from fisheye_svp_ros.diagnosis.stages import diagnose, diagnose_against
 from fisheye_svp_ros.diagnosis.stepwise import NAMED_P, TraceStep
-from fisheye_svp_ros.diagnosis.uncertainty import standard_errors, total_errors
-from fisheye_svp_ros.diagnosis.variance_budget import Component, Structure, stage_shares
+from fisheye_svp_ros.diagnosis.uncertainty import total_errors
+from fisheye_svp_ros.diagnosis.variance_budget import stage_shares
 
 __all__ = [
-    'CONFOUNDED_P',
-    'DIAGNOSE_AIR',
-    'MAX_RMS_RATIO',
-    'NAMED_P',
-    'NAMES',
-    'RETAKE',
-    'SIGNIFICANCE',
-    'STAGE_OF',
-    'TURNED',
-    'UNLIKE',
-    'USE_EXTENDED',
-    'Advice',
-    'Cause',
-    'Comparison',
-    'Component',
-    'Decision',
-    'Diagnosis',
-    'DiagnosisOptions',
-    'EffectTests',
-    'ErrorParts',
-    'Evaluation',
-    'Figures',
-    'FitQuality',
-    'FittedModel',
-    'HeldOut',
-    'InAir',
-    'Intrinsic',
-    'LensErrors',
-    'ModelErrors',
-    'NullModel',
-    'PredictedOffsets',
-    'Problem',
-    'SearchRecord',
-    'Selection',
-    'SharedParameter',
-    'Structure',
-    'TraceStep',
-    'Transfer',
-    'TwoCameras',
-    'TwoDatasets',
-    'can_be_included',
-    'compare_errors',
-    'deviations',
-    'diagnose',
-    'diagnose_against',
-    'frames_of',
-    'pose_maps',
-    'pose_summary',
-    'predict_other_data',
-    'refit',
-    'simplest_form',
-    'stage_shares',
-    'standard_errors',
+    'CONFOUNDED_P', 'DIAGNOSE_AIR', 'MAX_RMS_RATIO', 'NAMED_P', 'RETAKE', 'SIGNIFICANCE',
+    'TURNED', 'UNLIKE', 'USE_EXTENDED', 'Advice', 'Cause', 'Comparison', 'Decision',
+    'Diagnosis', 'DiagnosisOptions', 'EffectTests', 'ErrorParts', 'LensErrors', 'NullModel',
+    'PredictedOffsets', 'TraceStep', 'Transfer', 'TwoCameras', 'TwoDatasets',
+    'can_be_included', 'compare_errors', 'deviations', 'diagnose', 'diagnose_against',
+    'frames_of', 'pose_maps', 'pose_summary', 'predict_other_data', 'stage_shares',
     'total_errors',
 ]

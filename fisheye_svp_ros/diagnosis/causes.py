@@ -9,19 +9,24 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, flat_rows
+from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
-from fisheye_svp_ros.diagnosis.noise_growth import NoiseGrowth
 from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
+from fisheye_svp_ros.diagnosis.variance_budget import NoiseGrowth
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.ray_effects import FlatPortEffect, RadialProfileEffect
 from fisheye_svp_ros.mixed_model import group_basis, pseudo_inverse
 from fisheye_svp_ros.scene.observations import Observations, photograph_entry
 from fisheye_svp_ros.solve.outliers import Outliers
+from fisheye_svp_ros.solve.port_fit import MEDIUM_INDEX, THICKNESS
 from fisheye_svp_ros.solve.rig_state import rms_px
 
 # An effect is confounded with another unless, with it in the model, the other is still needed.
 CONFOUNDED_P = 0.002
 _CONFOUNDED_SHARE = 0.3  # of the statistic, that the other explains by itself
+_PORT_UNITS = {MEDIUM_INDEX: '', 'port_distance': 'm', 'port_tilt_x': 'rad', 'port_tilt_y': 'rad',
+               THICKNESS: 'm'}
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,26 @@ def selected_causes(
             '; '.join([effect.to_separate, *_look_alike_texts(tests, alike, columns)]),
         ))
     return causes
+
+
+def medium_cause(medium: Medium, stderr: dict[str, float], rms: float, gain: float) -> Cause:
+    """Return a medium behind a port as a cause.
+
+    stderr by name; rms, gain: of held-out frames once it is in.
+    """
+    values = medium.state.lens.parameters
+    if MEDIUM_INDEX in stderr:
+        # Nothing seen through the port tells the index from the focal length in air.
+        told = float(np.hypot(stderr[MEDIUM_INDEX], medium.focal_error * values[MEDIUM_INDEX]))
+        stderr = {**stderr, MEDIUM_INDEX: told}
+    parameters = {
+        name.removeprefix('port_'): {
+            'value': float(values[name]), 'stderr': stderr.get(name, 0.0), 'unit': unit}
+        for name, unit in _PORT_UNITS.items() if name in (MEDIUM_INDEX, *medium.names)}
+    return Cause(
+        FlatPortEffect.name, f'{FlatPortEffect.name}(medium)', parameters, medium.p_value,
+        medium.share, True, rms, gain, [RadialProfileEffect.name] if medium.alike else [],
+        FlatPortEffect.to_separate)
 
 
 def _look_alike_texts(tests: EffectTests, alike: Sequence[str], columns: Index) -> list[str]:

@@ -30,11 +30,7 @@ from fisheye_svp_ros.diagnosis.decision import (
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.fitted_model import RepeatedErrors
-from fisheye_svp_ros.diagnosis.lens_evidence import (
-    compare_lens_files,
-    find_bounds,
-    find_lens_rays,
-)
+from fisheye_svp_ros.diagnosis.lens_evidence import compare_lens_files, find_bounds, find_lens_rays
 from fisheye_svp_ros.diagnosis.random_effects import SAG
 from fisheye_svp_ros.diagnosis.variance_budget import Component
 from fisheye_svp_ros.effects.target_map import board_maps

@@ -32,12 +32,7 @@ from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import localize_frames
 from fisheye_svp_ros.solve.outliers import Outliers, find_outliers
 from fisheye_svp_ros.solve.rig_checks import has_no_rig, rig_differs, unpair_cameras
-from fisheye_svp_ros.solve.rig_state import (
-    Linearization,
-    RigState,
-    RigViews,
-    group_by_frame,
-)
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 
 _RESAMPLES = 2000
 _PREDICTED_RATIO = 5.0  # times the median frame

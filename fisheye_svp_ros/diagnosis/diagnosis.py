@@ -9,32 +9,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.checks.turned_boards import (
-    TurnedFrame,
-)
+from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras
-from fisheye_svp_ros.diagnosis.checks.two_datasets import (
-    TwoDatasets,
-)
+from fisheye_svp_ros.diagnosis.checks.two_datasets import TwoDatasets
 from fisheye_svp_ros.diagnosis.conclusion import Advice, Conclusion
 from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause
 from fisheye_svp_ros.diagnosis.cross_validation import Comparison
 from fisheye_svp_ros.diagnosis.decision import Decision, FileFigure
-from fisheye_svp_ros.diagnosis.evaluation import (
-    MAX_RMS_RATIO,
-    Evaluation,
-    FitQuality,
-    Intrinsic,
-)
+from fisheye_svp_ros.diagnosis.evaluation import MAX_RMS_RATIO, Evaluation, FitQuality, Intrinsic
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
 from fisheye_svp_ros.diagnosis.model_errors import ModelErrors
 from fisheye_svp_ros.diagnosis.problem import Problem
 from fisheye_svp_ros.diagnosis.stepwise import TraceStep
-from fisheye_svp_ros.diagnosis.variance_budget import (
-    REPEATED_COMPONENT,
-    Component,
-    Structure,
-)
+from fisheye_svp_ros.diagnosis.variance_budget import REPEATED_COMPONENT, Component, Structure
 from fisheye_svp_ros.diagnosis.written_lens import AveragedModel
 from fisheye_svp_ros.effects.target_map import BoardMap, board_maps
 from fisheye_svp_ros.optics.lens import Lens
@@ -118,19 +105,17 @@ class Diagnosis:
 
     @property
     def offers_extended(self) -> bool:
-        """Whether the extended lens is expected to be better than the lens as given."""
-        return (self.decision['lens'].say == 'use_extended'
-                or (self.is_lens_off and not self.is_extended_refuted))
+        """Whether the extended lens is expected to be better than the lens as given.
+
+        One that predicts held-out frames worse than a lens that is off is not.
+        """
+        refuted = self.file.extended_px > MAX_RMS_RATIO * self.file.given_px
+        return self.decision['lens'].say == 'use_extended' or (self.is_lens_off and not refuted)
 
     @property
     def is_lens_off(self) -> bool:
         """Whether the lens as given is another one than the data show."""
         return self.decision['lens'].say == 'recalibrate'
-
-    @property
-    def is_extended_refuted(self) -> bool:
-        """Whether the extended lens predicts held-out frames worse than the lens as given."""
-        return self.file.extended_px > MAX_RMS_RATIO * self.file.given_px
 
     @property
     def candidates(self) -> list[UnconfirmedCause]:
@@ -206,11 +191,6 @@ class Diagnosis:
     def averaged_model(self) -> AveragedModel:
         """The viewpoint shifts that are written and not named."""
         return self.evaluation.averaged_model
-
-    def written_field_entry(self) -> dict[str, Any]:
-        """Return what diagnosis.json holds of the image field: nothing where none is predicted."""
-        field = self.evaluation.written_field
-        return {} if field is None else {'image_field': field.to_dict()}
 
     @property
     def errors(self) -> ModelErrors:
@@ -291,6 +271,7 @@ class Diagnosis:
             external['cameras'] = [pair.to_dict() for pair in self.cameras]
         if self.against is not None:
             external['sets'] = self.against.to_dict()
+        field = self.evaluation.written_field
         return {
             'verdict': self.verdict,
             'noise_px': self.noise_px,
@@ -302,7 +283,8 @@ class Diagnosis:
             'named': entry(self.figures.named),
             'lens': entry(self.figures.lens_only) | {
                 'ray_error_mrad': self.conclusion.ray_error_mrad(),
-                **self.averaged_model.to_dict(), **self.written_field_entry()},
+                **self.averaged_model.to_dict(),
+                **({} if field is None else {'image_field': field.to_dict()})},
             'extended': entry(self.figures.extended),
             **self.conclusion.to_dict(),
             'photographs': [

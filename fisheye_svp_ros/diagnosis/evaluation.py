@@ -13,8 +13,8 @@ from itertools import pairwise
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.diagnosis.causes import Cause, selected_causes
-from fisheye_svp_ros.diagnosis.checks.medium import Medium
+from fisheye_svp_ros.diagnosis.causes import Cause, medium_cause, selected_causes
+from fisheye_svp_ros.diagnosis.checks.medium import Medium, stated_parameters
 from fisheye_svp_ros.diagnosis.checks.similar_views import similar_views
 from fisheye_svp_ros.diagnosis.cross_validation import (
     Comparison,
@@ -29,7 +29,6 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
 )
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
-from fisheye_svp_ros.diagnosis.lens_errors import stated_parameters
 from fisheye_svp_ros.diagnosis.model_errors import ModelErrors, shared_names
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import extended_lenses
@@ -344,7 +343,7 @@ class Evaluation:
         gain = self._gain(self._given_prediction, self._base_prediction)
         remaining = 1 - self.medium.share
         fitted = replace(self.medium, state=self.selection.state)
-        return [fitted.cause(self._free_errors(), self._base_prediction.rms, gain),
+        return [medium_cause(fitted, self._free_errors(), self._base_prediction.rms, gain.value),
                 *(replace(cause, share=remaining * cause.share) for cause in causes)]
 
     def components(self, noise_causes: Mapping[str, float]) -> list[Component]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask, flat_rows
+from fisheye_svp_ros.diagnosis.checks.medium import InAir, stated_parameters
 from fisheye_svp_ros.diagnosis.cross_validation import (
     HeldOut,
     gain_and_confidence,
@@ -15,14 +16,8 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
     refit_poses,
     sum_squares,
 )
-from fisheye_svp_ros.diagnosis.decision import (
-    Bound,
-    FileFigure,
-    LensOffset,
-    least_likely_offset,
-)
+from fisheye_svp_ros.diagnosis.decision import Bound, FileFigure, LensOffset, least_likely_offset
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
-from fisheye_svp_ros.diagnosis.lens_errors import InAir, stated_parameters
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.uncertainty import LensCovariance
 from fisheye_svp_ros.diagnosis.written_lens import OpenShifts

@@ -2,28 +2,36 @@
 
 What a diagnosis leaves without a name (its variance components) is no noise: it does not average
 out over the points of a view.  Carried through the solver, it stands beside noise and parameters.
+`diagnose` writes all of it into the lens as `uncertainty`; who solves with that lens may ask it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index, Mask, flat_rows
+from fisheye_svp_ros.arrays import Array, flat_rows
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
 from fisheye_svp_ros.diagnosis.gathered_points import MILLIMETRE, ColumnGeometry
 from fisheye_svp_ros.diagnosis.null_model import FINEST_FIELD, NullModel
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF, make_random_effects
 from fisheye_svp_ros.effects.base import Term
-from fisheye_svp_ros.mixed_model import (
-    LAMBDA_ABSENT,
-    RandomColumns,
-    Variances,
-    pseudo_inverse,
-)
-from fisheye_svp_ros.solve.rig_state import Linearization, is_shared
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.extension import Target
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.mixed_model import LAMBDA_ABSENT, RandomColumns, Variances, pseudo_inverse
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, identity
+from fisheye_svp_ros.scene.observations import Views
+from fisheye_svp_ros.solve.localization import Localization
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, is_shared
+
+_STEP_SIGMAS = 1e-3  # of a standard error
+_OF_IMAGE = np.array([name.startswith('image_') for name in NAMES])  # components
+_OF_TARGET = np.array([STAGE_OF[name] == 'target' for name in NAMES])
 
 
 class ErrorParts(NamedTuple):
@@ -59,12 +67,10 @@ class ModelErrors:
         Parameters take up part of an image field that has no name: what it does to them is not
         counted beside the field.
         """
-        lam = np.where(np.isin(np.arange(len(NAMES)), _image_components()), LAMBDA_ABSENT,
-                       null.variances.lam)
+        lam = np.where(_OF_IMAGE, LAMBDA_ABSENT, null.variances.lam)
         bare = replace(null, variances=replace(null.variances, lam=lam))
-        own = null.included_columns
+        own, scale = null.included_columns, null.scale[: null.column_count]
         inverse, _ = pseudo_inverse(bare.information[np.ix_(own, own)], 1e-13)
-        scale = null.scale[own]
         finest = [grid.pitch for grid in null.random.grids if grid.name == FINEST_FIELD]
         modes, alone = fitted.target_modes(null.variances.sigma)
         geometry = ColumnGeometry.measure(null.linear, max(finest, default=np.nan), modes, alone)
@@ -112,7 +118,7 @@ class ModelErrors:
         misfit = random.group**2 @ variance[random.group_label]
         label = random.shared_label[: random.shared.shape[1]]
         fields = random.shared.power(2) @ np.where(
-            np.isin(label, _image_components()), variance[label], 0.0)
+            np.append(_OF_IMAGE, False)[label], variance[label], 0.0)
         misfit = misfit + np.asarray(fields).reshape(misfit.shape)
         px = np.where(weight > 0, weight, np.nan) ** -2.0
         parameters = np.einsum(
@@ -140,7 +146,7 @@ class ModelErrors:
 
     def _random_columns(self, linear: Linearization) -> tuple[RandomColumns, Array]:
         """Return the random columns of the frames, and the variance of each component, last 0."""
-        alive = self.variances.alive & ~_target_components()
+        alive = self.variances.alive & ~_OF_TARGET
         random = make_random_effects(linear, geometry=self.geometry).select(alive)
         return random.columns, np.append(self.variances.tau**2, 0.0)
 
@@ -172,14 +178,6 @@ def pose_maps(columns: Array) -> Array:
     """
     turned = np.swapaxes(columns, -1, -2)
     return np.asarray(np.linalg.solve(turned @ columns, turned))
-
-
-def _image_components() -> Index:
-    return np.array([i for i, name in enumerate(NAMES) if name.startswith('image_')])
-
-
-def _target_components() -> Mask:
-    return np.array([STAGE_OF[name] == 'target' for name in NAMES])
 
 
 def shared_names(linear: Linearization) -> tuple[str, ...]:
@@ -216,3 +214,153 @@ def _turn_columns(linear: Linearization) -> Array:
     """Return whitened derivatives (F, M, 3) by a turn of the camera that all frames share."""
     rotation = linear.state.view_poses(linear.data).rotation
     return linear.whiten(np.nan_to_num(linear.linear.d_pose[..., 3:] @ rotation[:, None]))
+
+
+def with_uncertainty(
+    errors: ModelErrors, linear: Linearization, noise: float, misfit: float,
+    lenses_of: Callable[[RigState], Mapping[str, Lens]],
+) -> dict[str, Lens]:
+    """Return the lenses of a diagnosis, each with what is known of its errors.
+
+    linear: the fit; noise, and misfit that remains, px; lenses_of: makes lenses of its state.
+    """
+    lenses, by = lenses_of(linear.state), {}
+    for name in lenses:
+        by[name] = np.zeros((len(_numbers(lenses[name])), len(errors.covariance)))
+    frames = np.zeros((linear.data.frames, 6))
+    for k, stderr in enumerate(np.sqrt(np.diag(errors.covariance))):
+        if k < 6 * (linear.data.cameras - 1) or not stderr:
+            continue  # of the rig
+        step = np.zeros(len(errors.covariance))
+        step[k] = _STEP_SIGMAS * stderr
+        one, other = (lenses_of(linear.state.retract(linear.free, frames, way))
+                      for way in (step, -step))
+        for name, columns in by.items():
+            values = [np.array([*_numbers(lens[name]).values()]) for lens in (one, other)]
+            columns[:, k] = (values[0] - values[1]) / (2 * step[k])
+    return {
+        name: replace(lens, uncertainty=_entry(
+            errors, camera, noise, misfit, by[name] @ errors.covariance @ by[name].T,
+            list(_numbers(lens))))
+        for camera, (name, lens) in enumerate(lenses.items())
+    }
+
+
+def _numbers(lens: Lens) -> dict[str, float]:
+    """Return all numbers of a lens: of its curves, its corrections and those of its target."""
+    target = Target.from_entries(lens.target, lens.name)
+    terms = (*ForwardModel(lens).terms, *(target.terms if target else ()))
+    return {**lens.parameters, **{
+        name: float(value) for term in terms for name, value in
+        zip(parameter_names(term), term[1], strict=True)}}
+
+
+def _entry(
+    errors: ModelErrors, camera: int, noise: float, misfit: float, covariance: Array,
+    names: list[str],
+) -> dict[str, Any]:
+    geometry, variances = errors.geometry, errors.variances
+    sizes = {name: float(size) for name, size in zip(NAMES, variances.tau, strict=True)
+             if size and STAGE_OF[name] != 'target'}
+    modes = geometry.modes.reshape(len(geometry.points), -1)
+    off = np.concatenate([geometry.alone, modes], axis=1)
+    known = np.diag(covariance) > 0
+    return {
+        'noise_px': noise, 'misfit_px': misfit,
+        'parameters': [name for name, there in zip(names, known, strict=True) if there],
+        'covariance': covariance[np.ix_(known, known)].tolist(),
+        'components': sizes,
+        'extent_px': geometry.extents[camera].tolist(),
+        'finest_px': float(geometry.finest) if np.isfinite(geometry.finest) else None,
+        'landmarks': [[*pair, *place, *(float(f'{value:.6g}') for value in values)]
+                      for *pair, place, values in zip(
+            geometry.landmark.tolist(), geometry.board.tolist(), geometry.points.tolist(), off,
+            strict=True)],
+    }
+
+
+@dataclass(frozen=True)
+class LensErrors:
+    """A lens and what its file says of its errors.
+
+    noise, misfit: of a coordinate of an image point, px; model: of its parameters, and of what
+    remains without a name, over the noise.
+    """
+
+    lens: Lens
+    noise: float
+    misfit: float
+    model: ModelErrors
+
+    @classmethod
+    def from_lens(cls, lens: Lens) -> LensErrors:
+        """Return what a lens carries; raise LensError for one that carries nothing, or half."""
+        entry = lens.uncertainty
+        if entry is None:
+            raise LensError(f'lens {lens.name!r} has no uncertainty; use the extended_lens.yaml '
+                            'that `diagnose -o` writes')
+        try:
+            size = np.array([float(entry['components'].get(name, 0.0)) for name in NAMES])
+            lam = np.where(size > 0, 1 / np.maximum(size, 1e-30) ** 2, LAMBDA_ABSENT)
+            finest = entry['finest_px']
+            rows = np.array(entry['landmarks'], dtype=float)
+            rows = rows.reshape(len(rows), -1)
+            if rows.shape[1] < 8:
+                raise ValueError('landmarks without how far they may be off')
+            ids, boards = (np.array([*map(int, rows[:, i])], dtype=np.int64) for i in (0, 1))
+            geometry = ColumnGeometry(
+                np.array(entry['extent_px'], dtype=float).reshape(1, 2, 2),
+                np.nan if finest is None else float(finest), ids, boards, rows[:, 2:5],
+                rows[:, 8:].reshape(len(rows), 3, -1), rows[:, 5:8])
+            names = tuple(map(str, entry['parameters']))
+            covariance = np.array(entry['covariance'], dtype=float).reshape(len(names), len(names))
+            found = cls(lens, float(entry['noise_px']), float(entry['misfit_px']),
+                        ModelErrors(names, covariance, Variances(1.0, lam, np.zeros(0)), geometry))
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as cause:
+            raise LensError(f'lens {lens.name!r}: uncertainty is incomplete ({cause})') from cause
+        numbers = (found.noise, found.misfit, *covariance.ravel(), *size)
+        wide = np.diff(geometry.extents, axis=1) > 0
+        if not (np.isfinite(numbers).all() and found.noise > 0 and len(rows) and wide.all()
+                and np.isfinite(rows).all() and (np.diag(covariance) >= 0).all()):
+            raise LensError(f'lens {lens.name!r}: uncertainty holds a number that cannot be')
+        return found
+
+    def inflate_sigma(self, sigma: Array | float) -> Array | float:
+        """Return sigma (...), px, of image points by this lens: noise and what remains."""
+        return np.hypot(sigma, self.misfit)
+
+    def of_poses(self, views: Views, pose: Pose) -> ErrorParts:
+        """Return covariances (S, 6, 6), m and rad, of poses, for noise of 1 / weight."""
+        linear = self.linearize(views, pose)
+        return self.model.propagate(linear, pose_maps(linear.frame_columns))
+
+    def of_solved_poses(
+        self, views: Views, solved: Localization, sigma: float | None
+    ) -> ErrorParts:
+        """Return covariances (S, 6, 6), m and rad, of the change in `Pose.retract` of poses.
+
+        sigma: noise that was estimated with weights of 1, px, in whose place that of the lens is
+        taken; None where weights are 1 / `inflate_sigma(sigma)`.  A pose whose misfit the solver
+        found to be more than it may be is so much more uncertain.
+        """
+        linear = self.linearize(views, solved.pose)
+        maps = pose_maps(linear.frame_columns)
+        parts = self.model.propagate(linear, maps)
+        excess = np.trace(solved.covariance, axis1=1, axis2=2)
+        excess = excess / np.trace(parts.noise, axis1=1, axis2=2) / (sigma or 1.0) ** 2
+        if sigma is None:
+            weight = linear.data.blocks(views.weight[..., None] * np.ones(2))
+            of_noise = 1 - (self.misfit * weight) ** 2
+        else:
+            of_noise = np.full(maps.shape[::2], self.noise**2)
+        parts = parts._replace(noise=(maps * of_noise[:, None]) @ np.swapaxes(maps, -1, -2))
+        return ErrorParts(*(part * excess[:, None, None] for part in parts))
+
+    def linearize(self, views: Views, pose: Pose) -> Linearization:
+        """Linearise views of this lens, with the numbers that are uncertain free."""
+        model = ForwardModel(self.lens)
+        views, terms = model.assign_boards(views), model.terms_for(views)
+        bare = replace(self.lens, corrections={}, target={})
+        own = [name for name in self.model.names if name in bare.parameters]
+        state = RigState(pose, identity(1), bare, terms)
+        return Linearization(RigViews.of_one_camera(views), state, own)

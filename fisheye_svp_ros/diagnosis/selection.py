@@ -19,7 +19,6 @@ from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes
 from fisheye_svp_ros.diagnosis.effect_forms import simplest_form
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
-from fisheye_svp_ros.diagnosis.noise_growth import NoiseGrowth, noise_growth
 from fisheye_svp_ros.diagnosis.null_model import (
     FINEST_FIELD,
     NullModel,
@@ -34,6 +33,7 @@ from fisheye_svp_ros.diagnosis.stepwise import (
     eliminate_effects,
     find_single_landmarks,
 )
+from fisheye_svp_ros.diagnosis.variance_budget import NoiseGrowth, noise_growth
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.detection_effects import NoiseVsAngleEffect

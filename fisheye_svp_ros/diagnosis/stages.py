@@ -27,7 +27,7 @@ from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, Figures, SearchRecord
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
-from fisheye_svp_ros.diagnosis.lens_errors import with_uncertainty
+from fisheye_svp_ros.diagnosis.model_errors import with_uncertainty
 from fisheye_svp_ros.diagnosis.problem import (
     DiagnosisOptions,
     Inputs,
@@ -185,7 +185,6 @@ def _conclude(
     components = evaluation.components({c.effect: c.p_value for c in noise_causes})
     causes = evaluation.causes(components) + noise_causes
     significant = significant_components(components)
-
     lenses = with_uncertainty(
         evaluation.model_errors, averaged.linear, evaluation.noise_px,
         evaluation.uncertainty['image_px']['misfit'], evaluation.extended_lenses)

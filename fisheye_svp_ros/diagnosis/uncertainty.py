@@ -19,10 +19,7 @@ from fisheye_svp_ros.diagnosis.model_errors import parameter_names, shared_names
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.written_lens import AveragedModel, CameraField
 from fisheye_svp_ros.effects.base import Effect
-from fisheye_svp_ros.mixed_model import (
-    Score,
-    pseudo_inverse,
-)
+from fisheye_svp_ros.mixed_model import Score, pseudo_inverse
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, with_effect
 
 _MAX_MODELS = 40

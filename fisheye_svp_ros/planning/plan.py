@@ -33,12 +33,7 @@ from fisheye_svp_ros.pose import identity, quaternion_from_rotation
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.simulation import blank_views
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.rig_state import (
-    Linearization,
-    RigState,
-    RigViews,
-    group_by_frame,
-)
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 
 # Over those of the photographs that there are: still sharp, still in reach
 _MIN_DISTANCE_RATIO, _MAX_DISTANCE_RATIO = 0.7, 1.5

@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands.diagnose import effects_left_out
-from fisheye_svp_ros.diagnosis import Advice, Comparison, DiagnosisOptions, Structure, diagnose
+from fisheye_svp_ros.diagnosis import Advice, Comparison, DiagnosisOptions, diagnose
+from fisheye_svp_ros.diagnosis.variance_budget import Structure
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
-from fisheye_svp_ros.diagnosis import DiagnosisOptions, Problem, diagnose, standard_errors
-from fisheye_svp_ros.diagnosis.problem import Inputs
+from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
+from fisheye_svp_ros.diagnosis.problem import Inputs, Problem
 from fisheye_svp_ros.diagnosis.selection import select_causes
+from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel

@@ -7,9 +7,15 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
-from fisheye_svp_ros.diagnosis import NullModel, refit, standard_errors
+from fisheye_svp_ros.diagnosis import NullModel
+from fisheye_svp_ros.diagnosis.fitted_model import refit
 from fisheye_svp_ros.diagnosis.similar_poses import cluster_frames
-from fisheye_svp_ros.diagnosis.uncertainty import likely_models, model_uncertainty, total_errors
+from fisheye_svp_ros.diagnosis.uncertainty import (
+    likely_models,
+    model_uncertainty,
+    standard_errors,
+    total_errors,
+)
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.optics.lens import parameter_values

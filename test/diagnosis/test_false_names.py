@@ -9,8 +9,9 @@ from scipy import stats
 
 from benchmark import blind_outside
 from benchmark.blind_trial import Task, draw_case
-from fisheye_svp_ros.diagnosis import EffectTests, NullModel, diagnose, refit
+from fisheye_svp_ros.diagnosis import EffectTests, NullModel, diagnose
 from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain, sum_gains
+from fisheye_svp_ros.diagnosis.fitted_model import refit
 from fisheye_svp_ros.diagnosis.stepwise import bulk_p_values
 from fisheye_svp_ros.effects.base import Scene
 from fisheye_svp_ros.effects.catalogue import CATALOGUE

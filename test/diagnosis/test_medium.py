@@ -7,7 +7,8 @@ import pytest
 from helpers.uncertain import STDERR, uncertain
 from helpers.water import AIR, photographs
 
-from fisheye_svp_ros.diagnosis import DiagnosisOptions, InAir, diagnose
+from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
+from fisheye_svp_ros.diagnosis.checks.medium import InAir
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import FlatGlass
 from fisheye_svp_ros.pose import Pose, rotation_from_vector

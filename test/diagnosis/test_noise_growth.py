@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
-from fisheye_svp_ros.diagnosis.noise_growth import NoiseGrowth, noise_growth
+from fisheye_svp_ros.diagnosis.variance_budget import NoiseGrowth, noise_growth
 from fisheye_svp_ros.solve.rig_state import RigViews
 
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
-from fisheye_svp_ros.diagnosis import NAMES, NullModel, refit
+from fisheye_svp_ros.diagnosis import NullModel
+from fisheye_svp_ros.diagnosis.fitted_model import refit
+from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
 from fisheye_svp_ros.effects.of_cameras import by_camera, combine_cameras
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect

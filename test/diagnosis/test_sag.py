@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from helpers.water import AIR
 
-from fisheye_svp_ros.diagnosis import NAMES, NullModel, diagnose, refit, standard_errors
+from fisheye_svp_ros.diagnosis import NullModel, diagnose
+from fisheye_svp_ros.diagnosis.fitted_model import refit
+from fisheye_svp_ros.diagnosis.random_effects import NAMES
+from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
 from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.pose import rotation_from_vector
 from fisheye_svp_ros.scene.observations import make_observations

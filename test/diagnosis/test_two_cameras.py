@@ -18,9 +18,9 @@ from fisheye_svp_ros.diagnosis import (
     TwoCameras,
     diagnose,
     diagnose_against,
-    simplest_form,
 )
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TargetMaps
+from fisheye_svp_ros.diagnosis.effect_forms import simplest_form
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import load_lens

@@ -10,14 +10,13 @@ from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.diagnosis import (
     Comparison,
     DiagnosisOptions,
-    HeldOut,
-    SharedParameter,
     Transfer,
     TwoDatasets,
     diagnose,
     diagnose_against,
 )
-from fisheye_svp_ros.diagnosis.cross_validation import held_out_gain, rms_reduction
+from fisheye_svp_ros.diagnosis.checks.two_datasets import SharedParameter
+from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, held_out_gain, rms_reduction
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import save_lens

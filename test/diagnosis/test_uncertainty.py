@@ -9,13 +9,9 @@ from helpers.scenes import lens, observe, scene
 from helpers.water import AIR, photographs
 from scipy import linalg
 
-from fisheye_svp_ros.diagnosis import (
-    DiagnosisOptions,
-    FittedModel,
-    ModelErrors,
-    NullModel,
-    diagnose,
-)
+from fisheye_svp_ros.diagnosis import DiagnosisOptions, NullModel, diagnose
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
+from fisheye_svp_ros.diagnosis.model_errors import ModelErrors
 from fisheye_svp_ros.diagnosis.uncertainty import likely_models, model_weights
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import intrinsic_names

@@ -9,8 +9,8 @@ import pytest
 from helpers.water import AIR, photographs
 
 from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, diagnose
-from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
 from fisheye_svp_ros.diagnosis.lens_evidence import find_lens_rays
+from fisheye_svp_ros.diagnosis.model_errors import LensErrors
 from fisheye_svp_ros.diagnosis.written_lens import (
     PRIOR_ODDS,
     SHIFT_SIGMA,

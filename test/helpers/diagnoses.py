@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from fisheye_svp_ros.diagnosis import Figures, SearchRecord
+from fisheye_svp_ros.diagnosis.diagnosis import Figures, SearchRecord
 
 
 def with_changes(found, **changes):

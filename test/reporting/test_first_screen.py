@@ -19,12 +19,12 @@ from fisheye_svp_ros.diagnosis import (
     Comparison,
     Diagnosis,
     DiagnosisOptions,
-    Structure,
     TraceStep,
     diagnose,
 )
 from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause
 from fisheye_svp_ros.diagnosis.decision import Bound, Figure
+from fisheye_svp_ros.diagnosis.variance_budget import Structure
 from fisheye_svp_ros.reporting.cause_text import percent, size
 from fisheye_svp_ros.reporting.diagnosis_plots import point_residuals
 from fisheye_svp_ros.reporting.diagnosis_report import write_report

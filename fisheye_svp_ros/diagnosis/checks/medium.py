@@ -7,27 +7,34 @@ where that explains as well what a free lens curve would need a dozen numbers fo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import special
 
-from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.cross_validation import Comparison, HeldOut, predict_other_data
-from fisheye_svp_ros.diagnosis.lens_errors import InAir
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, predict_other_data
+from fisheye_svp_ros.diagnosis.model_errors import LensErrors
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import Problem, Progress
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
 from fisheye_svp_ros.diagnosis.variance_budget import Component
-from fisheye_svp_ros.effects.ray_effects import FlatPortEffect, RadialProfileEffect
+from fisheye_svp_ros.effects.ray_effects import FlatPortEffect
 from fisheye_svp_ros.effects.recording_effects import SessionStepEffect
-from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
+from fisheye_svp_ros.errors import GeometryError, LensError
+from fisheye_svp_ros.optics.lens import (
+    INTRINSICS,
+    Lens,
+    field_of_view,
+    intrinsic_names,
+    parameter_values,
+)
 from fisheye_svp_ros.optics.ports import MEDIA
-from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.outliers import Outliers
+from fisheye_svp_ros.solve.outliers import Outliers, find_outliers, without_points
 from fisheye_svp_ros.solve.port_fit import (
     CURVE_TERMS,
     LOST_PX,
@@ -39,10 +46,8 @@ from fisheye_svp_ros.solve.port_fit import (
     is_glass,
     start_port,
 )
-from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, rms_px
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, is_shared, rms_px
 
-_UNITS = {MEDIUM_INDEX: '', 'port_distance': 'm', 'port_tilt_x': 'rad', 'port_tilt_y': 'rad',
-          THICKNESS: 'm'}
 _SUSPICIOUS_PX = 1.0  # px: less than this is no third of the image
 _MIN_MAGNIFICATION = 1.1  # than in air: what looks so much larger may be seen through a flat port
 _FOLDS = 5
@@ -50,6 +55,14 @@ _CURVE_SHARE = 0.5  # of the squares in air, at most, are left by a curve behind
 _EXPLAINED_SHARE = 0.98  # of what a free lens curve explains
 _MAX_COST_RATIO = 1.5  # times as much misfit as a free lens curve leaves; lenses are not rigid
 _THICKNESS_SIGMAS = 3.0  # standard errors of its thickness
+_KNOWN_SHARE = 0.01  # of an image height, beside what the focal length is off by
+_SAMPLES = 200
+_REACH_GROWTH = 1.25  # from fit to fit: the field whose points are taken in
+_MIN_VIEW_POINTS = 8  # points of a view
+_MIN_EIGENVALUE = 1e-8  # eigenvalue of correlations, beside what numbers hold
+_MEDIAN_SIZE = 0.6745  # of the size of a normal number
+_MAX_SIGMAS = 4.0  # standard deviations, rms, that no intrinsics are off
+_INDEX_SIGMA = 0.1  # standard deviation of an index before anything is known of the medium
 
 
 @dataclass(frozen=True)
@@ -106,25 +119,6 @@ class Medium:
             squares[mine], counts[mine] = predict_other_data(test, near)
         return HeldOut(squares, counts)
 
-    def cause(self, stderr: dict[str, float], rms: float, gain: Comparison) -> Cause:
-        """Return the cause; stderr by name; rms, gain: of held-out frames once it is in."""
-        values = self.state.lens.parameters
-        if MEDIUM_INDEX in stderr:
-            # Nothing seen through the port tells the index from the focal length in air.
-            told = float(np.hypot(stderr[MEDIUM_INDEX], self.focal_error * values[MEDIUM_INDEX]))
-            stderr = {**stderr, MEDIUM_INDEX: told}
-        parameters = {
-            name.removeprefix('port_'): {
-                'value': float(values[name]), 'stderr': stderr.get(name, 0.0),
-                'unit': _UNITS[name],
-            } for name in _UNITS if name in (MEDIUM_INDEX, *self.names)
-        }
-        form = f'{FlatPortEffect.name}(medium)'
-        return Cause(
-            FlatPortEffect.name, form, parameters, self.p_value, self.share, True, rms, gain.value,
-            [RadialProfileEffect.name] if self.alike else [], FlatPortEffect.to_separate,
-        )
-
     def budget(self, parts: Sequence[Component]) -> list[Component]:
         """Return the variance budget of the simulation in air from that behind the port."""
         square = float(np.mean(self.air.residual[self.air.row_mask] ** 2)) * self.share
@@ -134,14 +128,139 @@ class Medium:
                  for p in parts]
         own = Component('named_lens', 'lens', float(np.sqrt(square)), self.share, self.share,
                         self.p_value)
-        for i, part in enumerate(parts):
+        for part in parts:
             if part.name == own.name:
-                parts[i] = part._replace(
+                own = own._replace(
                     sd_px=float(np.hypot(part.sd_px, own.sd_px)), share=part.share + own.share,
-                    named_share=part.named_share + own.share, p_value=min(part.p_value, 0.0),
-                )
-                return parts
-        return [own, *parts]
+                    named_share=part.named_share + own.share, p_value=0.0)
+        return [own, *(part for part in parts if part.name != own.name)]
+
+
+@dataclass(frozen=True)
+class InAir:
+    """How sure the intrinsics of a lens are: names, covariance (K, K) of their values."""
+
+    lens: Lens
+    names: tuple[str, ...]
+    covariance: Array
+
+    @classmethod
+    def from_lens(cls, lens: Lens) -> InAir | None:
+        """Return what a lens file from `calibrate` or `diagnose` tells; None if it is nothing.
+
+        Raises LensError for half of it, or what cannot be.
+        """
+        if lens.uncertainty is not None:
+            errors = LensErrors.from_lens(lens)
+            known, whole = errors.model.names, errors.model.covariance
+        elif (said := lens.calibration or {}).get('covariance') is None:
+            return None
+        else:
+            known, whole = _stated_covariance(lens, said)
+        at = [i for i, name in enumerate(known) if name in ('f', *intrinsic_names(lens))]
+        names = tuple(known[i] for i in at)
+        return cls(lens, names, whole[np.ix_(at, at)]) if {'f', 'fx'} & set(names) else None
+
+    @property
+    def focal(self) -> float:
+        """Relative standard error of the focal length."""
+        at = next(i for i, name in enumerate(self.names) if name in ('f', 'fx'))
+        return float(np.sqrt(self.covariance[at, at])) / self.lens.fx
+
+    @property
+    def reach(self) -> float:
+        """Distance from the principal point, px, up to which the curve is known."""
+        lens = self.lens
+        theta = np.linspace(0.0, lens.max_incidence, _SAMPLES)[1:]
+        height = lens.image_height.value_and_slope(theta)[0]
+        by = {'f': height, 'fx': height, **dict(zip(
+            lens.image_height.coefficient_names, lens.fx * lens.image_height.columns(theta).T,
+            strict=True))}
+        columns = np.stack([by.get(name, np.zeros_like(theta)) for name in self.names], axis=-1)
+        spread = np.sqrt(np.einsum('tk,kl,tl->t', columns, self.covariance, columns))
+        open_ = spread > (self.focal + _KNOWN_SHARE) * lens.fx * height
+        return float(lens.fx * height[np.argmax(open_)]) if open_.any() else np.inf
+
+    def fit_behind_port(
+        self, everything: RigViews, lens: Lens, place: tuple[str, ...], index: str
+    ) -> Lens | None:
+        """Return the lens with the intrinsics that photographs behind its port call for.
+
+        They move within what is known of them, beside the port's `place` and the medium's `index`;
+        the field whose points are taken in grows, for beyond it nothing is known of the curve.
+        None if they are far from what is known.  Raises GeometryError where a view cannot be
+        posed.
+        """
+        names, reach = (*place, index, *self.names), self.reach
+        while near := self.select_points(everything, reach):
+            data, _ = find_outliers(near, initial_state(near, lens))
+            state = adjust(data, initial_state(data, lens), place)
+            state = adjust(data, state, names, self._prior(data, state, index))
+            lens = replace(state.lens, max_incidence=field_of_view(state.lens))
+            if near.views.used.sum() == everything.views.used.sum():
+                break
+            reach *= _REACH_GROWTH
+        return lens if self.squared_distance(lens) < _MAX_SIGMAS**2 * len(self.names) else None
+
+    def select_points(self, data: RigViews, reach: float) -> RigViews | None:
+        """Return the points up to a distance from the principal point, px; None if too few."""
+        off = np.linalg.norm(data.views.uv - [self.lens.cx, self.lens.cy], axis=-1)
+        inside = data.views.used & (off <= reach)
+        whole = (inside | ~data.views.used).all(axis=1, keepdims=True)
+        inside &= whole | (inside.sum(axis=1, keepdims=True) >= _MIN_VIEW_POINTS)
+        return without_points(data, ~inside) if inside.any() else None
+
+    def squared_distance(self, lens: Lens) -> float:
+        """Return how unlikely the intrinsics of a lens are: squares of standard deviations."""
+        found, own = (np.array(parameter_values(one, self.names)) for one in (lens, self.lens))
+        return float(((self._root @ (found - own)) ** 2).sum())
+
+    @property
+    def _root(self) -> Array:
+        """What values are off, times this (K, K), is of unit covariance."""
+        size = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(size, size))
+        return np.asarray((vectors / np.sqrt(np.maximum(values, _MIN_EIGENVALUE))).T / size)
+
+    def _prior(self, data: RigViews, state: RigState, index: str) -> Prior:
+        """Return what is known of index and intrinsics, beside rows as noisy as a fit's."""
+        linear = Linearization(data, state, ())
+        noise = float(np.median(np.abs(linear.residual[linear.row_mask]))) / _MEDIAN_SIZE
+        others = sum(len(values) for effect, values in state.terms if is_shared(effect))
+        mean = np.concatenate([[state.lens.parameters[index]],
+                               parameter_values(self.lens, self.names),
+                               np.zeros(others)])
+        root = np.zeros((1 + len(self.names), len(mean)))
+        root[0, 0] = 1 / _INDEX_SIGMA
+        root[1:, 1:1 + len(self.names)] = self._root
+        return Prior(mean, noise * root)
+
+
+def _stated_covariance(lens: Lens, said: Mapping[str, Any]) -> tuple[tuple[str, ...], Array]:
+    """Return names and covariance (K, K) from the `calibration` block of a lens file."""
+    try:
+        names, whole = tuple(said['stderr']), np.array(said['covariance'], dtype=float)
+        right = whole.shape == (len(names), len(names)) and np.isfinite(whole).all()
+        if not (right and (np.diag(whole) >= 0).all()):
+            raise ValueError
+    except (KeyError, TypeError, ValueError) as cause:
+        raise LensError(f'lens {lens.name!r}: calibration: covariance is no matrix of finite '
+                        'numbers, a row and a column for each name in stderr; calibrate anew, or '
+                        'leave it out') from cause
+    return names, whole
+
+
+def stated_parameters(lenses: Mapping[str, Lens]) -> dict[str, tuple[float, float]]:
+    """Return the parameters of lenses as given, each with the error that its file states."""
+    stated = {}
+    for camera, lens in lenses.items():
+        air = InAir.from_lens(lens)
+        errors = {} if air is None else dict(
+            zip(air.names, np.sqrt(np.diag(air.covariance)).tolist(), strict=True))
+        for name, value in lens.parameters.items():
+            error = errors.get('f' if name in ('fx', 'fy') and 'f' in errors else name, 0.0)
+            stated[f'{camera}.{name}' if camera else name] = value, error
+    return stated
 
 
 def find_medium(problem: Problem, progress: Progress) -> Medium | None:

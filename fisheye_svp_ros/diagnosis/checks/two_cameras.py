@@ -6,14 +6,14 @@ finding it; and the rig is found view by view, from poses of each camera by itse
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.cross_validation import (
     Comparison,
     HeldOut,
@@ -29,7 +29,6 @@ from fisheye_svp_ros.diagnosis.selection import Selection, select_causes
 from fisheye_svp_ros.effects.forward import Term
 from fisheye_svp_ros.effects.of_cameras import camera_terms
 from fisheye_svp_ros.effects.target_map import KnownTarget, at_landmarks, less_similarity
-from fisheye_svp_ros.mixed_model import Variances
 from fisheye_svp_ros.pose import Pose, identity, vector_from_rotation
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.rig_checks import MIN_SHARED_FRAMES, is_unpaired
@@ -86,9 +85,9 @@ def displaces_landmarks(term: Term) -> bool:
     return term[0].stage == 'target'
 
 
-def effect_names(terms: Sequence[Term]) -> list[str]:
-    """Return the names of effects."""
-    return [effect.name for effect, _ in terms]
+def without_terms(state: RigState, which: Callable[[Term], bool]) -> RigState:
+    """Return the state without some of its effects."""
+    return state.without_effects([term[0].name for term in state.terms if which(term)])
 
 
 def fit_and_predict(
@@ -101,12 +100,6 @@ def fit_and_predict(
     fitted = adjust(data, state, free, held=held)
     return fitted, cross_validate(
         NullModel.with_variances(data, fitted, free), held=held)
-
-
-def landmark_variances(data: RigViews, variances: Variances, landmark: Index) -> Variances:
-    """Return variances of landmarks (L,) for the landmarks of other data."""
-    seen = np.unique(data.views.landmark[data.views.used])
-    return replace(variances, weight=variances.weight[np.searchsorted(landmark, seen)])
 
 
 def fitted_target(fitted: FittedModel, known: KnownTarget) -> Array:
@@ -232,7 +225,9 @@ def _fit_camera(selection: Selection, camera: int, known: KnownTarget) -> _Camer
     state = _single_camera(selection.state, pose, at, camera)
     target = None
     if _has_target(selection):
-        variances = landmark_variances(own, null.variances, null.random.landmark)
+        seen = np.unique(own.views.landmark[own.views.used])
+        variances = replace(null.variances, weight=null.variances.weight[
+            np.searchsorted(null.random.landmark, seen)])
         state = refit(own, state, names, variances)
         target = fitted_target(
             FittedModel.of_state(Linearization(own, state, names), variances), known)
@@ -248,14 +243,13 @@ def _has_target(selection: Selection) -> bool:
     """Whether anything was found that stays with the target."""
     alive = selection.null.variances.alive
     return any(map(displaces_landmarks, selection.state.terms)) or any(
-        STAGE_OF[name] == 'target' for name, there in zip(NAMES, alive, strict=True) if there)
+        STAGE_OF[name] == 'target' for name in np.array(NAMES)[alive])
 
 
 def _compare(one: _Camera, other: _Camera, known: KnownTarget) -> TwoCameras:
     carried, poses = [], []
     for mine, source in ((one, other), (other, one)):
-        data, state = mine.data, mine.state.without_effects(effect_names(
-            [term for term in mine.state.terms if displaces_landmarks(term)]))
+        data, state = mine.data, without_terms(mine.state, displaces_landmarks)
         if source.target is None:
             after = adjust(data, state, mine.free)
         else:

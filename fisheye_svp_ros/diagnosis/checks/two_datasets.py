@@ -16,11 +16,12 @@ from fisheye_svp_ros.diagnosis.checks.two_cameras import (
     Transfer,
     displace_target,
     displaces_landmarks,
-    effect_names,
     fit_and_predict,
     fitted_target,
     moves_with_lens,
+    without_terms,
 )
+from fisheye_svp_ros.diagnosis.cross_validation import HeldOut
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
@@ -130,12 +131,13 @@ def _transfer_causes(
     if not carried:
         return None
     data, free = other.null.linear.data, other.null.linear.free
-    own = other.null.linear.state
-    bare = own.without_effects(effect_names([t for t in own.terms if moves_with_lens(t)]))
+    bare = without_terms(other.null.linear.state, moves_with_lens)
 
-    def predict(terms: Sequence[Term], state: RigState = bare, free: Sequence[str] = free) -> Any:
+    def predict(
+        terms: Sequence[Term], state: RigState = bare, free: Sequence[str] = free
+    ) -> HeldOut:
         there = replace(state, terms=(*state.terms, *terms))
-        return fit_and_predict(data, there, free, effect_names(terms))[1]
+        return fit_and_predict(data, there, free, [effect.name for effect, _ in terms])[1]
 
     without, there = predict(()), predict(carried)
     whole = (predict((), replace(bare, lens=one.simulation.state.lens), ()),
@@ -161,8 +163,8 @@ def _transfer_target(
     ):
         return None
     fitted = FittedModel.of_state(one.null.linear, one.null.variances)
-    linear, own = other.null.linear, other.null.linear.state
-    state = own.without_effects(effect_names([t for t in own.terms if displaces_landmarks(t)]))
+    linear = other.null.linear
+    state = without_terms(linear.state, displaces_landmarks)
     shift = less_similarity(known.points, fitted_target(fitted, known))
     _, without = fit_and_predict(linear.data, state, linear.free)
     _, carried = fit_and_predict(displace_target(linear.data, known, shift), state, linear.free)
