@@ -7,7 +7,7 @@ within their intervals in 95 of 100 cases, by noise alone, with the lens's param
 misfit that remains (`diagnosis.uncertainty`).  Without a table: simulated cameras with displaced
 landmarks and an image field that no catalogue holds, of which the truth is known: poses of the
 other half, and points that two of the cameras see as a rig, by what the lens files carry
-(`diagnosis.lens_errors`); how often each cause was named.  Writes docs/results/coverage.json.
+(`diagnosis.model_errors`); how often each cause was named.  Writes docs/results/coverage.json.
 """
 
 from __future__ import annotations

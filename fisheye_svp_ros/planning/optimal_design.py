@@ -233,29 +233,30 @@ class Design:
         Where fewer than `count` are possible, all of them.
         """
         count = min(count, len(self.added))
-        chosen: list[int] = []
-        for _ in range(count):
-            chosen.append(self._best_view(question, chosen))
+        chosen = self._add_views(question, range(len(self.added)), count)
         for _ in range(_EXCHANGES):
             before = list(chosen)
             for i in range(count):
-                chosen[i] = self._best_view(question, chosen[:i] + chosen[i + 1:])
+                chosen[i] = self._best_view(
+                    question, range(len(self.added)), chosen[:i] + chosen[i + 1:])
             if chosen == before:
                 break
-        ordered: list[int] = []
-        for _ in range(count):
-            remaining = [i for i in chosen if i not in ordered]
-            known = self._information_with(ordered)
-            merit = question.merit(known + self.added[remaining])
-            ordered.append(remaining[int(np.argmax(merit))])
+        ordered = self._add_views(question, chosen, count)
         return np.array(ordered), [
             question.answer(self._information_with(ordered[:i])) for i in range(count + 1)
         ]
 
-    def _best_view(self, question: Criterion, taken: Sequence[int]) -> int:
-        merit = question.merit(self._information_with(taken) + self.added)
-        merit[list(taken)] = -np.inf
-        return int(np.argmax(merit))
+    def _add_views(self, question: Criterion, among: Sequence[int], count: int) -> list[int]:
+        """Return some of the views, each the best beside those before it."""
+        found: list[int] = []
+        for _ in range(count):
+            found.append(self._best_view(question, among, found))
+        return found
+
+    def _best_view(self, question: Criterion, among: Sequence[int], taken: Sequence[int]) -> int:
+        left = [i for i in among if i not in taken]
+        merit = question.merit(self._information_with(taken) + self.added[left])
+        return left[int(np.argmax(merit))]
 
     def _information_with(self, taken: Sequence[int]) -> Array:
         return np.asarray(self.known + self.added[list(taken)].sum(axis=0))
