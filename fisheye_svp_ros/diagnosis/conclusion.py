@@ -286,13 +286,13 @@ def conclude(
     advice: Sequence[Advice], candidates: list[UnconfirmedCause], contradicted: bool,
 ) -> Conclusion:
     """Return what to do; contradicted: whether the cameras of a rig disagree about the target."""
-    rays = find_lens_rays(evaluation, evaluation.selection.problem.inputs.lenses)
+    ray_errors, offset = find_lens_rays(evaluation, evaluation.selection.problem.inputs.lenses)
     file, gain = compare_lens_files(evaluation), evaluation.gains['named']
     lens = decide_lens(LensFacts(
         [c.effect for c in causes if c.stage == 'lens'],
         [c.effect for c in causes if c.stage != 'noise'],
         bool(evaluation.averaged_model.shifts),
-        (gain.value, gain.low), file, rays.offset if evaluation.free else None,
+        (gain.value, gain.low), file, offset if evaluation.free else None,
         find_bounds(evaluation.null), evaluation.noise_px, evaluation.falling,
         evaluation.frames))
     scatter = np.hypot.reduce([part.sd_px for part in components
@@ -306,7 +306,7 @@ def conclude(
         evaluation.selection.problem.plannable,
         'view' if is_unpaired(evaluation.null.linear.data) else 'frame'))
     return Conclusion({'lens': lens, 'target': target, 'photographs': photographs}, file,
-                      rays.errors, candidates)
+                      ray_errors, candidates)
 
 
 def advice_on_lens(advice: Sequence[Advice], conclusion: Conclusion) -> list[Advice]:

@@ -178,7 +178,9 @@ def smooth_fields(linear: Linearization) -> dict[str, Array]:
     distance = np.linalg.norm(scene.pose.into_body(views.points), axis=-1)
     near = np.where(views.used, 1 / np.maximum(distance, 1e-6), 0.0)
     near = near / max(near.max(), 1e-9)
-    radial, tangential = _polar(x, y)
+    radial = np.stack([x, y], axis=-1) / np.maximum(np.hypot(x, y), 1e-9)[..., None]
+    tangential = np.stack([-radial[..., 1], radial[..., 0]], axis=-1)
+    phase = 2 * np.pi * np.nan_to_num(linear.linear.optical)
     fields = {
         'theta': [direction * (theta**i)[..., None] for direction in (radial, tangential)
                   for i in range(1, _CURVE_DEGREE + 1)],
@@ -186,14 +188,15 @@ def smooth_fields(linear: Linearization) -> dict[str, Array]:
             direction * (near**i * theta**j)[..., None]
             for direction in (radial, tangential) for i in (1, 2) for j in (1, 2, 3)
         ],
-        'pixel_phase': _pixel_phases(linear.linear.optical),
+        'pixel_phase': [wave(harmonic * phase) * axis for harmonic in (1, 2)
+                        for wave in (np.sin, np.cos) for axis in np.eye(2)],
     }
     t = scene.times
     if np.isfinite(t).all() and np.ptp(t) > 0:
         when = (2 * (t - t.min()) / np.ptp(t) - 1)[:, None] * np.ones_like(x)
         fields['time'] = [
-            field * (when**i)[..., None]
-            for field in _on_both_axes([np.ones_like(x), x, y]) for i in (1, 2, 3)
+            (field * when**i)[..., None] * axis
+            for field in (np.ones_like(x), x, y) for axis in np.eye(2) for i in (1, 2, 3)
         ]
     return {
         name: linear.whiten(np.stack(columns, axis=-1)) for name, columns in fields.items()
@@ -219,31 +222,6 @@ def intrinsic_walks(linear: Linearization) -> tuple[Array, Array]:
     columns = step[..., None] * moves[:, None, None, None]
     roughness = np.tile(np.repeat(waves**4.0, data.cameras), step.shape[-1])
     return linear.whiten(columns.reshape(*growth.shape[:-1], -1)), roughness
-
-
-def _polar(x: Array, y: Array) -> tuple[Array, Array]:
-    norm = np.maximum(np.hypot(x, y), 1e-9)
-    radial = np.stack([x / norm, y / norm], axis=-1)
-    return radial, np.stack([-radial[..., 1], radial[..., 0]], axis=-1)
-
-
-def _pixel_phases(uv: Array) -> list[Array]:
-    phase = 2 * np.pi * np.nan_to_num(uv)
-    columns = []
-    for harmonic in (1, 2):
-        for wave in (np.sin(harmonic * phase), np.cos(harmonic * phase)):
-            for axis in (0, 1):
-                column = np.zeros_like(wave)
-                column[..., axis] = wave[..., axis]
-                columns.append(column)
-    return columns
-
-
-def _on_both_axes(scalars: list[Array]) -> list[Array]:
-    """Return fields (..., 2): each scalar (...) along u, and along v."""
-    zero = np.zeros_like(scalars[0])
-    pairs = [pair for s in scalars for pair in ((s, zero), (zero, s))]
-    return [np.stack(pair, axis=-1) for pair in pairs]
 
 
 def hexagons(low: Array, high: Array, pitch: float) -> Array:

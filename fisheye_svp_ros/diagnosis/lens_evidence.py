@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
 )
 from fisheye_svp_ros.diagnosis.decision import Bound, FileFigure, LensOffset, least_likely_offset
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
+from fisheye_svp_ros.diagnosis.model_errors import mask_shared
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.uncertainty import LensCovariance
 from fisheye_svp_ros.diagnosis.written_lens import OpenShifts
@@ -33,7 +33,7 @@ from fisheye_svp_ros.solve.ray_errors import (
     typical_points,
     without_motion,
 )
-from fisheye_svp_ros.solve.rig_state import Linearization, is_shared
+from fisheye_svp_ros.solve.rig_state import Linearization
 
 _BOUNDED_EFFECTS = ('viewpoint_shift', 'sensor_tilt', 'decentering')
 _NORMAL_95 = 1.96
@@ -48,11 +48,8 @@ _NEAR_RANGE = 1  # of ray_errors.RANGES: 1 m
 
 def lens_columns(linear: Linearization) -> Mask:
     """Return which of what is shared (K,) goes into a lens file: intrinsics, lasting effects."""
-    found = [np.zeros(6 * (linear.data.cameras - 1), dtype=bool),
-             np.ones(len(linear.free), dtype=bool)]
-    found += [np.full(len(values), effect.stage != 'target' and not effect.of_recording)
-              for effect, values in linear.state.terms if is_shared(effect)]
-    return np.concatenate(found)
+    return mask_shared(
+        linear, lambda effect: effect.stage != 'target' and not effect.of_recording)
 
 
 def compare_lens_files(evaluation: Evaluation) -> FileFigure:
@@ -106,11 +103,10 @@ def _rig_response(null: NullModel, at: Index) -> Array:
 def _shared_values(evaluation: Evaluation) -> tuple[Array, Array]:
     """Return what is shared (K,), zeros for the rig, as it was found and as the lenses have it."""
     null, problem = evaluation.null, evaluation.selection.problem
-    start, known = 6 * (null.linear.data.cameras - 1), null.linear.state.parameters
-    now = np.concatenate([np.zeros(start), [known[name] for name in null.linear.free],
-                          *(values for _, _, values in null.terms)])
+    start, free = 6 * (null.linear.data.cameras - 1), null.linear.free
+    now = np.append(np.zeros(start), null.linear.state.shared_values(free))
     stated, given = stated_parameters(problem.inputs.lenses), now.copy()
-    given[start:start + len(null.linear.free)] = [stated[n][0] for n in null.linear.free]
+    given[start:start + len(free)] = [stated[name][0] for name in free]
     before = {effect.name: values for effect, values in problem.base.terms}
     for effect, columns, values in null.terms:
         held = before.get(effect.name)
@@ -166,21 +162,16 @@ def _edge_cost(null: NullModel, moves: Array) -> tuple[float, float]:
     return cost, 1e3 * cost / max(slope, 1e-9)
 
 
-@dataclass(frozen=True)
-class LensRays:
-    """Ray errors of each lens as given and as extended, by range; the least likely offset."""
-
-    errors: dict[str, dict[str, list[RayError]]]
-    offset: LensOffset | None
-
-
-def find_lens_rays(evaluation: Evaluation, lenses: Mapping[str, Lens]) -> LensRays:
+def find_lens_rays(
+    evaluation: Evaluation, lenses: Mapping[str, Lens]
+) -> tuple[dict[str, dict[str, list[RayError]]], LensOffset | None]:
     """Compare the rays of lenses as given, by camera, and as extended.
 
-    The range that the user asks for comes last.
+    Returns the ray errors of both, by range (the one that the user asks for comes last), and the
+    least likely offset.
     """
     if evaluation.medium is not None:
-        return LensRays({}, None)
+        return {}, None
     quick = evaluation.selection.problem.options.quick
     known = LensCovariance.from_model(
         evaluation.null, evaluation.averaged_model, None if quick else evaluation.other_models)
@@ -201,7 +192,7 @@ def find_lens_rays(evaluation: Evaluation, lenses: Mapping[str, Lens]) -> LensRa
         fitted = _difference(model, points_on_rays(before[name], uv[there]))
         one = _offset(model, (off, off - fitted), given, uv[there], evaluation.noise_px)
         offsets.append(one._replace(camera=name if len(lenses) > 1 else ''))
-    return LensRays(errors, least_likely_offset(offsets))
+    return errors, least_likely_offset(offsets)
 
 
 def _written_rays(

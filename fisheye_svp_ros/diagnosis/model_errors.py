@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, flat_rows
+from fisheye_svp_ros.arrays import Array, Mask, flat_rows
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
 from fisheye_svp_ros.diagnosis.gathered_points import MILLIMETRE, ColumnGeometry
 from fisheye_svp_ros.diagnosis.null_model import FINEST_FIELD, NullModel
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF, make_random_effects
-from fisheye_svp_ros.effects.base import Term
+from fisheye_svp_ros.effects.base import Effect, Term
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.extension import Target
 from fisheye_svp_ros.errors import LensError
@@ -110,7 +110,8 @@ class ModelErrors:
         """
         turn = _turn_columns(linear)
         weight = linear.row_weight
-        columns = linear.shared_columns * _lens_mask(linear)
+        columns = linear.shared_columns * mask_shared(
+            linear, lambda effect: effect.stage in ('ray', 'image', 'detector'))
         flat, around = flat_rows(columns), flat_rows(turn)
         columns = (flat - around @ np.linalg.lstsq(around, flat, rcond=None)[0]).reshape(
             columns.shape)
@@ -184,8 +185,8 @@ def shared_names(linear: Linearization) -> tuple[str, ...]:
     """Return the names of what is shared in a linearization: rig, intrinsics, effects."""
     terms = [name for term in linear.state.terms if is_shared(term[0])
              for name in parameter_names(term)]
-    rig = linear.shared_columns.shape[-1] - len(linear.free) - len(terms)
-    return (*(f'rig.{i}' for i in range(rig)), *linear.free, *terms)
+    rig = (f'rig.{i}' for i in range(6 * (linear.data.cameras - 1)))
+    return (*rig, *linear.free, *terms)
 
 
 def parameter_names(term: Term) -> list[str]:
@@ -201,13 +202,12 @@ def _shared_columns(linear: Linearization) -> Array:
     return columns
 
 
-def _lens_mask(linear: Linearization) -> Array:
-    """Return 1 for what is shared (K,) and moves with the lens, 0 for rig and target."""
-    terms = [(effect, len(values)) for effect, values in linear.state.terms if is_shared(effect)]
-    own = [np.full(count, effect.stage in ('ray', 'image', 'detector')) for effect, count in terms]
-    free = len(linear.free)
-    rig = linear.shared_columns.shape[-1] - free - sum(count for _, count in terms)
-    return np.concatenate([np.zeros(rig), np.ones(free), *own])
+def mask_shared(linear: Linearization, which: Callable[[Effect], bool]) -> Mask:
+    """Return which of what is shared (K,) are intrinsics, or effects of some kind."""
+    own = [np.full(len(values), which(effect)) for effect, values in linear.state.terms
+           if is_shared(effect)]
+    return np.concatenate([np.zeros(6 * (linear.data.cameras - 1), dtype=bool),
+                           np.ones(len(linear.free), dtype=bool), *own])
 
 
 def _turn_columns(linear: Linearization) -> Array:

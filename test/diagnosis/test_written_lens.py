@@ -89,7 +89,7 @@ def test_ray_errors_file_figure_and_summary_are_of_the_lens_that_is_written() ->
     closed = diagnosed(0.004, 0.1, options=DiagnosisOptions(left_out=('viewpoint_shift',)))
     assert found.figures.named.rms_px == pytest.approx(closed.figures.named.rms_px, rel=1e-3)
     assert found.file.extended_px < closed.file.extended_px
-    rays = find_lens_rays(found.evaluation, found.lenses).errors['']
+    rays = find_lens_rays(found.evaluation, found.lenses)[0]['']
     for one, other in zip(rays['given'], rays['extended'], strict=True):
         assert one.value == pytest.approx(other.value, rel=1e-6)  # no difference to itself
     known, bare = (d.uncertainty['image_px'] for d in (found, closed))
