@@ -66,6 +66,16 @@ class Cause:
         return list(dict.fromkeys(name.partition('.')[0] for name in self.parameters))
 
 
+@dataclass(frozen=True)
+class UnconfirmedCause:
+    """An effect that is significant, and yet no confirmed cause; why: the reason."""
+
+    effect: str
+    parameters: dict[str, dict[str, Any]]
+    p_value: float
+    why: str
+
+
 def selected_causes(
     tests: EffectTests, found: Sequence[PlacedEffect], errors: Array, shares: dict[str, float],
     held_out: Sequence[tuple[float, float]],

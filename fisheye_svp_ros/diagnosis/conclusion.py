@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Index
-from fisheye_svp_ros.diagnosis.causes import Cause
+from fisheye_svp_ros.diagnosis.causes import Cause, UnconfirmedCause
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
-from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause
 from fisheye_svp_ros.diagnosis.cross_validation import gain_and_confidence
 from fisheye_svp_ros.diagnosis.decision import (
     Decision,

@@ -1,6 +1,7 @@
 """The stages of a diagnosis, from checked inputs to the answer.
 
 Problem -> NullModel -> EffectTests -> Selection -> FittedModel -> Evaluation -> Diagnosis.
+Before the last, causes that held-out frames refute, or another effect explains, are taken out.
 """
 
 from __future__ import annotations
@@ -11,8 +12,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.causes import Cause, growth_cause, outlier_rows, table_causes
-from fisheye_svp_ros.diagnosis.checks.medium import behind_port, find_medium
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.causes import (
+    Cause,
+    UnconfirmedCause,
+    confounded_effects,
+    growth_cause,
+    outlier_rows,
+    parameters_of,
+    table_causes,
+)
+from fisheye_svp_ros.diagnosis.checks.medium import Medium, behind_port, find_medium
 from fisheye_svp_ros.diagnosis.checks.turned_boards import (
     TurnedFrame,
     find_turned_frames,
@@ -22,12 +32,13 @@ from fisheye_svp_ros.diagnosis.checks.turned_boards import (
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras, agree_on_target
 from fisheye_svp_ros.diagnosis.checks.two_datasets import DatasetModel, compare_datasets
 from fisheye_svp_ros.diagnosis.conclusion import advice_on_lens, advise, conclude, turn_advice
-from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause, confirm
+from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, cross_validate
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, Figures, SearchRecord
-from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
+from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
 from fisheye_svp_ros.diagnosis.model_errors import with_uncertainty
+from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
 from fisheye_svp_ros.diagnosis.problem import (
     DiagnosisOptions,
     Inputs,
@@ -35,7 +46,7 @@ from fisheye_svp_ros.diagnosis.problem import (
     find_hand_eye,
     prepare_problem,
 )
-from fisheye_svp_ros.diagnosis.selection import select_causes
+from fisheye_svp_ros.diagnosis.selection import Selection, select_causes, without_cause
 from fisheye_svp_ros.diagnosis.variance_budget import (
     Component,
     Structure,
@@ -43,11 +54,18 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
     remaining_structure,
     significant_components,
 )
+from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.table_checks import ROUNDING, check_distinct, dither
+
+_FAR_SHIFT = 0.025  # m: no lens of a machine is known to move its viewpoint by more
+REFUTED_BY_FRAMES = 'held-out frames refute it'
+REFUTED_BY_FILE = 'the held-out file refutes it'
+NO_GAIN = 'its gain on held-out frames is not significant'
+NO_OTHER_FRAME = 'there is no other frame to confirm it'
 
 
 def diagnose(
@@ -168,8 +186,7 @@ def _evaluate(inputs: Inputs, progress: Progress) -> _EvaluationResult:
         selection = select_causes(behind_port(problem, medium), progress)
     selection, cameras = agree_on_target(selection, progress)
     progress('measuring the gain on held-out data', 0.8)
-    evaluation, candidates = confirm(selection, lambda one: Evaluation.of_selection(
-        one, FittedModel.solve_null_model(one.null), medium))
+    evaluation, candidates = _confirm(selection, medium)
     return _EvaluationResult(evaluation, candidates, cameras, of_robot,
                              tuple(one for one, _ in turned))
 
@@ -233,3 +250,109 @@ def _remaining(
     remaining = add_outliers(remaining, selection.revision.outliers, len(observations))
     hidden = {name for cause in noise_causes for name in cause.effect_class.hidden_structure}
     return [one for one in remaining if one.variable not in hidden]
+
+
+class _Doubt(NamedTuple):
+    """Why a cause is not confirmed; z: of what it gains on held-out frames."""
+
+    cause: PlacedEffect
+    z: float
+    why: str
+
+
+def _weakest_cause(evaluation: Evaluation) -> _Doubt | None:
+    """Return the cause that is confirmed least, if there is one that is not."""
+    selection, null = evaluation.selection, evaluation.null
+    tests, full = EffectTests(null), cross_validate(null)
+    kept = full.is_predictable
+    twins = [(effect.name, columns, confounded_effects(tests, effect.name, columns))
+             for effect, columns, _ in null.terms if not effect.per_frame]
+    other = None if evaluation.held_out is None else evaluation.predict()
+    doubts = []
+    for cause in selection.causes:
+        effect, columns, values = cause
+        if effect.name in selection.problem.options.included or effect.per_frame:
+            continue
+        z, why = _gain_in_sigmas(
+            cross_validate(null, [effect.name]).take(kept), full.take(kept)), ''
+        if len(kept) < 2:
+            why = NO_OTHER_FRAME
+        elif z <= 1:
+            why = REFUTED_BY_FRAMES if z < -1 else NO_GAIN
+        elif other is not None and _gain_in_sigmas(
+                evaluation.predict([effect.name]), other) < -1:
+            why = REFUTED_BY_FILE
+        why = why or find_confounder(tests, effect, columns, twins) or _implausible(effect, values)
+        if why:
+            doubts.append(_Doubt(cause, z, why))
+    return min(doubts, key=lambda one: one.z, default=None)
+
+
+def _gain_in_sigmas(before: HeldOut, after: HeldOut) -> float:
+    """Return by how much the sum of squares falls, over its error over the frames."""
+    change, count = before.squares - after.squares, len(before.squares)
+    error = float(change.std(ddof=1) * np.sqrt(count)) if count > 1 else np.inf
+    return float(change.sum()) / max(error, 1e-300)
+
+
+def find_confounder(
+    tests: EffectTests, effect: Effect, columns: Index,
+    twins: Sequence[tuple[str, Index, list[str]]],
+) -> str:
+    """Return which effect in the place of another cause makes this one needless."""
+    null = tests.null
+    for other, theirs, names in twins:
+        if other == effect.name or not names:
+            continue
+        rest = np.setdiff1d(null.included_columns, np.concatenate([columns, theirs]))
+        # One with as many parameters as both causes explains nothing more simply than they do.
+        for twin in tests.likeliest_forms(rest, names, len(theirs) + len(columns) - 1):
+            beside = np.concatenate([rest, null.form_columns(twin.form)])
+            place = f'if {twin.effect.name} replaces {other}'
+            if tests.score_beside(beside, columns).p_value * tests.effect_count > SIGNIFICANCE:
+                return f'not significant {place}'
+            if not tests.held_out_gain(beside, columns, effect).sufficient:
+                return f'no significant gain on held-out frames {place}'
+    return ''
+
+
+def _implausible(effect: Effect, values: Array) -> str:
+    if effect.name == 'viewpoint_shift' and abs(values[0]) > _FAR_SHIFT:
+        return f'a shift of {1e3 * abs(values[0]):.0f} mm is larger than in any real lens'
+    return ''
+
+
+def _confirm(
+    selection: Selection, medium: Medium | None
+) -> tuple[Evaluation, list[UnconfirmedCause]]:
+    """Take out causes that are not confirmed, the weakest first; fit the rest anew each time."""
+    candidates: dict[str, UnconfirmedCause] = {}
+    while True:
+        evaluation = Evaluation.of_selection(
+            selection, FittedModel.solve_null_model(selection.null), medium)
+        doubt = _weakest_cause(evaluation)
+        if doubt is None:
+            return evaluation, _add_refused_causes(selection, candidates)
+        effect, columns, values = doubt.cause
+        test = EffectTests(selection.null).test_removal(
+            selection.null.included_columns, columns, effect)
+        candidates[effect.name] = UnconfirmedCause(
+            effect.name, parameters_of(effect, values, evaluation.errors[columns]), test.p_value,
+            doubt.why)
+        selection = without_cause(selection, effect.name)
+        if doubt.why in (REFUTED_BY_FRAMES, REFUTED_BY_FILE) or _implausible(effect, values):
+            selection = replace(selection, refuted=(*selection.refuted, effect.name))
+
+
+def _add_refused_causes(
+    selection: Selection, found: Mapping[str, UnconfirmedCause]
+) -> list[UnconfirmedCause]:
+    """Return also what was significant in the selection and did not predict better."""
+    causes = {effect.name for effect, _, _ in selection.causes}
+    every = dict(found)
+    why = NO_GAIN if selection.null.linear.data.frames > 1 else NO_OTHER_FRAME
+    for step in selection.trace:
+        if (not step.accepted and step.why.endswith('does not predict better')
+                and step.name not in causes and step.name not in every):
+            every[step.name] = UnconfirmedCause(step.name, {}, step.corrected, why)
+    return list(every.values())

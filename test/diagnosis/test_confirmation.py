@@ -8,12 +8,12 @@ from helpers.scenes import lens, observe, scene
 from helpers.water import AIR
 
 from fisheye_svp_ros.diagnosis import EffectTests, NullModel, diagnose
-from fisheye_svp_ros.diagnosis.confirmation import (
+from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain
+from fisheye_svp_ros.diagnosis.stages import (
     NO_OTHER_FRAME,
     REFUTED_BY_FRAMES,
     find_confounder,
 )
-from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.effects.recording_effects import FocalDriftEffect, SessionStepEffect
@@ -105,7 +105,7 @@ def test_an_effect_with_more_parameters_takes_the_place_of_another_cause(false_t
 def test_a_cause_must_predict_better_beside_what_takes_the_place_of_another(
         false_tilt, monkeypatch):
     """Significant it is here at any p-value."""
-    module = 'fisheye_svp_ros.diagnosis.confirmation'
+    module = 'fisheye_svp_ros.diagnosis.stages'
     monkeypatch.setattr(f'{module}.SIGNIFICANCE', 1e9)
     gain = HeldOutGain(1.0, 0.5)
     monkeypatch.setattr(EffectTests, 'held_out_gain', lambda *_: gain)

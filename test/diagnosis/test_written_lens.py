@@ -120,7 +120,7 @@ def test_ray_errors_are_stated_at_the_range_that_is_asked_for() -> None:
 
 
 def test_a_shift_that_no_lens_can_have_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('fisheye_svp_ros.diagnosis.confirmation._FAR_SHIFT', 1e-3)
+    monkeypatch.setattr('fisheye_svp_ros.diagnosis.stages._FAR_SHIFT', 1e-3)
     found = diagnosed(0.006, 0.02, options=DiagnosisOptions(quick=True))
     why = {one.effect: one.why for one in found.candidates}
     assert 'larger than in any real lens' in why['viewpoint_shift']

@@ -22,7 +22,7 @@ from fisheye_svp_ros.diagnosis import (
     TraceStep,
     diagnose,
 )
-from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause
+from fisheye_svp_ros.diagnosis.causes import UnconfirmedCause
 from fisheye_svp_ros.diagnosis.decision import Bound, Figure
 from fisheye_svp_ros.diagnosis.variance_budget import Structure
 from fisheye_svp_ros.reporting.cause_text import percent, size
