@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.effect_forms import bump_values
-from fisheye_svp_ros.diagnosis.gathered_points import MILLIMETRE
 from fisheye_svp_ros.diagnosis.null_model import (
     FINEST_FIELD,
     NullModel,
@@ -24,6 +23,7 @@ from fisheye_svp_ros.diagnosis.null_model import (
     prior_products,
 )
 from fisheye_svp_ros.diagnosis.random_effects import (
+    MILLIMETRE,
     NAMES,
     SAG,
     ImageGrid,

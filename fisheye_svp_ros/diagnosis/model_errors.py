@@ -15,9 +15,14 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask, flat_rows
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
-from fisheye_svp_ros.diagnosis.gathered_points import MILLIMETRE, ColumnGeometry
 from fisheye_svp_ros.diagnosis.null_model import FINEST_FIELD, NullModel
-from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF, make_random_effects
+from fisheye_svp_ros.diagnosis.random_effects import (
+    MILLIMETRE,
+    NAMES,
+    STAGE_OF,
+    ColumnGeometry,
+    make_random_effects,
+)
 from fisheye_svp_ros.effects.base import Effect, Term
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.extension import Target

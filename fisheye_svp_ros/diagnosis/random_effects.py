@@ -8,17 +8,19 @@ Frames are the groups of the mixed model, landmarks its units.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import sparse
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.effect_forms import bump_values, hexagons
-from fisheye_svp_ros.diagnosis.gathered_points import ColumnGeometry, GatheredPoints
+from fisheye_svp_ros.effects.extension import Target
 from fisheye_svp_ros.mixed_model import Components, RandomColumns
+from fisheye_svp_ros.scene.boards import Board, find_boards
 from fisheye_svp_ros.solve.rig_state import Linearization
 
+MILLIMETRE = 1e-3  # unit of offsets on the target
 SAG = 'frame_sag'
 STAGE_OF = {
     'image_broad': 'lens', 'image_coarse': 'lens', 'image_fine': 'lens', 'image_finest': 'lens',
@@ -46,39 +48,141 @@ class ImageGrid(NamedTuple):
     pitch: float
 
 
-class BoardField(NamedTuple):
-    """Smooth displacements of one board along some of its axes: values (L, K) at the landmarks."""
-
-    name: str
-    axes: tuple[int, ...]
-    values: Array
-
-
 class RandomEffects(NamedTuple):
     """The random columns of a state, and what they stand for.
 
-    landmark (L,): ids of the units; grids, fields: what the shared columns are of, grids first (u
-    and v of each bump), fields last (axis by axis); axes (L, 3, 3): of the board of each landmark.
+    landmark (L,): ids of the units; grids: what the first of the shared columns are of (u and v of
+    each bump); axes (L, 3, 3): of the board of each landmark.
     """
 
     columns: RandomColumns
     landmark: Index
     grids: tuple[ImageGrid, ...]
-    fields: tuple[BoardField, ...]
     axes: Array
 
     def select(self, alive: Mask) -> RandomEffects:
         """Return the effects of some of the components (`NAMES`) only."""
         return self._replace(
             columns=self.columns.select(alive),
-            grids=tuple(g for g in self.grids if alive[NAMES.index(g.name)]),
-            fields=tuple(f for f in self.fields if alive[NAMES.index(f.name)]),
-        )
+            grids=tuple(grid for grid in self.grids if alive[NAMES.index(grid.name)]))
 
     @property
     def grid_columns(self) -> int:
         """How many of the shared columns, the first ones, belong to grids."""
         return sum(2 * len(grid.centres) for grid in self.grids)
+
+
+class ColumnGeometry(NamedTuple):
+    """What the columns rest on, for data other than those that the variances are of.
+
+    extents (C, 2, 2), px: least and largest u, v by camera; finest, px: pitch of the finest grid,
+    NaN without one; landmark, board (L,), points (L, 3), m: the target, by ascending numbers;
+    modes (L, 3, K) and alone (L, 3), m: how far its landmarks are off along the axes of their
+    boards, each as a sum of the modes, drawn once for all, and of what it has alone.
+    """
+
+    extents: Array
+    finest: float
+    landmark: Index
+    board: Index
+    points: Array
+    modes: Array
+    alone: Array
+
+    @classmethod
+    def measure(
+        cls, linear: Linearization, finest: float, modes: Array, alone: Array
+    ) -> ColumnGeometry:
+        """Return that of a linearised state; modes, alone: see above."""
+        return cls(_extents(linear), finest, *_seen_target(linear), modes, alone)
+
+
+class _Landmarks(NamedTuple):
+    """The landmarks of a target: ids (L,), its boards, that of each (L,), place on it (L, 2).
+
+    board_of (L,): among `boards`; at (L, 2): place on the board over its size.
+    """
+
+    ids: Index
+    boards: list[Board]
+    board_of: Index
+    at: Array
+
+    @classmethod
+    def of_target(cls, landmark: Index, board: Index, points: Array) -> _Landmarks:
+        boards = find_boards(points, board)
+        board_of, at = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 2))
+        for i, one in enumerate(boards):
+            mine = board == one.id
+            board_of[mine], at[mine] = i, one.to_board(points[mine])[:, :2]
+        return cls(landmark, boards, board_of, at)
+
+    @property
+    def axes(self) -> Array:
+        """The axes (L, 3, 3) of the board of each."""
+        return np.stack([one.axes for one in self.boards])[self.board_of]
+
+
+class _Points(NamedTuple):
+    """The points of all frames, (F, N) each: N of all cameras; what a design is built from.
+
+    used; uv (F, N, 2), px; weight, 1/px; camera; slot: place among the landmarks, -1 for none;
+    place (F, N, 2, 3): whitened derivatives by an offset along the board's axes, per mm; extents
+    (C, 2, 2), px: see `ColumnGeometry`.
+    """
+
+    used: Mask
+    uv: Array
+    weight: Array
+    camera: Index
+    slot: Index
+    place: Array
+    extents: Array
+    landmarks: _Landmarks
+
+    @classmethod
+    def gather(cls, linear: Linearization, geometry: ColumnGeometry | None) -> _Points:
+        """Gather the points of a linearized state; geometry: None for its own."""
+        data, views = linear.data, linear.data.views
+
+        def rows(values: Any) -> Array:
+            return data.blocks(values[..., None])
+
+        camera = np.broadcast_to(data.camera_of[:, None], views.landmark.shape)
+        camera, landmark = (rows(of).astype(np.int64) for of in (camera, views.landmark))
+        weight = rows(linear.weight)
+        used = shown = weight > 0
+        if geometry is None:
+            extents, target = _extents(linear), _seen_target(linear)
+        else:
+            extents = geometry.extents
+            target = geometry.landmark, geometry.board, geometry.points
+            shown = used & (rows(Target((), *target).landmark_mask(views)) > 0)
+        known = _Landmarks.of_target(*target)
+        slot = np.searchsorted(known.ids, landmark).clip(max=len(known.ids) - 1)
+        slot = np.where(shown, slot, -1)
+        place = linear.whiten(linear.linear.d_target).reshape(*used.shape, 2, 3) * MILLIMETRE
+        place = place @ np.swapaxes(known.axes[slot], -1, -2)
+        uv = data.blocks(np.nan_to_num(linear.linear.uv)[..., None, :])
+        return cls(used, uv, weight, camera, slot, place, extents, known)
+
+
+def _seen_target(linear: Linearization) -> tuple[Index, Index, Array]:
+    """Return numbers, boards (L,) and places (L, 3), m, of the landmarks that are seen."""
+    views = linear.data.views
+    landmark, first = np.unique(views.landmark[views.used], return_index=True)
+    return landmark, views.board[views.used][first], views.points[views.used][first]
+
+
+def _extents(linear: Linearization) -> Array:
+    """Return the least and the largest u, v of each camera, (C, 2, 2), px; NaN without points."""
+    uv, data = np.nan_to_num(linear.linear.uv), linear.data
+    extents = np.full((data.cameras, 2, 2), np.nan)
+    for camera in range(data.cameras):
+        mine = data.views.used & (data.camera_of == camera)[:, None]
+        if mine.any():
+            extents[camera] = uv[mine].min(axis=0), uv[mine].max(axis=0)
+    return extents
 
 
 def make_random_effects(
@@ -89,38 +193,35 @@ def make_random_effects(
     geometry: of the data that the variances are of, None for these; with it every component has
     its columns, and what stays with a target those views alone that show it.
     """
-    points = GatheredPoints.gather(linear, geometry)
+    points = _Points.gather(linear, geometry)
     frame, label = _frame_columns(points, geometry is None)
     static = list(_image_grids(points, finest) if geometry is None else
                   _complete_grids(points, geometry.finest))
-    grids, fields = [grid for grid, _ in static], _board_fields(points)
+    grids, fields = [grid for grid, _ in static], list(_board_fields(points.landmarks))
     weight = points.weight.reshape(-1, 1)
-    parts = [_move_both_axes(bumps.multiply(weight).tocsr()) for _, bumps in static]
+    parts = [sparse.csr_array(sparse.kron(bumps.multiply(weight).tocsr(), np.eye(2), 'csr'))
+             for _, bumps in static]
     names = [grid.name for grid in grids]
     if linear.data.poses is None:  # else the camera moves, and gravity beside it
         parts.append(_sag_columns(points, linear.state.pose.rotation))
         names.append(SAG)
-    combinations = [_combine_offsets(field) for field in fields]
-    of = [np.full(part.shape[1], NAMES.index(name)) for name, part in zip(
-        [*names, *(field.name for field in fields)], [*parts, *combinations], strict=True)]
-    in_plane, normal, free = (
-        NAMES.index(name) for name in ('landmark_in_plane', 'landmark_normal', 'landmark')
-    )
+    of = [np.full(part.shape[1], NAMES.index(name))
+          for name, part in (*zip(names, parts, strict=True), *fields)]
     landmarks = points.landmarks
-    kinds = [[in_plane, in_plane, normal] if one.flat else [free] * 3
-             for one in landmarks.boards]
+    kinds = np.array([[NAMES.index(name) for name in (
+        ('landmark_in_plane', 'landmark_in_plane', 'landmark_normal') if one.flat
+        else ('landmark',) * 3)] for one in landmarks.boards])
     columns = RandomColumns(
-        frame, label, points.place, points.slot, np.array(kinds)[landmarks.board_of],
+        frame, label, points.place, points.slot, kinds[landmarks.board_of],
         _join_columns(points.weight.size * 2, parts),
-        _join_columns(landmarks.ids.size * 3, combinations),
+        _join_columns(landmarks.ids.size * 3, [field for _, field in fields]),
         np.concatenate([np.zeros(0, dtype=np.int64), *of]),
         Components(OF_LANDMARKS, _NUMEROUS),
     )
-    axes = np.stack([one.axes for one in landmarks.boards])[landmarks.board_of]
-    return RandomEffects(columns, landmarks.ids, tuple(grids), tuple(fields), axes)
+    return RandomEffects(columns, landmarks.ids, tuple(grids), landmarks.axes)
 
 
-def _frame_columns(points: GatheredPoints, compact: bool) -> tuple[Array, Index]:
+def _frame_columns(points: _Points, compact: bool) -> tuple[Array, Index]:
     """Return columns (F, M, B) and labels (B,) of what single frames have of their own."""
     blocks: list[tuple[str, Array]] = []
     for camera, (low, high) in enumerate(points.extents):
@@ -142,32 +243,32 @@ def _frame_columns(points: GatheredPoints, compact: bool) -> tuple[Array, Index]
         blocks.append(('frame_bumps', _on_both_axes(bumps)))
     blocks.append(('frame_bend', _bend_columns(points)))
     columns = np.concatenate([block for _, block in blocks], axis=-1)
-    label = np.concatenate([
-        np.full(block.shape[-1], NAMES.index(name)) for name, block in blocks
-    ])
+    label = np.repeat([NAMES.index(name) for name, _ in blocks],
+                      [block.shape[-1] for _, block in blocks])
     frames, count = points.used.shape
     return columns.reshape(frames, 2 * count, -1), label
 
 
-def _cover_points(points: GatheredPoints, mine: Mask, pitch: float) -> Array:
+def _cover_points(points: _Points, mine: Mask, pitch: float) -> Array:
     """Return centres of bumps over the extent of a camera and over all its points."""
     low, high = points.extents[int(points.camera[mine][0])]
     uv = points.uv[mine]
     return hexagons(np.minimum(low, uv.min(axis=0)), np.maximum(high, uv.max(axis=0)), pitch)
 
 
-def _bend_columns(points: GatheredPoints) -> Array:
+def _bend_columns(points: _Points) -> Array:
     """Return columns (F, N, 2, 3 boards) of a bend of each board, anew in every frame."""
-    x, y = np.moveaxis(points.local, -1, 0)
+    known = points.landmarks
+    x, y = np.moveaxis(known.at[points.slot], -1, 0)
     powers = np.stack([x * x, x * y, y * y], axis=-1)
     bend = points.place[..., 2:] * powers[..., None, :]
-    boards = len(points.landmarks.boards)
-    mine = (points.slot >= 0)[..., None] & (points.board[..., None] == np.arange(boards))
+    board = np.where(points.slot < 0, -1, known.board_of[points.slot])
+    mine = board[..., None] == np.arange(len(known.boards))
     columns = bend[..., None, :] * mine[..., None, :, None]
     return np.asarray(columns.reshape(*columns.shape[:3], -1))
 
 
-def _sag_columns(points: GatheredPoints, rotation: Array) -> sparse.csr_array:
+def _sag_columns(points: _Points, rotation: Array) -> sparse.csr_array:
     """Return columns (2 F N, 9 boards) of a bend of each board in proportion to its normal.
 
     rotation (F, 3, 3): of the camera or rig.  A board that sags by its own weight bends by
@@ -182,7 +283,7 @@ def _sag_columns(points: GatheredPoints, rotation: Array) -> sparse.csr_array:
 
 
 def _image_grids(
-    points: GatheredPoints, finest: bool
+    points: _Points, finest: bool
 ) -> Iterator[tuple[ImageGrid, sparse.csr_array]]:
     """Yield bumps over the image that all frames share, camera by camera, coarse to fine.
 
@@ -205,7 +306,7 @@ def _image_grids(
 
 
 def _complete_grids(
-    points: GatheredPoints, finest: float
+    points: _Points, finest: float
 ) -> Iterator[tuple[ImageGrid, sparse.csr_array]]:
     """Yield the bumps wherever there are points; finest: pitch of the finest grid, px, or NaN."""
     for camera, (low, high) in enumerate(points.extents):
@@ -218,49 +319,43 @@ def _complete_grids(
                        bump_values(points.uv, mine, centres, pitch))
 
 
-def _board_fields(points: GatheredPoints) -> list[BoardField]:
-    """Return smooth displacements of boards, along and across them: neighbours err alike.
+def _board_fields(landmarks: _Landmarks) -> Iterator[tuple[str, sparse.csr_array]]:
+    """Yield smooth displacements of boards, along and across them: neighbours err alike.
 
-    Along it, what is linear has its own variance: paper stretches as a whole.  Across it, the
-    smooth shapes that the catalogue has are taken out.
+    As combinations (3 L, K axes) of the offsets of landmarks.  Along a board, what is linear has
+    its own variance: paper stretches as a whole.  Across it, the smooth shapes that the catalogue
+    has are taken out.
     """
-    fields = []
-    for i, board in enumerate(points.landmarks.boards):
-        mine = points.landmarks.board_of == i
+    for i, board in enumerate(landmarks.boards):
+        mine = landmarks.board_of == i
         if not board.flat or mine.sum() < _MIN_LANDMARKS:
             continue
-        at = points.landmarks.at[mine]
+        at = landmarks.at[mine]
         pitch = max(float(np.ptp(at, axis=0).max()) / _BOARD_CELLS, 1e-9)
         centres = hexagons(at.min(axis=0), at.max(axis=0), pitch)
         bumps = bump_values(at, np.ones(len(at), dtype=bool), centres, pitch).toarray()
-        stretch = np.zeros((len(points.landmarks.at), 2))
-        stretch[mine] = at - at.mean(axis=0)
-        fields.append(BoardField('board_stretch', (0, 1), stretch))
-        smooth = ('board_in_plane', (0, 1), 1), ('board_normal', (2,), board.highest_degree)
+        yield 'board_stretch', _combine_offsets(at - at.mean(axis=0), mine, [0, 1])
+        smooth = ('board_in_plane', [0, 1], 1), ('board_normal', [2], board.highest_degree)
         for name, axes, degree in smooth:
-            values = np.zeros((len(points.landmarks.at), len(centres)))
-            values[mine] = _remove_polynomial(bumps, at, degree)
-            kept = np.sqrt((values**2).sum(axis=0)) > 0.05
-            if kept.any():
-                fields.append(BoardField(name, axes, values[:, kept]))
-    return fields
+            values = _remove_polynomial(bumps, at, degree)
+            values = values[:, np.sqrt((values**2).sum(axis=0)) > 0.05]
+            if values.size:
+                yield name, _combine_offsets(values, mine, axes)
 
 
 def _remove_polynomial(values: Array, at: Array, degree: int) -> Array:
     """Take the best polynomial of places (L, 2) out of values (L, K)."""
     x, y = at.T
-    powers = np.stack(
-        [x ** (total - j) * y**j for total in range(degree + 1) for j in range(total + 1)], axis=-1
-    )
+    powers = np.stack([x ** (total - j) * y**j
+                       for total in range(degree + 1) for j in range(total + 1)], axis=-1)
     return np.asarray(values - powers @ np.linalg.lstsq(powers, values, rcond=1e-9)[0])
 
 
-def _combine_offsets(field: BoardField) -> sparse.csr_array:
-    """Return a field as combinations (3 L, K axes) of the offsets of landmarks."""
-    count, width = field.values.shape
-    columns = np.zeros((count, 3, len(field.axes), width))
-    columns[:, field.axes, np.arange(len(field.axes))] = field.values[:, None]
-    return sparse.csr_array(columns.reshape(3 * count, -1))
+def _combine_offsets(values: Array, mine: Mask, axes: list[int]) -> sparse.csr_array:
+    """Return values (M, K) of some of the landmarks (L,) along each of some axes."""
+    columns = np.zeros((len(mine), 3, len(axes), values.shape[1]))
+    columns[mine] = values[:, None, None] * np.eye(3)[:, axes, None]
+    return sparse.csr_array(columns.reshape(3 * len(mine), -1))
 
 
 def _join_columns(rows: int, parts: list[sparse.csr_array]) -> sparse.csr_array:
@@ -279,12 +374,5 @@ def _compact_columns(columns: Array) -> Array:
 
 def _on_both_axes(values: Array) -> Array:
     """Return columns (F, N, 2, 2 K) that move u and v apart by values (F, N, K)."""
-    columns = np.zeros((*values.shape[:2], 2, values.shape[-1], 2))
-    columns[..., 0, :, 0] = values
-    columns[..., 1, :, 1] = values
-    return columns.reshape(*values.shape[:2], 2, -1)
-
-
-def _move_both_axes(values: sparse.csr_array) -> sparse.csr_array:
-    """Return columns (2 n, 2 K) that move u and v apart by values (n, K)."""
-    return sparse.csr_array(sparse.kron(values, np.eye(2), 'csr'))
+    columns = values[..., None, :, None] * np.eye(2)[:, None]
+    return np.asarray(columns.reshape(*values.shape[:2], 2, -1))

@@ -19,8 +19,7 @@ from fisheye_svp_ros.diagnosis.effect_tests import (
     EffectTests,
     HeldOutGain,
 )
-from fisheye_svp_ros.diagnosis.gathered_points import MILLIMETRE
-from fisheye_svp_ros.diagnosis.random_effects import OF_LANDMARKS
+from fisheye_svp_ros.diagnosis.random_effects import MILLIMETRE, OF_LANDMARKS
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.target_effects import MIN_VIEWS, LandmarkSurveyEffect
 from fisheye_svp_ros.mixed_model import (

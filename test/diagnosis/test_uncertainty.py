@@ -143,8 +143,7 @@ def test_cameras_without_a_common_frame_have_poses_of_their_own():
 def dense_square(null, sigma):
     """Return the mean square (3 L, 3 L), m^2, of landmarks' offsets given the data, densely."""
     linear, variances = null.linear, null.variances
-    effects = null.random.select(variances.alive)
-    random = effects.columns
+    random = null.random.select(variances.alive).columns
     frames = linear.frame_columns
     fixed = np.concatenate([linalg.block_diag(*frames),
                             linear.shared_columns.reshape(frames.shape[0] * frames.shape[1], -1)],
@@ -162,12 +161,7 @@ def dense_square(null, sigma):
     way = np.zeros((random.unit_columns.shape[1], len(inverse)))
     start_of = fixed.shape[1] + blocks[0].shape[1]
     way[:, start_of:start_of + len(way)] = np.eye(len(way))
-    place = start_of + len(way)
-    for field in effects.fields:
-        for axis in field.axes:
-            way.reshape(-1, 3, len(inverse))[
-                :, axis, place:place + field.values.shape[1]] += field.values
-            place += field.values.shape[1]
+    way[:, len(inverse) - random.fields.shape[1]:] = random.fields.toarray()
     mean = way @ mean
     return 1e-6 * (sigma**2 * way @ inverse @ way.T + np.outer(mean, mean))
 

@@ -15,10 +15,9 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
-from fisheye_svp_ros.diagnosis.gathered_points import MILLIMETRE
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import Problem
-from fisheye_svp_ros.diagnosis.random_effects import NAMES
+from fisheye_svp_ros.diagnosis.random_effects import MILLIMETRE, NAMES
 from fisheye_svp_ros.effects.target_map import KnownTarget
 from fisheye_svp_ros.scene.boards import BoardTurn, board_turns
 from fisheye_svp_ros.scene.observations import Landmarks, Observations, frame_name
