@@ -28,9 +28,9 @@ from fisheye_svp_ros.diagnosis.decision import (
 )
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
-from fisheye_svp_ros.diagnosis.fitted_model import RepeatedErrors
 from fisheye_svp_ros.diagnosis.lens_evidence import compare_lens_files, find_bounds, find_lens_rays
 from fisheye_svp_ros.diagnosis.random_effects import SAG
+from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
 from fisheye_svp_ros.diagnosis.variance_budget import Component
 from fisheye_svp_ros.effects.target_map import board_maps
 from fisheye_svp_ros.optics.lens import Lens
@@ -190,7 +190,7 @@ def _measure_landmarks(evaluation: Evaluation, gain: float) -> list[Advice]:
     return [Advice(what, landmarks=chosen, gain=gain)] if chosen else []
 
 
-def _vary_views(views: RepeatedErrors) -> Advice:
+def _vary_views(views: SimilarViews) -> Advice:
     """Return what to do where landmarks err alike in similar views."""
     soon = f' and taken within {views.lasting:.0f} s' if np.isfinite(views.lasting) else ''
     return Advice(

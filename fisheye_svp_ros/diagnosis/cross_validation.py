@@ -16,7 +16,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets, refit
-from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.diagnosis.null_model import NullModel, border_of
 from fisheye_svp_ros.mixed_model import (
     FactoredEquations,
     RandomColumns,
@@ -110,15 +110,13 @@ def rms_reduction(before: HeldOut, after: HeldOut) -> Comparison:
     return Comparison(before.rms, after.rms, before.rms - after.rms, float(low), float(high))
 
 
-def held_out_gain(before: HeldOut, after: HeldOut, noise: float) -> Comparison:
-    """Return 1 - (held-out variance above noise after) / (before), with a bootstrap interval."""
-    return gain_and_confidence(before, after, noise)[0]
-
-
 def gain_and_confidence(
     before: HeldOut, after: HeldOut, noise: float
 ) -> tuple[Comparison, float]:
-    """Return `held_out_gain`, and the share of the bootstrap in which it is above zero."""
+    """Return 1 - (held-out variance above noise after) / (before), with a bootstrap interval.
+
+    And the share of the bootstrap in which it is above zero.
+    """
     gains = _excess_gain(before, after, noise, _resample_frames(len(before.squares)))
     low, high = np.quantile(gains, (0.025, 0.975))
     whole = np.arange(len(before.squares))[None]
@@ -333,8 +331,7 @@ def split_frames(
     trained, tested = (columns._replace(
         group=columns.group[part], offset=columns.offset[part], unit=columns.unit[part],
         shared=columns.shared[row[part].ravel()]) for part in (~out, out))
-    border = np.concatenate(
-        [linear.shared_columns / fitted.scale, linear.residual[..., None]], axis=-1)
+    border = border_of(linear, linear.shared_columns / fitted.scale)
     eq = make_equations(trained, linear.frame_columns[~out], border[~out])
     return factor_equations(eq.with_ridge(1e-9), variances.lam, variances.weight), tested
 
@@ -356,15 +353,14 @@ def refuting_blocks(null: NullModel, fitted: FittedModel) -> dict[str, tuple[End
     block, ends = contiguous_blocks(linear.data)
     if linear.data.frames < _MIN_FRAMES or len(ends) < BLOCKS:
         return {}
+    border = border_of(linear, linear.shared_columns / null.scale[own])
     models = [own, *(np.setdiff1d(own, columns) for _, columns, _ in lasting)]
     found: dict[str, tuple[Ends, ...]] = {}
     for i, edge in enumerate(ends):
         out = block == i
         information = split_frames(fitted, null.variances, out)[0].information
         predicted = np.stack([_predict(null, information, model) for model in models], axis=-1)
-        border = np.concatenate([linear.shared_columns[out] / null.scale[own],
-                                 linear.residual[out][..., None]], axis=-1)
-        whole, *without = misfits(linear, out, border @ predicted)
+        whole, *without = misfits(linear, out, border[out] @ predicted)
         for (effect, _, _), square in zip(lasting, without, strict=True):
             if whole > _MAX_SQUARE_RATIO * square:
                 found[effect.name] = (*found.get(effect.name, ()), edge)

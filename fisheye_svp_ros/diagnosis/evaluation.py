@@ -15,14 +15,13 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.diagnosis.causes import Cause, medium_cause, selected_causes
 from fisheye_svp_ros.diagnosis.checks.medium import Medium, stated_parameters
-from fisheye_svp_ros.diagnosis.checks.similar_views import similar_views
 from fisheye_svp_ros.diagnosis.cross_validation import (
     Comparison,
     HeldOut,
     HeldOutData,
     cross_validate,
     fit_without_causes,
-    held_out_gain,
+    gain_and_confidence,
     predict_other_data,
     refuting_blocks,
     valid_state,
@@ -33,6 +32,7 @@ from fisheye_svp_ros.diagnosis.model_errors import ModelErrors, shared_names
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import extended_lenses
 from fisheye_svp_ros.diagnosis.selection import Selection
+from fisheye_svp_ros.diagnosis.similar_views import similar_views
 from fisheye_svp_ros.diagnosis.uncertainty import (
     OtherModel,
     likely_models,
@@ -97,10 +97,9 @@ class Evaluation:
     medium: Medium | None
 
     @classmethod
-    def of_selection(
-        cls, selection: Selection, fitted: FittedModel, medium: Medium | None
-    ) -> Evaluation:
-        """Evaluate a selection; fitted: of its null model."""
+    def of_selection(cls, selection: Selection, medium: Medium | None) -> Evaluation:
+        """Evaluate a selection."""
+        fitted = FittedModel.solve_null_model(selection.null)
         views = similar_views(fitted.linear, fitted.residuals())
         offsets = fitted.predicted_offsets()._replace(views=views)
         noise = noise_px(selection.null)
@@ -310,7 +309,7 @@ class Evaluation:
         return self._gain(self._given_prediction, self._extended_prediction)
 
     def _gain(self, before: HeldOut, after: HeldOut) -> Comparison:
-        return held_out_gain(before, after, self.noise_px)
+        return gain_and_confidence(before, after, self.noise_px)[0]
 
     @cached_property
     def gains(self) -> dict[str, Comparison]:
@@ -343,7 +342,8 @@ class Evaluation:
         gain = self._gain(self._given_prediction, self._base_prediction)
         remaining = 1 - self.medium.share
         fitted = replace(self.medium, state=self.selection.state)
-        return [medium_cause(fitted, self._free_errors(), self._base_prediction.rms, gain.value),
+        errors = dict(zip(shared_names(self.null.linear), self.errors.tolist(), strict=True))
+        return [medium_cause(fitted, errors, self._base_prediction.rms, gain.value),
                 *(replace(cause, share=remaining * cause.share) for cause in causes)]
 
     def components(self, noise_causes: Mapping[str, float]) -> list[Component]:
@@ -359,11 +359,6 @@ class Evaluation:
     def _squares(self) -> dict[str, float]:
         return cause_squares(self.null, self.selection.causes)
 
-    def _free_errors(self) -> dict[str, float]:
-        """Return the standard errors of what was free from the start."""
-        rig = _count_rig_columns(self.selection.first, self.free)
-        return {name: float(self.errors[rig + i]) for i, name in enumerate(self.free)}
-
     @cached_property
     def intrinsics(self) -> dict[str, Intrinsic]:
         """Free intrinsics before and after, with errors under the null model."""
@@ -375,13 +370,13 @@ class Evaluation:
         errors = np.sqrt(np.diag(written.widen(np.diag(alone**2))))
         after = dict(zip(shared_names(written.linear), errors, strict=True))
         given = stated_parameters(selection.problem.inputs.lenses)
-        before = self._errors_of(selection.first)
-        rig = _count_rig_columns(selection.first, self.free)
+        before = dict(zip(shared_names(selection.first.linear),
+                          self._errors_of(selection.first), strict=True))
         was, now = selection.problem.base.parameters, written.linear.state.parameters
         return {
             name: Intrinsic(
-                *given[name], was[name], float(before[rig + i]), now[name], float(after[name]))
-            for i, name in enumerate(self.free)
+                *given[name], was[name], float(before[name]), now[name], float(after[name]))
+            for name in self.free
         }
 
 
@@ -389,8 +384,3 @@ def _with_poses_anew(linear: Linearization) -> Linearization:
     if linear.data.poses is not None:
         return linear
     return Linearization(linear.data, adjust_poses(linear.data, linear.state), linear.free)
-
-
-def _count_rig_columns(null: NullModel, free: Sequence[str]) -> int:
-    """Return how many of what is shared come before what was free from the start."""
-    return null.column_count - len(free) - sum(len(values) for _, _, values in null.terms)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse.linalg import eigsh
@@ -19,6 +19,7 @@ from fisheye_svp_ros.diagnosis.effect_forms import bump_values
 from fisheye_svp_ros.diagnosis.null_model import (
     FINEST_FIELD,
     NullModel,
+    border_of,
     column_norms,
     prior_products,
 )
@@ -30,6 +31,7 @@ from fisheye_svp_ros.diagnosis.random_effects import (
     RandomEffects,
     make_random_effects,
 )
+from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
 from fisheye_svp_ros.effects.target_map import at_landmarks
 from fisheye_svp_ros.mixed_model import (
     Equations,
@@ -54,28 +56,6 @@ _PAIR_REACH = 80  # of the image: how near to each other points have the same pl
 MIN_PAIRS = 100
 
 
-class RepeatedErrors(Protocol):
-    """What landmarks err by alike in similar views, see `checks.similar_views`.
-
-    cross_predictions (S, N, 2): in each view, predicted from the others, px; share: of what noise
-    seemed to be.
-    """
-
-    @property
-    def cross_predictions(self) -> Array: ...
-
-    @property
-    def share(self) -> float: ...
-
-    @property
-    def p_value(self) -> float: ...
-
-    @property
-    def lasting(self) -> float: ...
-
-    def predict(self, linear: Linearization) -> Array: ...
-
-
 class PredictedOffsets(NamedTuple):
     """Predicted random effects of landmarks (L, 3), m, of the image (grids, (K, 2) px), of views.
 
@@ -85,7 +65,7 @@ class PredictedOffsets(NamedTuple):
     landmark: Index
     offset: Array
     grids: tuple[tuple[ImageGrid, Array], ...]
-    views: RepeatedErrors | None = None
+    views: SimilarViews | None = None
 
     @property
     def of_image(self) -> PredictedOffsets:
@@ -133,9 +113,7 @@ class FittedModel:
         finest = bool(variances.alive[NAMES.index(FINEST_FIELD)])
         random = make_random_effects(linear, finest).select(variances.alive)
         scale = column_norms(linear.shared_columns)
-        border = np.concatenate(
-            [linear.shared_columns / scale, linear.residual[..., None]], axis=-1
-        )
+        border = border_of(linear, linear.shared_columns / scale)
         eq = make_equations(random.columns, linear.frame_columns, border).select(variances.alive)
         eq = eq.add_products(prior_products(linear, linear.state, scale, variances.sigma))
         return cls._solve(linear, random, eq, variances, scale)

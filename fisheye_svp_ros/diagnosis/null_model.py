@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.cluster import hierarchy
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.effect_forms import (
@@ -26,7 +27,6 @@ from fisheye_svp_ros.diagnosis.random_effects import (
     RandomEffects,
     make_random_effects,
 )
-from fisheye_svp_ros.diagnosis.similar_poses import cluster_frames
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.mixed_model import (
@@ -54,6 +54,8 @@ _OF_FRAMES = np.array([stage == 'frame' for stage in STAGE_OF.values()])  # comp
 _FIELD_SIZES = (0.5, 2.0, 8.0, 32.0)  # what a bump adds to the variance where it is, over noise
 _WALK_SIZES = tuple(8.0 * 4.0**i for i in range(12))  # of the slowest wave of a walk
 _FRAME_STEPS = 6  # the likelihood is flat around the best variances
+_SIMILAR_POSE = 0.1  # of the distance, or rad
+_MIN_CLUSTERS = 3  # fewer are no sample
 
 PlacedEffect = tuple[Effect, Index, Array]  # an effect, its columns among shared ones, its values
 Alternative = tuple[float, Array]  # log determinant and information of the border
@@ -81,17 +83,13 @@ class FixedColumns:
         """Return the columns of a linearized state, without the effects left out."""
         forms = effect_forms(linear, left_out)
         fields, (walks, roughness) = smooth_fields(linear), intrinsic_walks(linear)
-        columns = np.concatenate(
-            [linear.shared_columns, forms.columns, *fields.values(), walks], axis=-1)
+        parts = [linear.shared_columns, forms.columns, *fields.values(), walks]
+        columns = np.concatenate(parts, axis=-1)
         scale = column_norms(columns)
-        border = np.concatenate([columns / scale, linear.residual[..., None]], axis=-1)
-        own = linear.shared_columns.shape[-1]
-        at, where = own + forms.columns.shape[-1], {}
-        for name, field in fields.items():
-            where[name] = np.arange(at, at + field.shape[-1])
-            at += field.shape[-1]
-        walks_at = np.arange(at, at + walks.shape[-1])
-        return cls(border, scale, own, forms, where, walks_at, roughness)
+        ends = np.cumsum([part.shape[-1] for part in parts])
+        own, _, *where, walks_at = np.split(np.arange(len(scale)), ends[:-1])
+        return cls(border_of(linear, columns / scale), scale, len(own), forms,
+                   dict(zip(fields, where, strict=True)), walks_at, roughness)
 
 
 @dataclass(frozen=True)
@@ -149,8 +147,7 @@ class NullModel:
 
     def _with_priors(self, variances: Variances) -> NullModel:
         """Return the model with variances, and the priors of its effects beside their noise."""
-        products = prior_products(
-            self.linear, self.linear.state, self.scale, variances.sigma)
+        products = prior_products(self.linear, self.linear.state, self.scale, variances.sigma)
         return replace(self, variances=variances, full=self.full.add_products(products))
 
     def relinearize(
@@ -158,8 +155,7 @@ class NullModel:
         finest: bool,
     ) -> NullModel:
         """Return the model around another state, the variances as they are."""
-        bare = self._linearize(data, state, free, left_out, finest)
-        return bare._with_priors(self.variances)
+        return self._linearize(data, state, free, left_out, finest)._with_priors(self.variances)
 
     def calls_for_finest_field(
         self, data: RigViews, state: RigState, left_out: Sequence[str]
@@ -244,13 +240,10 @@ class NullModel:
     @property
     def terms(self) -> list[PlacedEffect]:
         """Each effect in the model, its columns among what is shared, and its values."""
-        terms = [t for t in self.linear.state.terms if t[0].stage != 'noise']
-        start = self.column_count - sum(len(values) for _, values in terms)
-        placed = []
-        for effect, values in terms:
-            placed.append((effect, np.arange(start, start + len(values)), values))
-            start += len(values)
-        return placed
+        terms = [term for term in self.linear.state.terms if is_shared(term[0])]
+        ends = np.cumsum([0, *(len(values) for _, values in terms)])
+        columns = np.split(self.included_columns, self.column_count - ends[-1] + ends)[1:-1]
+        return [(effect, at, values) for (effect, values), at in zip(terms, columns, strict=True)]
 
     @property
     def effect_kinds(self) -> set[str]:
@@ -322,11 +315,9 @@ class NullModel:
         eq = self.full.select(alive).free_component(kind)
         f = factor_equations(eq, self.variances.lam, self.variances.weight)
         count = len(f.information) - len(self.scale) - 1
-        for size in _FIELD_SIZES:
-            prior = own * self.full.rows / count / size
-            logs, information = integrate_columns(f, np.arange(count), prior)
-            alternatives.append((logs, information[count:, count:]))
-        return alternatives
+        fields = (integrate_columns(f, np.arange(count), own * self.full.rows / count / size)
+                  for size in _FIELD_SIZES)
+        return alternatives + [(logs, part[count:, count:]) for logs, part in fields]
 
     @cached_property
     def walk_alternatives(self) -> list[Alternative]:
@@ -351,12 +342,6 @@ class NullModel:
         return without, estimated
 
 
-def with_ordinary_landmarks(null: NullModel, landmarks: Sequence[int]) -> Variances:
-    """Return the variances with the offsets of some landmarks drawn as those of most are."""
-    mine = np.isin(null.random.landmark, landmarks)
-    return replace(null.variances, weight=np.where(mine, 1.0, null.variances.weight))
-
-
 def prior_products(
     linear: Linearization, state: RigState, scale: Array, sigma: float
 ) -> Array:
@@ -377,6 +362,33 @@ def prior_products(
     rows[:, -1] = -values
     rows *= (sigma / expected)[:, None]
     return np.asarray(rows.T @ rows)
+
+
+def cluster_frames(linear: Linearization) -> Index:
+    """Return the cluster (F,) of each frame: those in which the target is seen in one pose.
+
+    What light, detector and board do to such frames they do to all alike: no independent
+    witnesses.  Poses of a cluster differ by at most a tenth, of the distance or a radian; each
+    frame has its own where there are fewer than three.
+    Source: Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 11; by clusters:
+    Bell and McCaffrey, Survey Methodology 28 (2002).
+    """
+    pose, points = linear.state.pose, linear.data.views.points[linear.data.views.used]
+    frames = np.arange(len(pose.position))
+    if len(frames) < _MIN_CLUSTERS:
+        return frames
+    middle = pose.into_body(np.broadcast_to(points.mean(axis=0), (len(frames), 1, 3)))[:, 0]
+    away = np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-300)
+    turn = pose.rotation.reshape(-1, 9) / np.sqrt(2)  # so far apart as the angle, if small
+    tree = hierarchy.linkage(
+        np.concatenate([middle / away, np.log(away), turn], axis=1), 'complete')
+    cluster = hierarchy.fcluster(tree, _SIMILAR_POSE, 'distance').astype(np.int64) - 1
+    return frames if cluster.max() + 1 < _MIN_CLUSTERS else cluster
+
+
+def border_of(linear: Linearization, columns: Array) -> Array:
+    """Return columns (F, M, K) and, last, the residual."""
+    return np.concatenate([columns, linear.residual[..., None]], axis=-1)
 
 
 def column_norms(columns: Array) -> Array:

@@ -23,7 +23,6 @@ from fisheye_svp_ros.diagnosis.null_model import (
     FINEST_FIELD,
     NullModel,
     PlacedEffect,
-    with_ordinary_landmarks,
 )
 from fisheye_svp_ros.diagnosis.problem import Problem, Progress
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
@@ -126,7 +125,9 @@ def select_causes(problem: Problem, progress: Progress) -> Selection:
                  0.8 - 0.75 * _PROGRESS_DECAY**turn)
         null = search.estimate_null_model(problem)
         first, before = first or null, replace(search, variances=null.variances)
-        search = _change_effects(problem, before, null, _max_effects(null, turn))
+        # How many causes may be taken in at once.
+        most = 1 if _misfit(null) > _LINEAR_LIMIT and not turn else _MAX_EFFECTS
+        search = _change_effects(problem, before, null, most)
         if search.state is before.state:
             search = _revise(problem, search, null)
         if search.state is before.state and search.finest == before.finest:
@@ -161,8 +162,9 @@ def _change_effects(problem: Problem, search: _Search, null: NullModel, most: in
     effect, offset, step = found
     return replace(
         search, state=with_effect(search.state, effect, offset), trace=(*search.trace, step),
-        # Their random offsets must not stand in for them.
-        variances=with_ordinary_landmarks(null, effect.landmarks))
+        # Their random offsets must not stand in for them: drawn as those of most are.
+        variances=replace(null.variances, weight=np.where(
+            np.isin(null.random.landmark, effect.landmarks), 1.0, null.variances.weight)))
 
 
 def _revise(problem: Problem, search: _Search, null: NullModel) -> _Search:
@@ -193,7 +195,8 @@ def _revise_outliers(problem: Problem, search: _Search, fitted: FittedModel) -> 
     changed = len(kept.rows) < len(problem.outliers.rows) or len(outliers.rows) > len(kept.rows)
     state = search.state
     if growth is not None:
-        state = with_noise_growth(state, growth.value)
+        term = (NoiseVsAngleEffect(), np.array([growth.value]))
+        state = replace(state, terms=(*state.terms, term))
     elif changed:
         state = replace(state)  # the same, to be fitted to other data
     return replace(search, data=data, state=state, revision=Revision(outliers, growth),
@@ -247,11 +250,6 @@ def without_cause(selection: Selection, name: str) -> Selection:
 def _known_effects(problem: Problem) -> tuple[str, ...]:
     """Return what is not asked for: what the lens came with and what the user includes."""
     return (*problem.options.included, *(effect.name for effect in problem.given_effects))
-
-
-def _max_effects(null: NullModel, turn: int) -> int:
-    """Return how many causes may be taken in at once."""
-    return 1 if _misfit(null) > _LINEAR_LIMIT and not turn else _MAX_EFFECTS
 
 
 def _misfit(null: NullModel) -> float:
@@ -353,9 +351,3 @@ def reinstate_outliers(
     why = tuple(one for one, back in zip(outliers.why, again, strict=True) if not back)
     return (replace(data, views=views._replace(weight=weight, row=row)),
             Outliers(outliers.rows[~again], outliers.px[~again], why))
-
-
-def with_noise_growth(state: RigState, growth: float) -> RigState:
-    """Return the state with weights for noise that grows with the angle."""
-    term = (NoiseVsAngleEffect(), np.array([growth]))
-    return replace(state, terms=(*state.terms, term))

@@ -36,7 +36,6 @@ from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, cross_validate
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, Figures, SearchRecord
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
-from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
 from fisheye_svp_ros.diagnosis.model_errors import with_uncertainty
 from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
 from fisheye_svp_ros.diagnosis.problem import (
@@ -328,8 +327,7 @@ def _confirm(
     """Take out causes that are not confirmed, the weakest first; fit the rest anew each time."""
     candidates: dict[str, UnconfirmedCause] = {}
     while True:
-        evaluation = Evaluation.of_selection(
-            selection, FittedModel.solve_null_model(selection.null), medium)
+        evaluation = Evaluation.of_selection(selection, medium)
         doubt = _weakest_cause(evaluation)
         if doubt is None:
             return evaluation, _add_refused_causes(selection, candidates)

@@ -18,9 +18,10 @@ from scipy import optimize, special
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
-from fisheye_svp_ros.diagnosis.fitted_model import MIN_PAIRS, FittedModel, RepeatedErrors
+from fisheye_svp_ros.diagnosis.fitted_model import MIN_PAIRS, FittedModel
 from fisheye_svp_ros.diagnosis.null_model import NullModel, PlacedEffect
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
+from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.mixed_model import (
     component_p_values,
@@ -106,7 +107,7 @@ def _px2(null: NullModel) -> float:
 
 def variance_budget(
     null: NullModel, squares: Mapping[str, float], p_values: Mapping[str, float],
-    repeated: RepeatedErrors | None = None,
+    repeated: SimilarViews | None = None,
 ) -> list[Component]:
     """Return all parts: what is named, random components, noise.
 

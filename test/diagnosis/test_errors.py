@@ -9,7 +9,7 @@ from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import NullModel
 from fisheye_svp_ros.diagnosis.fitted_model import refit
-from fisheye_svp_ros.diagnosis.similar_poses import cluster_frames
+from fisheye_svp_ros.diagnosis.null_model import cluster_frames
 from fisheye_svp_ros.diagnosis.uncertainty import (
     likely_models,
     model_uncertainty,

@@ -7,7 +7,7 @@ import pytest
 from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.checks.similar_views import similar_views
+from fisheye_svp_ros.diagnosis.similar_views import similar_views
 from fisheye_svp_ros.diagnosis.variance_budget import REPEATED_COMPONENT
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.bundle_adjustment import adjust

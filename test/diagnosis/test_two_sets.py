@@ -16,7 +16,7 @@ from fisheye_svp_ros.diagnosis import (
     diagnose_against,
 )
 from fisheye_svp_ros.diagnosis.checks.two_datasets import SharedParameter
-from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, held_out_gain, rms_reduction
+from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, gain_and_confidence, rms_reduction
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import save_lens
@@ -105,7 +105,7 @@ def test_the_intervals_of_predictions_hold_95_percent():
     spread = [np.std(squares) / np.mean(squares) / 20 for squares in (before, after)]
     less = rms_reduction(HeldOut(before, count), HeldOut(before / 4, count))
     assert (less.high - less.low) / 2 == pytest.approx(1.96 * less.value * spread[0] / 2, rel=0.15)
-    found = held_out_gain(HeldOut(before, count), HeldOut(after, count), 0.0)
+    found, _ = gain_and_confidence(HeldOut(before, count), HeldOut(after, count), 0.0)
     ratio = after.mean() / before.mean()
     assert (found.high - found.low) / 2 == pytest.approx(
         1.96 * ratio * np.hypot(*spread), rel=0.15)
