@@ -130,9 +130,10 @@ class EffectTests:
             effect = null.fixed.forms.effects[form]
             if not score.rank or effect.per_frame > per_frame or not worth(score):
                 continue
-            if _is_negative(effect, score):
-                continue
-            if effect.is_implausible(score.estimate, null.linear.scene):
+            # Some sizes have a meaning only where they are positive.
+            positive = np.array([parameter.positive for parameter in effect.parameters])
+            if (score.estimate[positive] < 0).any() or effect.is_implausible(
+                    score.estimate, null.linear.scene):
                 continue
             gain, count = score.statistic, score.rank
             if effect.per_frame:  # what it is in single frames is one variance
@@ -239,12 +240,6 @@ def _log_marginal(information: Array, included: Index, columns: Index, prior: Ar
     gradient = remaining[len(included) : -1, -1]
     inverse, _ = pseudo_inverse(block, 1e-14)
     return float(gradient @ inverse @ gradient - np.linalg.slogdet(block)[1]) / 2
-
-
-def _is_negative(effect: Effect, score: Score) -> bool:
-    """Whether a size comes out negative where only a positive one has a meaning."""
-    sizes = zip(score.estimate, effect.parameters, strict=True)
-    return any(value < 0 for value, parameter in sizes if parameter.positive)
 
 
 def random_gain(null: NullModel, included: Index, columns: Index) -> float:

@@ -155,26 +155,18 @@ class FittedModel:
         x = np.einsum('fmk,fmc->kc', self.linear.shared_columns, rows, optimize=True)
         return self.factored.solve(e, r, x / self.scale[:, None] + pull)
 
-    def residuals(self) -> Array:
-        """Return whitened residuals (F, M), every random effect at its prediction."""
-        solution = self.solution
-        remaining = self.linear.residual - self.predict_rows(
-            solution.e[..., None], solution.r[:, None], solution.values[:, None]
-        )[..., 0]
-        return np.asarray(remaining * self.linear.row_mask)
+    def residuals(self, of_frames: bool = False) -> Array:
+        """Return whitened residuals (F, M), every random effect at its prediction.
 
-    def residuals_of_frames(self) -> Array:
-        """Return whitened residuals (F, M) beside what single frames have of their own alone.
-
-        What landmarks and the image have of their own is in them.
+        of_frames: those of single frames alone; what landmarks and the image have stays in.
         """
         e, r = self.solution.e[..., None], self.solution.r[:, None]
         eq = self.factored.equations
-        group, unit, shared = eq.split(e, r)
-        rows = predict_rows(self.random.columns, self.pose_columns, group, 0 * unit, 0 * shared,
-                            eq.units)[..., 0]
-        values = self.linear.shared_columns @ (self.solution.values / self.scale)
-        return np.asarray((self.linear.residual - rows - values) * self.linear.row_mask)
+        if of_frames:
+            group, _, shared = eq.split(e, r)
+            e, r = eq.join(group, np.zeros((*self.random.axes.shape[:2], 1)), 0 * shared)
+        rows = self.predict_rows(e, r, self.solution.values[:, None])[..., 0]
+        return np.asarray((self.linear.residual - rows) * self.linear.row_mask)
 
     def leverages(self) -> Array:
         """Return the diagonal (F, M) of the hat matrix, from random signs.
@@ -232,7 +224,7 @@ class FittedModel:
         e, r = self.solution.e[..., None], self.solution.r[:, None]
         offset = self._landmark_offsets(e, r)[..., 0]
         in_target = np.einsum('la,lab->lb', offset, random.axes) * MILLIMETRE
-        shared, grids = eq.split(e, r)[2][:, 0], []
+        shared, grids = eq.split(self.solution.e, self.solution.r)[2], []
         for grid in random.grids:
             values, shared = np.split(shared, [2 * len(grid.centres)])
             grids.append((grid, values.reshape(-1, 2)))
@@ -243,9 +235,9 @@ class FittedModel:
 
         x^2, xy and y^2 over the size of a board, by each component of its normal.
         """
-        eq, columns = self.factored.equations, self.random.columns
-        shared = eq.split(self.solution.e[..., None], self.solution.r[:, None])[2][:, 0]
-        return np.asarray(shared[columns.shared_label == NAMES.index(SAG)].reshape(-1, 3, 3))
+        shared = self.factored.equations.split(self.solution.e, self.solution.r)[2]
+        sag = self.random.columns.shared_label == NAMES.index(SAG)
+        return np.asarray(shared[sag].reshape(-1, 3, 3))
 
     def target_modes(self, sigma: float) -> tuple[Array, Array]:
         """Return how far the landmarks may be off: modes (L, 3, K) and alone (L, 3), m.

@@ -147,12 +147,12 @@ def _change_effects(problem: Problem, search: _Search, null: NullModel, most: in
     """Remove effects and add others; where none changes, single landmarks that stand out."""
     tests, options = EffectTests(null), problem.options
     included, steps = eliminate_effects(tests, _known_effects(problem), options.quick)
-    search = replace(search, trace=(*search.trace, *steps))
-    choice = add_effects(tests, included, most, search.removed_effects, options.quick)
-    search = replace(search, trace=(*search.trace, *choice.trace))
     gone = [step.name for step in steps]
-    if gone or choice.forms:
-        return replace(search, state=_change_state(null, included, gone, choice.forms))
+    forms, tried = add_effects(
+        tests, included, most, {*search.removed_effects, *gone}, options.quick)
+    search = replace(search, trace=(*search.trace, *steps, *tried))
+    if gone or forms:
+        return replace(search, state=_change_state(null, included, gone, forms))
     name = LandmarkSurveyEffect.name
     if name in options.left_out or any(e.name == name for e, _ in search.state.terms):
         return search

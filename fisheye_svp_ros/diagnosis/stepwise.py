@@ -24,6 +24,7 @@ from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.target_effects import MIN_VIEWS, LandmarkSurveyEffect
 from fisheye_svp_ros.mixed_model import (
     LAMBDA_ABSENT,
+    Score,
     factor_equations,
     initial_variances,
     solve_equations,
@@ -68,24 +69,16 @@ class TraceStep:
         return self.why.startswith(REMOVAL_PREFIX)
 
 
-@dataclass
-class ForwardSelection:
-    """The forms that were chosen, in order, and the trace."""
-
-    forms: list[int]
-    trace: list[TraceStep]
-
-
 def add_effects(
     tests: EffectTests, included: Index, most: int, refused: Container[str], quick: bool
-) -> ForwardSelection:
+) -> tuple[list[int], list[TraceStep]]:
     """Add forms for as long as one is significant and predicts held-out frames better.
 
     included: the border's columns in the model; refused: effects that are not asked again; quick:
-    do without held-out frames.
+    do without held-out frames.  Returns the forms, in order, and the trace.
     """
-    choice, failed = ForwardSelection([], []), set()
-    while len(choice.forms) < most:
+    forms, trace, failed = list[int](), list[TraceStep](), set()
+    while len(forms) < most:
         remaining = (c for c in tests.significant_candidates(included)
                      if c.form not in failed and c.effect.name not in refused)
         best = _next_candidate(remaining)
@@ -95,13 +88,15 @@ def add_effects(
         gain = HeldOutGain(np.inf, 0.0)
         if not (best.effect.per_frame or quick):
             gain = tests.held_out_gain(included, columns, best.effect)
-        choice.trace.append(_trace_step(best, gain))
+        why = 'significant and predicts better' if gain.convincing else 'does not predict better'
+        trace.append(_trace_step(
+            best.effect, best.score, best.corrected, gain, gain.convincing, why))
         if gain.convincing:
             included = np.concatenate([included, columns])
-            choice.forms.append(best.form)
+            forms.append(best.form)
         else:
             failed.add(best.form)
-    return choice
+    return forms, trace
 
 
 def _next_candidate(remaining: Iterator[Candidate]) -> Candidate | None:
@@ -126,13 +121,11 @@ def _commoner_candidate(best: Candidate, others: Iterator[Candidate]) -> Candida
                  and len(c.effect.parameters) == size), best)
 
 
-def _trace_step(candidate: Candidate, gain: HeldOutGain) -> TraceStep:
-    score = candidate.score
-    why = 'significant and predicts better' if gain.convincing else 'does not predict better'
-    return TraceStep(
-        candidate.effect.key, score.statistic, score.rank, score.p_value, candidate.corrected,
-        gain.value, gain.stderr, gain.convincing, why,
-    )
+def _trace_step(
+    effect: Effect, score: Score, corrected: float, gain: HeldOutGain, accepted: bool, why: str
+) -> TraceStep:
+    return TraceStep(effect.key, score.statistic, score.rank, score.p_value, corrected,
+                     gain.value, gain.stderr, accepted, why)
 
 
 def eliminate_effects(
@@ -173,8 +166,7 @@ def _test_removal(
         if gain.sufficient:
             return None
         why = f'{REMOVAL_PREFIX} it does not predict better any more'
-    return TraceStep(effect.key, score.statistic, score.rank, score.p_value, corrected,
-                     gain.value, gain.stderr, False, why)
+    return _trace_step(effect, score, corrected, gain, False, why)
 
 
 def find_single_landmarks(
@@ -262,22 +254,16 @@ def test_landmarks(tests: EffectTests) -> tuple[Array, Array, Array]:
     precise = np.linalg.inv(unit_covariances(f))
     pull = (precise @ landmark[..., None])[..., 0]
     information = precise - prior[:, :, None] * np.eye(3)
-    views = _count_views(null.random.columns.unit, len(null.random.landmark))
-    often = views[eq.units] >= MIN_VIEWS
+    unit = null.random.columns.unit
+    seen = np.zeros((len(unit), len(null.random.landmark)), dtype=bool)
+    seen[np.nonzero(unit >= 0)[0], unit[unit >= 0]] = True
+    often = seen.sum(axis=0)[eq.units] >= MIN_VIEWS
     bulk = np.where(null.variances.alive[label], 1 / table, 0.0)
     statistic, rank, offset = _test_against_bulk(
         information, pull, bulk, often, null.variances.sigma**2
     )
     axes = null.random.axes[eq.units]
     return statistic, rank, np.einsum('la,lab->lb', offset, axes) * MILLIMETRE
-
-
-def _count_views(unit: Index, landmarks: int) -> Index:
-    """Return in how many frames each landmark (L,) is seen; unit (F, N): that of each point."""
-    views = np.zeros(landmarks, dtype=np.int64)
-    for frame in unit:
-        views[np.unique(frame[frame >= 0])] += 1
-    return views
 
 
 def _test_against_bulk(

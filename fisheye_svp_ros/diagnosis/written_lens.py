@@ -346,7 +346,7 @@ def _shared_coefficients(selection: Selection, fitted: FittedModel) -> Array:
     whole = np.zeros(len(null.scale) + 1)
     whole[at] = shifts.refit(null, null.information[np.ix_(at, at)])[2]
     e, r = null.factorization.coefficients(whole)
-    return null.equations.split(e[..., None], r[:, None])[2][:, 0]
+    return null.equations.split(e, r)[2]
 
 
 def _field(

@@ -264,7 +264,7 @@ def _gather(
     at = np.flatnonzero(
         ((shown | alone) == used).all(axis=1) & (shown.sum(axis=1) >= _MIN_POINTS))
     # Fields of the image stay in: they take up what a frame in the wrong order errs by.
-    rows = fitted.residuals_of_frames().reshape(count, -1, 2)[at]
+    rows = fitted.residuals(of_frames=True).reshape(count, -1, 2)[at]
     bumps = columns.group_label == NAMES.index('frame_bumps')
     fixed = np.concatenate([linear.frame_columns[at], columns.group[at][..., ~bumps]], axis=-1)
     fixed = np.where(shown[at][..., None, None],
