@@ -139,7 +139,7 @@ def _error_of_imitation(tests: EffectTests, true: Index, columns: Index) -> floa
 
     moved = project_out_poses(null.fixed.border[..., true] @ values[:, None])
     fitted = flat_rows(project_out_poses(null.fixed.border[..., null.included_columns]))
-    inverse, _ = pseudo_inverse(fitted.T @ fitted)
+    inverse = pseudo_inverse(fitted.T @ fitted)
     remaining = moved.ravel() - fitted @ (inverse @ (fitted.T @ moved.ravel()))
     return rms_px(linear, remaining.reshape(linear.residual.shape)) / linear.state.lens.focal
 

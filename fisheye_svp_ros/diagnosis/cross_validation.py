@@ -22,8 +22,8 @@ from fisheye_svp_ros.mixed_model import (
     RandomColumns,
     Variances,
     factor_equations,
+    fit_out,
     make_equations,
-    pseudo_inverse,
 )
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
@@ -210,10 +210,8 @@ def refit_shared(
     scale = null.scale[: null.column_count]
     combination[: null.column_count] += np.where(gone, values * scale, 0.0)
     kept = np.flatnonzero(~gone)
-    inverse, _ = pseudo_inverse(information[np.ix_(kept, kept)], 1e-13)
-    change = inverse @ (information[kept] @ combination)
-    combination[kept] -= change
-    return kept, change / null.scale[kept], combination
+    left = fit_out(information, kept, combination, 1e-13)
+    return kept, (combination - left)[kept] / null.scale[kept], left
 
 
 def cross_validate(

@@ -22,6 +22,7 @@ from fisheye_svp_ros.mixed_model import (
     FactoredEquations,
     Score,
     eliminate,
+    fit_out,
     integrate_columns,
     predict_rows,
     pseudo_inverse,
@@ -188,7 +189,10 @@ class EffectTests:
         covariance = null.variances.covariance
         if covariance is None or not score.rank:
             return score
-        combination = _direction(null, score.estimate * null.scale[columns], included, columns)
+        info = null.factorization.information
+        combination = np.zeros(len(info))
+        combination[columns] = score.estimate * null.scale[columns]
+        combination = fit_out(info, included, combination)
         freedom = satterthwaite_freedom(null.factorization, combination, covariance)
         p = float(special.fdtrc(score.rank, freedom, max(score.statistic, 0.0) / score.rank))
         if p < _DOUBTFUL_P and (
@@ -238,8 +242,8 @@ def _log_marginal(information: Array, included: Index, columns: Index, prior: Ar
     remaining = eliminate(information[np.ix_(chosen, chosen)], np.arange(len(included)))
     block = remaining[len(included) : -1, len(included) : -1] + prior
     gradient = remaining[len(included) : -1, -1]
-    inverse, _ = pseudo_inverse(block, 1e-14)
-    return float(gradient @ inverse @ gradient - np.linalg.slogdet(block)[1]) / 2
+    fit = gradient @ pseudo_inverse(block, 1e-14) @ gradient
+    return float(fit - np.linalg.slogdet(block)[1]) / 2
 
 
 def random_gain(null: NullModel, included: Index, columns: Index) -> float:
@@ -272,7 +276,7 @@ def _alternative_gain(
         rest = null.remaining_information(information, included)
         remaining = rest[-1, -1]
         without = min(without, logs + count * np.log(remaining))
-        inverse, _ = pseudo_inverse(rest[np.ix_(columns, columns)], least=IDENTIFIABLE)
+        inverse = pseudo_inverse(rest[np.ix_(columns, columns)], least=IDENTIFIABLE)
         remaining -= rest[columns, -1] @ inverse @ rest[columns, -1]
         beside = min(beside, logs + count * np.log(remaining))
     return max(float(without - beside), 0.0)
@@ -292,16 +296,6 @@ def _alternatives(null: NullModel, effect: Effect | None) -> Iterator[Alternativ
         yield from null.walk_alternatives
 
 
-def _direction(null: NullModel, estimate: Array, included: Index, columns: Index) -> Array:
-    """Return the combination (X + 1,) of the border along an estimate, what is included out."""
-    info = null.factorization.information
-    inverse, _ = pseudo_inverse(info[np.ix_(included, included)])
-    combination = np.zeros(len(info))
-    combination[columns] = estimate
-    combination[included] -= inverse @ (info[np.ix_(included, columns)] @ estimate)
-    return combination
-
-
 def _cluster_p_value(
     null: NullModel, score: Score, combination: Array, included: Index, columns: Index
 ) -> float:
@@ -313,9 +307,7 @@ def _cluster_p_value(
     Biometrika 73 (1986).
     """
     info, both = null.factorization.information, np.concatenate([included, columns])
-    residual = null.residual_combination(included)
-    inverse, _ = pseudo_inverse(info[np.ix_(both, both)])
-    residual[both] -= inverse @ (info[both] @ residual)
+    residual = fit_out(info, both, null.residual_combination(included))
     weight, remaining = _border_rows(null, combination, residual)
     used = null.linear.row_mask
     landmark = np.repeat(null.random.columns.unit, 2, axis=-1)[used]

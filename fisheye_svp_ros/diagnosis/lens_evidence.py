@@ -97,7 +97,7 @@ def _rig_response(null: NullModel, at: Index) -> Array:
     count = 6 * (null.linear.data.cameras - 1)
     left = flat_rows(refit_poses(null.fixed.border[..., at], null.linear.frame_columns))
     products = left[:, :count].T @ left
-    return pseudo_inverse(products[:, :count])[0] @ products
+    return pseudo_inverse(products[:, :count]) @ products
 
 
 def _shared_values(evaluation: Evaluation) -> tuple[Array, Array]:
@@ -135,7 +135,7 @@ def _effect_bound(
     null: NullModel, effect: Effect, mine: Index, every: Index, prior: Array
 ) -> Bound:
     information, count, scale = null.information, len(mine), null.scale[mine]
-    inverse, _ = pseudo_inverse(information[np.ix_(every, every)] + np.diag(prior), 1e-13)
+    inverse = pseudo_inverse(information[np.ix_(every, every)] + np.diag(prior), 1e-13)
     value = (inverse @ information[every, -1])[-count:] / scale
     covariance = inverse[-count:, -count:] / np.outer(scale, scale)
     spread, vectors = np.linalg.eigh(covariance)

@@ -24,8 +24,8 @@ from fisheye_svp_ros.diagnosis.random_effects import (
     make_random_effects,
 )
 from fisheye_svp_ros.effects.base import Effect, Term
-from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.extension import Target
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.mixed_model import LAMBDA_ABSENT, RandomColumns, Variances, pseudo_inverse
 from fisheye_svp_ros.optics.lens import Lens
@@ -75,7 +75,7 @@ class ModelErrors:
         lam = np.where(_OF_IMAGE, LAMBDA_ABSENT, null.variances.lam)
         bare = replace(null, variances=replace(null.variances, lam=lam))
         own, scale = null.included_columns, null.scale[: null.column_count]
-        inverse, _ = pseudo_inverse(bare.information[np.ix_(own, own)], 1e-13)
+        inverse = pseudo_inverse(bare.information[np.ix_(own, own)], 1e-13)
         finest = [grid.pitch for grid in null.random.grids if grid.name == FINEST_FIELD]
         modes, alone = fitted.target_modes(null.variances.sigma)
         geometry = ColumnGeometry.measure(null.linear, max(finest, default=np.nan), modes, alone)

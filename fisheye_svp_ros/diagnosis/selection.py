@@ -281,7 +281,7 @@ def _estimate_forms(
     prior = np.concatenate([np.zeros(len(included)), *(
         null.physical_precision(mine, null.fixed.forms.effects[form])
         for form, mine in zip(forms, columns, strict=True))])
-    inverse, _ = pseudo_inverse(information[np.ix_(every, every)] + np.diag(prior), 1e-12)
+    inverse = pseudo_inverse(information[np.ix_(every, every)] + np.diag(prior), 1e-12)
     values = (inverse @ information[every, -1]) / null.scale[every]
     estimated, at = [], len(included)
     for form, mine in zip(forms, columns, strict=True):

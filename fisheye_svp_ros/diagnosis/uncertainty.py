@@ -283,7 +283,7 @@ class LensCovariance:
     ) -> LensCovariance:
         """Gather what is known of a written model; models: None where time matters most."""
         own, quick = null.included_columns, models is None
-        inverse, _ = pseudo_inverse(null.information[np.ix_(own, own)], 1e-13)
+        inverse = pseudo_inverse(null.information[np.ix_(own, own)], 1e-13)
         least = inverse / np.outer(null.scale[own], null.scale[own])
         known, errors = np.sqrt(np.diag(least)), standard_errors(null, jackknife=not quick)
         if not quick:

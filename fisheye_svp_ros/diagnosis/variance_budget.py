@@ -86,8 +86,7 @@ def cause_squares(null: NullModel, causes: Sequence[PlacedEffect]) -> dict[str, 
     @cache
     def explained_square(some: tuple[int, ...]) -> float:
         mine = np.flatnonzero(np.isin(owner, some))
-        inverse, _ = pseudo_inverse(remaining[np.ix_(mine, mine)])
-        return float(signal[mine] @ inverse @ signal[mine])
+        return float(signal[mine] @ pseudo_inverse(remaining[np.ix_(mine, mine)]) @ signal[mine])
 
     px2, count = _px2(null), len(causes)
     squares = {}

@@ -126,7 +126,7 @@ class OpenShifts(NamedTuple):
         """
         own = np.arange(null.column_count)
         columns, scale = len(own) + np.arange(len(self.columns)), null.scale[self.columns]
-        inverse, _ = pseudo_inverse(information[np.ix_(own, own)], 1e-13)
+        inverse = pseudo_inverse(information[np.ix_(own, own)], 1e-13)
         follow = -inverse @ information[np.ix_(own, columns)]
         block = np.diag(information)[columns] + (information[columns][:, own] * follow.T).sum(1)
         score = information[columns, -1] + follow.T @ information[own, -1]

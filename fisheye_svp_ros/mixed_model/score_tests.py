@@ -92,22 +92,30 @@ def integrate_columns(
 
 def eliminate(information: Array, included: Index) -> Array:
     """Return the information with the included columns eliminated (Schur complement)."""
-    inverse, _ = pseudo_inverse(information[np.ix_(included, included)])
+    inverse = pseudo_inverse(information[np.ix_(included, included)])
     return np.asarray(information - information[:, included] @ inverse @ information[included])
 
 
-def pseudo_inverse(
-    matrix: Array, floor: float = IDENTIFIABLE, least: float = 1e-300
-) -> tuple[Array, int]:
-    """Return the pseudoinverse of a symmetric matrix and its rank.
+def fit_out(
+    information: Array, included: Index, combination: Array, floor: float = IDENTIFIABLE
+) -> Array:
+    """Return a combination (X,) of the border, less what included columns take up of it."""
+    found = combination.copy()
+    inverse = pseudo_inverse(information[np.ix_(included, included)], floor)
+    found[included] -= inverse @ (information[included] @ combination)
+    return found
+
+
+def pseudo_inverse(matrix: Array, floor: float = IDENTIFIABLE, least: float = 1e-300) -> Array:
+    """Return the pseudoinverse of a symmetric matrix.
 
     floor: of its largest eigenvalue, and least: below which an eigenvalue is taken as zero.
     """
     if not len(matrix):
-        return matrix, 0
+        return matrix
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     kept = values > max(floor * float(values[-1]), least)
-    return (vectors[:, kept] / values[kept]) @ vectors[:, kept].T, int(kept.sum())
+    return np.asarray((vectors[:, kept] / values[kept]) @ vectors[:, kept].T)
 
 
 def identifiable_basis(group_fixed: Array, columns: Array, chosen: Index) -> Array:

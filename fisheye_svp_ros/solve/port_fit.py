@@ -87,7 +87,7 @@ def _free_names(
     linear = Linearization(data, freed, names)
     basis, clean = group_basis(linear.frame_columns), linear.shared_columns
     flat = flat_rows(clean - basis @ (np.swapaxes(basis, -1, -2) @ clean))
-    inverse, _ = pseudo_inverse(flat.T @ flat, 1e-13)
+    inverse = pseudo_inverse(flat.T @ flat, 1e-13)
     square = linear.sum_of_squares / int(linear.row_mask.sum())
     gain = (Linearization(data, state, ()).sum_of_squares - linear.sum_of_squares) / square
     return freed, np.sqrt(np.diag(inverse) * square), gain

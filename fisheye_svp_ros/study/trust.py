@@ -135,7 +135,7 @@ def _free_target(null: NullModel, count: int) -> tuple[Array, Array]:
             prior.append(null.prior_precision(columns[-1], effect))
     every, information = np.concatenate(columns), null.information
     # Larger errors than `large` are no target that anybody would take for exact.
-    inverse, _ = pseudo_inverse(
+    inverse = pseudo_inverse(
         information[np.ix_(every, every)] + np.diag(np.concatenate(prior)), 1e-13
     )
     own, scale = own[:count], null.scale[:count]
