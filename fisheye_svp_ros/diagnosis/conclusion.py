@@ -300,7 +300,7 @@ def conclude(
     target = decide_target(_target_facts(evaluation, causes, components, contradicted))
     photographs = decide_photographs(PhotographsFacts(
         evaluation.frames, frames_of(advice, RETAKE), frames_of(advice, UNLIKE),
-        evaluation.named_quality.heldout_rms_px, 2**0.5 * float(scatter), lens.say,
+        evaluation.figures.named.heldout_rms_px, 2**0.5 * float(scatter), lens.say,
         target.say == 'measure_again' and target.confidence is not None,
         evaluation.selection.problem.plannable,
         'view' if is_unpaired(evaluation.null.linear.data) else 'frame'))

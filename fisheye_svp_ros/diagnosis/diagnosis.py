@@ -13,9 +13,14 @@ from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras
 from fisheye_svp_ros.diagnosis.checks.two_datasets import TwoDatasets
 from fisheye_svp_ros.diagnosis.conclusion import Advice, Conclusion
-from fisheye_svp_ros.diagnosis.cross_validation import Comparison
 from fisheye_svp_ros.diagnosis.decision import Decision, FileFigure
-from fisheye_svp_ros.diagnosis.evaluation import MAX_RMS_RATIO, Evaluation, FitQuality, Intrinsic
+from fisheye_svp_ros.diagnosis.evaluation import (
+    MAX_RMS_RATIO,
+    Evaluation,
+    Figures,
+    FitQuality,
+    Intrinsic,
+)
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
 from fisheye_svp_ros.diagnosis.model_errors import ModelErrors
 from fisheye_svp_ros.diagnosis.problem import Problem
@@ -30,21 +35,6 @@ from fisheye_svp_ros.solve.hand_eye import HandEye
 from fisheye_svp_ros.solve.rig_calibration import connected_cameras
 from fisheye_svp_ros.solve.rig_checks import has_no_rig
 from fisheye_svp_ros.solve.rig_state import Linearization
-
-
-class Figures(NamedTuple):
-    """How well each model describes the data: rms of the fit and held out.
-
-    base: the simulation as it was fitted; named: all causes, without random effects; lens_only:
-    what moves with the lens; extended: causes and predicted random effects; gain: of the last
-    over the first, on held-out data.
-    """
-
-    base: FitQuality
-    named: FitQuality
-    lens_only: FitQuality
-    extended: FitQuality
-    gain: Comparison
 
 
 class SearchRecord(NamedTuple):

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,6 +63,21 @@ class FitQuality:
     rms_px: float
     heldout_rms_px: float
     chi2_per_dof: float | None = None
+
+
+class Figures(NamedTuple):
+    """How well each model describes the data: rms of the fit and held out.
+
+    base: the simulation as it was fitted; named: all causes, without random effects; lens_only:
+    what moves with the lens; extended: causes and predicted random effects; gain: of the last
+    over the first, on held-out data.
+    """
+
+    base: FitQuality
+    named: FitQuality
+    lens_only: FitQuality
+    extended: FitQuality
+    gain: Comparison
 
 
 @dataclass(frozen=True)
@@ -193,8 +209,7 @@ class Evaluation:
     @cached_property
     def counted_frames(self) -> Mask:
         """Which frames (F,) count where each is left out one by one: what any model predicts."""
-        with_causes, without = (
-            cross_validate(self.null, gone) for gone in ((), self.names))
+        with_causes, without = cross_validate(self.null), cross_validate(self.null, self.names)
         return with_causes.is_predictable | without.is_predictable
 
     @cached_property
@@ -253,19 +268,31 @@ class Evaluation:
         """
         if self.medium is not None:
             return self.fixed_model  # the lens as it is in air was no free fit either
-        data, start = self.null.linear.data, self.null.linear.state
-        start = replace(start, terms=tuple(t for t in start.terms if is_shared(t[0])))
-        return Linearization(data, adjust(data, start, self.free), self.free)
+        start = self.null.linear.state
+        return self._adjust(
+            replace(start, terms=tuple(t for t in start.terms if is_shared(t[0]))))
+
+    def _adjust(self, state: RigState) -> Linearization:
+        """Return a state fitted by least squares."""
+        data = self.null.linear.data
+        return Linearization(data, adjust(data, state, self.free), self.free)
 
     @property
     def falling(self) -> bool:
         """Whether the rms of the fitted frames falls from base to named to extended."""
-        sizes = [self.base_quality.rms_px, self.named_quality.rms_px, self.extended_quality.rms_px]
+        sizes = [one.rms_px for one in (
+            self.figures.base, self.figures.named, self.figures.extended)]
         return all(after <= MAX_RMS_RATIO * before for before, after in pairwise(sizes))
 
     @cached_property
-    def base_quality(self) -> FitQuality:
-        """The simulation as it was fitted."""
+    def figures(self) -> Figures:
+        """How well each model describes the data it was fitted to and the data held out."""
+        named = FitQuality(rms_px(self.cause_fit), self._cause_predictions[-1].rms)
+        return Figures(self._base_quality(), named, self._lens_quality(),
+                       self._extended_quality(),
+                       self._gain(self._given_prediction, self._extended_prediction))
+
+    def _base_quality(self) -> FitQuality:
         linear, full = self.simulation, self.null.full
         freedom = full.rows - full.group_rank - len(self.free)
         chi2 = float((linear.residual**2).sum()) / self._noise_square / max(freedom, 1)
@@ -275,24 +302,13 @@ class Evaluation:
         return FitQuality(
             float(np.sqrt(np.nanmean(squares))), self._given_prediction.rms, chi2)
 
-    @cached_property
-    def named_quality(self) -> FitQuality:
-        """All causes, without random effects."""
-        return FitQuality(rms_px(self.cause_fit), self._cause_predictions[-1].rms)
-
-    @cached_property
-    def lens_quality(self) -> FitQuality:
-        """Only what moves with the lens, fitted without the rest."""
+    def _lens_quality(self) -> FitQuality:
         linear = self.selection.problem.linear
         if set(self._not_of_lens) < set(self.names):
-            state = fit_without_causes(self.null, self._not_of_lens, self.free)
-            data = self.null.linear.data
-            linear = Linearization(data, adjust(data, state, self.free), self.free)
+            linear = self._adjust(fit_without_causes(self.null, self._not_of_lens, self.free))
         return FitQuality(rms_px(linear), self._lens_prediction.rms)
 
-    @cached_property
-    def extended_quality(self) -> FitQuality:
-        """Causes and predicted random effects."""
+    def _extended_quality(self) -> FitQuality:
         residuals = self.fitted.residuals()
         chi2 = float((residuals**2).sum()) / self._noise_square / self.null.full.rows
         return FitQuality(
@@ -302,11 +318,6 @@ class Evaluation:
     def frames(self) -> int:
         """How many frames there are."""
         return self.null.linear.data.frames
-
-    @cached_property
-    def gain(self) -> Comparison:
-        """Of the best prediction over the simulation."""
-        return self._gain(self._given_prediction, self._extended_prediction)
 
     def _gain(self, before: HeldOut, after: HeldOut) -> Comparison:
         return gain_and_confidence(before, after, self.noise_px)[0]

@@ -33,7 +33,7 @@ from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras, agree_on_ta
 from fisheye_svp_ros.diagnosis.checks.two_datasets import DatasetModel, compare_datasets
 from fisheye_svp_ros.diagnosis.conclusion import advice_on_lens, advise, conclude, turn_advice
 from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, cross_validate
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, Figures, SearchRecord
+from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, SearchRecord
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.model_errors import with_uncertainty
@@ -217,9 +217,7 @@ def _conclude(
                   for camera, (name, lens) in enumerate(lenses.items())}
     return Diagnosis(
         evaluation,
-        Figures(evaluation.base_quality, evaluation.named_quality, evaluation.lens_quality,
-                evaluation.extended_quality,
-                evaluation.gain),
+        evaluation.figures,
         components, causes, _remaining(evaluation, noise_causes, significant),
         advice_on_lens(advice, conclusion), lenses,
         SearchRecord(list(selection.trace), EffectTests(selection.first).untestable,

@@ -2,7 +2,8 @@
 
 from dataclasses import replace
 
-from fisheye_svp_ros.diagnosis.diagnosis import Figures, SearchRecord
+from fisheye_svp_ros.diagnosis.diagnosis import SearchRecord
+from fisheye_svp_ros.diagnosis.evaluation import Figures
 
 
 def with_changes(found, **changes):
