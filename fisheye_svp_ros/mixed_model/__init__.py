@@ -7,23 +7,18 @@ covariance, leave-one-group-out predictions.  It knows no camera, board, lens or
     model_columns  X and Z, and their products
     equations      Henderson's mixed-model equations, factored block by block
     solution       estimates and predictions, their covariance, groups left out one by one
-    reml           variances by restricted maximum likelihood (average information)
-    components     which variances the data call for, and their p-values
-    score_tests    Rao's score test of added fixed columns, on one information matrix
+    reml           variances by restricted maximum likelihood, which the data call for, p-values
+    score_tests    Rao's score tests of added fixed columns and of variances at zero
 """
 
-from fisheye_svp_ros.mixed_model.components import (
-    component_p_values,
-    component_traces,
-    find_variances,
-    is_called_for,
-    score_components,
-)
 from fisheye_svp_ros.mixed_model.equations import (
+    LAMBDA_ABSENT,
     Equations,
     FactoredEquations,
+    Variances,
     factor_equations,
     make_equations,
+    no_variances,
     solve_lower,
 )
 from fisheye_svp_ros.mixed_model.model_columns import (
@@ -34,16 +29,17 @@ from fisheye_svp_ros.mixed_model.model_columns import (
     predict_rows,
 )
 from fisheye_svp_ros.mixed_model.reml import (
-    LAMBDA_ABSENT,
-    Variances,
+    component_p_values,
     estimate_variances,
+    find_variances,
     initial_variances,
-    no_variances,
+    is_called_for,
     unit_labels,
 )
 from fisheye_svp_ros.mixed_model.score_tests import (
     IDENTIFIABLE,
     Score,
+    component_traces,
     eliminate,
     fit_out,
     group_basis,
@@ -52,6 +48,7 @@ from fisheye_svp_ros.mixed_model.score_tests import (
     pseudo_inverse,
     satterthwaite_freedom,
     score_columns,
+    score_components,
     score_each,
 )
 from fisheye_svp_ros.mixed_model.solution import (

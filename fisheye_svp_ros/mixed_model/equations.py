@@ -35,9 +35,9 @@ _RIDGE = 1e-10  # of normalised fixed columns of a group: some may be zero
 _ABSENT_PRECISION = 1e12
 _ROUNDING_RIDGE = 1e-5  # of a column's own information, where rounding makes the whole indefinite
 _WORTH_THREADS = 5e7  # products of numbers: fewer take less time than threads to start
-
 _T = TypeVar('_T')
 _R = TypeVar('_R')
+LAMBDA_ABSENT = 1e12  # lambda of a component without variance
 
 
 def map_in_threads(
@@ -70,6 +70,47 @@ def log_determinant(root: Array) -> float:
     """Return the log determinant of A = L L' from triangular matrices L (..., n, n)."""
     diagonal = np.abs(np.diagonal(root, axis1=-2, axis2=-1))
     return 2 * float(np.log(np.maximum(diagonal, 1e-300)).sum())
+
+
+@dataclass(frozen=True)
+class Variances:
+    """The variances of a mixed model.
+
+    sigma: standard deviation of the noise; lam (K,): sigma^2 / tau^2, LAMBDA_ABSENT for a
+    component without variance; weight (U,): factors on the precision of each unit's offset;
+    covariance: of log tau^2 of all components and, last, log sigma^2.
+    """
+
+    sigma: float
+    lam: Array
+    weight: Array
+    covariance: Array | None = None
+
+    @property
+    def alive(self) -> Mask:
+        """Which components have a variance."""
+        return np.asarray(self.lam < LAMBDA_ABSENT)
+
+    @property
+    def tau(self) -> Array:
+        """Standard deviation of each component's coefficients, 0 where it has no variance."""
+        return np.where(self.alive, self.sigma / np.sqrt(self.lam), 0.0)
+
+    def with_equal_weights(self, of_units: Mask) -> Variances:
+        """Return the same without a scale for each unit: offsets are as large in the mean."""
+        more = np.where(of_units & self.alive, np.mean(1 / self.weight), 1.0)
+        return replace(self, lam=self.lam / more, weight=np.ones_like(self.weight))
+
+    def without_component(self, kind: int) -> Variances:
+        """Return the variances with one component switched off."""
+        lam = self.lam.copy()
+        lam[kind] = LAMBDA_ABSENT
+        return replace(self, lam=lam)
+
+
+def no_variances(components: int, units: int) -> Variances:
+    """Return the variances of a model without random effects."""
+    return Variances(1.0, np.full(components, LAMBDA_ABSENT), np.ones(units))
 
 
 @dataclass(frozen=True)
@@ -244,6 +285,11 @@ class FactoredEquations:
     def freedom(self) -> int:
         """Numbers in y less all fixed coefficients, shared ones and those of groups."""
         return self.equations.rows - self.equations.group_rank - len(self.information) + 1
+
+    @property
+    def products(self) -> float:
+        """How many products of numbers another factorization takes."""
+        return float(self.coupled.size * len(self.factor))
 
     @cached_property
     def root(self) -> Array:

@@ -1,4 +1,4 @@
-"""Variance components by restricted maximum likelihood (REML).
+"""Variance components by restricted maximum likelihood (REML), and which the data call for.
 
 Newton's method on the logarithms with the average information (Gilmour, Thompson, Cullis, Average
 information REML, Biometrics 51 (1995)); where that does not help, the fixed point
@@ -11,62 +11,46 @@ are far off do not widen the bulk.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy import special
 
-from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.mixed_model.equations import Equations, FactoredEquations, factor_equations
-from fisheye_svp_ros.mixed_model.solution import Solution, posterior_variances, solve_equations
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.mixed_model.equations import (
+    LAMBDA_ABSENT,
+    Equations,
+    FactoredEquations,
+    Variances,
+    factor_equations,
+    map_in_threads,
+    no_variances,
+)
+from fisheye_svp_ros.mixed_model.score_tests import score_components
+from fisheye_svp_ros.mixed_model.solution import (
+    Posterior,
+    Solution,
+    deviance_without,
+    posterior_covariance,
+    posterior_variances,
+    solution_without,
+    solve_equations,
+)
 
 T_FREEDOM = 3.0  # of the t distribution of units' offsets
-LAMBDA_ABSENT = 1e12  # lambda of a component without variance
 _MAX_STEPS = 25
 _TOLERANCE = 0.1  # of log lambda
 _OVERRELAXATION = 1.4
 _VANISHING_SHARE = 3e-4  # of the noise variance: a component that adds less has vanished
 _MAX_SHARE = 1e8  # times the noise variance: no component adds more, whatever a fit says
-
-
-@dataclass(frozen=True)
-class Variances:
-    """The variances of a mixed model.
-
-    sigma: standard deviation of the noise; lam (K,): sigma^2 / tau^2, LAMBDA_ABSENT for a
-    component without variance; weight (U,): factors on the precision of each unit's offset;
-    covariance: of log tau^2 of all components and, last, log sigma^2.
-    """
-
-    sigma: float
-    lam: Array
-    weight: Array
-    covariance: Array | None = None
-
-    @property
-    def alive(self) -> Mask:
-        """Which components have a variance."""
-        return np.asarray(self.lam < LAMBDA_ABSENT)
-
-    @property
-    def tau(self) -> Array:
-        """Standard deviation of each component's coefficients, 0 where it has no variance."""
-        return np.where(self.alive, self.sigma / np.sqrt(self.lam), 0.0)
-
-    def with_equal_weights(self, of_units: Mask) -> Variances:
-        """Return the same without a scale for each unit: offsets are as large in the mean."""
-        more = np.where(of_units & self.alive, np.mean(1 / self.weight), 1.0)
-        return replace(self, lam=self.lam / more, weight=np.ones_like(self.weight))
-
-    def without_component(self, kind: int) -> Variances:
-        """Return the variances with one component switched off."""
-        lam = self.lam.copy()
-        lam[kind] = LAMBDA_ABSENT
-        return replace(self, lam=lam)
-
-
-def no_variances(components: int, units: int) -> Variances:
-    """Return the variances of a model without random effects."""
-    return Variances(1.0, np.full(components, LAMBDA_ABSENT), np.ones(units))
+_SCREENING_P, _ADDITION_P = 0.3, 0.01  # p-values to start with a component, and to add one
+_INITIAL_SHARE = 0.02  # of the noise
+_REMOVAL_P = 0.05
+_UNCERTAIN_LOG = 0.3  # standard error of log tau^2 above which a component may be chance
+_WARM_STEPS = 6  # from the variances of a similar state
+_UNDECIDED_RATIOS = (2.7, 25.0)  # likelihood ratios between which the other variances follow
 
 
 def initial_variances(eq: Equations, share: float = 0.03) -> Variances:
@@ -204,3 +188,122 @@ def _unit_weights(eq: Equations, now: Variances, solution: Solution) -> Array:
 def unit_labels(eq: Equations) -> Index:
     """Return the components (m, w) of units' offsets."""
     return np.asarray(eq.unit_rows(eq.blocks.e_label, eq.blocks.r_label))
+
+
+def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
+    """Return the variances of the components that the data call for.
+
+    eq: with everything that may be fixed in its border, of full rank, or a real fixed effect would
+    widen the component that resembles it; before: variances of a similar state to start from.
+    """
+    first, numerous = initial_variances(eq, _INITIAL_SHARE), eq.components.numerous
+    if before is None:
+        p = score_components(
+            eq, no_variances(len(numerous), len(first.weight)), np.flatnonzero(~numerous))
+        lam = np.where(p < _SCREENING_P, first.lam, LAMBDA_ABSENT)
+        now, _ = estimate_variances(eq, Variances(1.0, lam, first.weight))
+    else:
+        now, _ = estimate_variances(eq, before, _WARM_STEPS)
+    # What the data do not call for beside large residuals they may call for beside smaller ones.
+    p = score_components(eq, now, np.flatnonzero(~now.alive))
+    lam = np.where(p < _ADDITION_P, first.lam, now.lam)
+    if (lam < LAMBDA_ABSENT).sum() > now.alive.sum():
+        now, _ = estimate_variances(eq, Variances(now.sigma, lam, now.weight))
+    return _remove_chance(eq.select(now.alive), now)
+
+
+def is_called_for(eq: Equations, now: Variances, kind: int) -> bool:
+    """Return whether the data call for one more component beside those that are there."""
+    return bool(score_components(eq, now, [kind])[kind] < _ADDITION_P)
+
+
+def component_p_values(eq: Equations, now: Variances) -> Array:
+    """Return p-values (K,) of the components, each by leaving it out; 1 for those not there.
+
+    Restricted likelihood ratio on the boundary: half the tail of chi-square(1) (Self and Liang,
+    JASA 82 (1987)); the other variances follow.  Offsets of units are drawn as alike there: a
+    scale for each would fit chance with as many numbers as there are units.
+    """
+    of_units = eq.components.of_units
+    p_values = np.ones(len(of_units))
+    for kinds, variances in ((~of_units, now), (of_units, now.with_equal_weights(of_units))):
+        if (now.alive & kinds).any():
+            whole = _solve_whole(eq, variances)
+            ratios = _deviance_ratios(whole, np.flatnonzero(now.alive & kinds))
+            for kind, ratio in _follow_variances(eq, variances, whole, ratios).items():
+                p_values[kind] = _boundary_p_value(ratio)
+    return p_values
+
+
+def _remove_chance(eq: Equations, now: Variances) -> Variances:
+    """Switch off what may be chance: a variance hardly known makes every test unsure.
+
+    One at a time: two that do the same are each dispensable, but not both.
+    """
+    while len(uncertain := _uncertain_components(now)):
+        whole = _solve_whole(eq, now)
+        ratios = _deviance_ratios(whole, uncertain)
+        if _boundary_p_value(min(ratios.values())) <= _REMOVAL_P:
+            ratios = _follow_variances(eq, now, whole, ratios)
+        kind = min(ratios, key=ratios.__getitem__)
+        if _boundary_p_value(ratios[kind]) <= _REMOVAL_P:
+            break
+        now, eq = estimate_variances(eq, now.without_component(kind), _WARM_STEPS)
+    return now
+
+
+def _uncertain_components(now: Variances) -> Index:
+    """Return the components whose variance is not known well enough to be beyond doubt."""
+    assert now.covariance is not None
+    spread = np.sqrt(np.diag(now.covariance)[:-1])
+    return np.flatnonzero(now.alive & (spread > _UNCERTAIN_LOG))
+
+
+def _boundary_p_value(ratio: float) -> float:
+    return float(special.chdtrc(1, max(ratio, 0.0))) / 2
+
+
+class _FullModel(NamedTuple):
+    """The equations of all components, solved."""
+
+    factored: FactoredEquations
+    solution: Solution
+    posterior: Posterior
+
+
+def _solve_whole(eq: Equations, now: Variances) -> _FullModel:
+    f = factor_equations(eq.select(now.alive), now.lam, now.weight)
+    posterior = posterior_covariance(f)
+    return _FullModel(f, solve_equations(f, posterior.variances), posterior)
+
+
+def _deviance_ratios(whole: _FullModel, kinds: Iterable[int]) -> dict[int, float]:
+    """Return by how much the deviance rises without each of some components."""
+    return {int(kind): deviance_without(*whole, int(kind)) for kind in kinds}
+
+
+def _follow_variances(
+    eq: Equations, now: Variances, whole: _FullModel, ratios: dict[int, float]
+) -> dict[int, float]:
+    """Return likelihood ratios once the other variances have taken up what they can.
+
+    They only ever take up a part of it, so that only undecided ones are asked for.
+    """
+
+    def follow(kind: int) -> float:
+        after = _step_without(eq, now, whole, kind)
+        f = factor_equations(eq.select(after.alive), after.lam, after.weight)
+        return solve_equations(f).deviance - whole.solution.deviance
+
+    low, high = _UNDECIDED_RATIOS
+    undecided = [kind for kind, ratio in ratios.items() if low < ratio < high]
+    followed = map_in_threads(follow, undecided, len(undecided) * whole.factored.products)
+    return ratios | dict(zip(undecided, followed, strict=True))
+
+
+def _step_without(eq: Equations, now: Variances, whole: _FullModel, kind: int) -> Variances:
+    f, others = whole.factored, now.without_component(kind)
+    if (f.equations.blocks.r_label == kind).any():
+        return update_variances(f, solution_without(*whole, kind), others)
+    f = factor_equations(eq.select(others.alive), others.lam, others.weight)
+    return update_variances(f, solve_equations(f, posterior_variances(f)), others)

@@ -1,21 +1,33 @@
-"""Score tests of added fixed columns, from the information of all columns that could be added.
+"""Score tests of added fixed columns and of variances at zero, from one factorization.
 
-One factorization serves all tests: once groups' columns and random effects are eliminated, what is
-left is a small information matrix of fixed columns, with the score as its last row and column.
+Once groups' columns and random effects are eliminated, what is left is a small information matrix
+of all fixed columns that could be added, with the score as its last row and column.
 Source: Rao, Large sample tests of statistical hypotheses concerning several parameters,
 Proceedings of the Cambridge Philosophical Society 44 (1948).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy import special
 
-from fisheye_svp_ros.arrays import Array, Index, flat_rows
-from fisheye_svp_ros.mixed_model.equations import FactoredEquations
+from fisheye_svp_ros.arrays import Array, Index, Mask, flat_rows
+from fisheye_svp_ros.mixed_model.equations import (
+    Equations,
+    FactoredEquations,
+    Variances,
+    factor_equations,
+    map_in_threads,
+    no_variances,
+    solve_lower,
+)
+from fisheye_svp_ros.mixed_model.solution import (
+    Solution,
+    solve_equations,
+)
 
 IDENTIFIABLE = 1e-8  # of a normalized column's square: what is left less cannot be told apart
 
@@ -135,3 +147,147 @@ def group_basis(columns: Array) -> Array:
     scale = np.sqrt((columns**2).sum(axis=1, keepdims=True))
     u, s, _ = np.linalg.svd(columns / np.maximum(scale, 1e-300), full_matrices=False)
     return np.asarray(u * (s > 1e-9)[:, None, :])
+
+
+def score_components(eq: Equations, now: Variances, kinds: Iterable[int]) -> Array:
+    """Return p-values (K,) of variances at zero, NaN for those not asked or not testable.
+
+    The sum of squares of the columns' products with the residual (Rao's score, 1948) against a
+    gamma distribution of the same mean and variance.  Source: Lin, Variance component testing in
+    generalised linear models with random effects, Biometrika 84 (1997).
+    """
+    p_values, kinds = np.full(eq.components.count, np.nan), list(kinds)
+    if not kinds:
+        return p_values
+    f = factor_equations(eq.select(now.alive), now.lam, now.weight)
+    solution = solve_equations(f)
+
+    def score(kind: int) -> float:
+        columns = _component_columns(eq, now.alive, int(kind))
+        if columns is None:
+            return np.nan
+        size = float((_score(columns, solution) ** 2).sum()) / solution.variance
+        remaining = _remaining_information(f, columns, True)
+        mean, spread = remaining.trace, 2 * remaining.sum_of_squares
+        if mean <= 1e-9 or spread <= 0:
+            return np.nan
+        return float(special.gammaincc(mean**2 / spread, size * mean / spread))
+
+    p_values[kinds] = map_in_threads(score, kinds, f.products)
+    return p_values
+
+
+def component_traces(eq: Equations, now: Variances) -> Array:
+    """Return what each component adds per unit of its variance (K,), groups' columns out.
+
+    Sums of squares of its columns once the fixed columns of groups are projected out, units by
+    their weights; 0 for what is not there.
+    """
+    nothing = no_variances(eq.components.count, len(now.weight))
+    f = factor_equations(eq.select(nothing.alive), nothing.lam, now.weight)
+    traces = np.zeros(len(nothing.lam))
+    for kind in np.flatnonzero(now.alive):
+        columns = _component_columns(eq, nothing.alive, int(kind))
+        if columns is not None:
+            traces[kind] = _remaining_information(f, columns, False).trace
+    return traces
+
+
+class _ComponentColumns(NamedTuple):
+    """Products of a component's g sets of w columns with each other and with all that is there.
+
+    own (g, w, w): within the sets, between which there are none; e (b, k, w): with the blocks
+    `at` (b,), -1 for one that is not there: of several sets with a block each, of one with all;
+    r (R, g, w): with the rest; x (X, g, w): with the border.
+    """
+
+    own: Array
+    at: Index
+    e: Array
+    r: Array
+    x: Array
+
+
+class _Information(NamedTuple):
+    """The information of columns beside others: block (g, w, w) less u' u, u (C, g, w)."""
+
+    block: Array
+    u: Array
+
+    @property
+    def trace(self) -> float:
+        return float(np.einsum('gww->', self.block) - (self.u**2).sum())
+
+    @property
+    def sum_of_squares(self) -> float:
+        """The sum of the squares of all its elements."""
+        u = self.u.reshape(len(self.u), self.block.shape[0] * self.block.shape[1])
+        both = u @ u.T if u.shape[0] < u.shape[1] else u.T @ u
+        across = np.moveaxis(self.u, 1, 0) @ self.block
+        mixed = np.einsum('gcw,cgw->', across, self.u)
+        return float((self.block**2).sum() - 2 * mixed + (both**2).sum())
+
+
+def _component_columns(eq: Equations, alive: Mask, kind: int) -> _ComponentColumns | None:
+    b = eq.blocks
+    keep, columns, rest = eq.find_present(alive)
+    in_r = np.flatnonzero(b.r_label == kind)
+    if len(in_r):
+        return _ComponentColumns(
+            b.rr[np.ix_(in_r, in_r)][None], np.arange(int(keep.sum())),
+            b.er[..., in_r][keep][:, columns], b.rr[np.ix_(rest, in_r)][:, None],
+            b.rx[in_r].T[:, None])
+    mine = b.e_label == kind
+    block = np.flatnonzero(mine.any(axis=1))
+    if not len(block):
+        return None
+    column = np.nonzero(mine)[1].reshape(len(block), -1)
+    own = b.ee[block[:, None, None], column[:, :, None], column[:, None]]
+    place, chosen = np.where(keep, np.cumsum(keep) - 1, -1), np.flatnonzero(columns)
+    e = b.ee[block[:, None, None], chosen[:, None], column[:, None]]
+    r, x = b.er[block[:, None], column][..., rest], b.ex[block[:, None], column]
+    return _ComponentColumns(
+        own, place[block], e, np.moveaxis(r, -1, 0), np.moveaxis(x, -1, 0))
+
+
+def _score(c: _ComponentColumns, solution: Solution) -> Array:
+    """Return the products (g, w) of columns with what is left of the residual."""
+    present, change = c.at >= 0, np.append(-solution.values, 1.0)
+    score = np.tensordot(change, c.x, 1) - np.tensordot(solution.r, c.r, 1)
+    by_blocks = np.einsum('bkw,bk->bw', c.e[present], solution.e[c.at[present]])
+    if len(c.own) > 1:
+        score[present] -= by_blocks
+    else:
+        score -= by_blocks.sum(axis=0)
+    return np.asarray(score)
+
+
+def _remaining_information(
+    f: FactoredEquations, c: _ComponentColumns, fixed: bool
+) -> _Information:
+    """Return the information of columns beside all that is there; fixed: the border's, too."""
+    present, (groups, width, _) = c.at >= 0, c.own.shape
+    first = f.inverse[c.at[present]] @ c.e[present]
+
+    def multiply_blocks(part: Array) -> Array:
+        """Return the products (C, g, w) of coefficients (b, k, C) with the columns."""
+        if groups == 1:
+            flat = first.reshape(first.size // width, width)
+            return (part.reshape(len(flat), part.shape[-1]).T @ flat)[:, None]
+        products = np.zeros((part.shape[-1], groups, width))
+        products[:, present] = np.moveaxis(np.swapaxes(part, -1, -2) @ first, 1, 0)
+        return products
+
+    block = c.own.copy()
+    if groups > 1:
+        block[present] -= np.swapaxes(first, -1, -2) @ first
+    else:
+        block -= multiply_blocks(first)[:, 0]
+    at = c.at[present]
+    r = c.r - multiply_blocks(f.coupled[at])
+    u = solve_lower(f.factor, r.reshape(len(r), groups * width))
+    if fixed:
+        x = c.x[:-1] - multiply_blocks(f.block_border[at, :, :-1])
+        flat = x.reshape(len(x), groups * width) - f.border[:, :-1].T @ u
+        u = np.concatenate([u, solve_lower(f.root, flat)])
+    return _Information(block, u.reshape(len(u), groups, width))
