@@ -16,7 +16,7 @@ from fisheye_svp_ros.diagnosis.variance_budget import NoiseGrowth
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import FlatPortEffect, RadialProfileEffect
-from fisheye_svp_ros.mixed_model import group_basis, pseudo_inverse
+from fisheye_svp_ros.mixed_model import project_out, pseudo_inverse
 from fisheye_svp_ros.scene.observations import Observations, photograph_entry
 from fisheye_svp_ros.solve.outliers import Outliers
 from fisheye_svp_ros.solve.port_fit import MEDIUM_INDEX, THICKNESS
@@ -132,15 +132,12 @@ def _error_of_imitation(tests: EffectTests, true: Index, columns: Index) -> floa
     null, linear = tests.null, tests.null.linear
     rest = np.setdiff1d(null.included_columns, columns)
     values = tests.score_beside(rest, true).estimate * null.scale[true]
-    basis = group_basis(linear.frame_columns)
-
-    def project_out_poses(rows: Array) -> Array:
-        return rows - basis @ (np.swapaxes(basis, -1, -2) @ rows)
-
-    moved = project_out_poses(null.fixed.border[..., true] @ values[:, None])
-    fitted = flat_rows(project_out_poses(null.fixed.border[..., null.included_columns]))
-    inverse = pseudo_inverse(fitted.T @ fitted)
-    remaining = moved.ravel() - fitted @ (inverse @ (fitted.T @ moved.ravel()))
+    border = null.fixed.border
+    both = np.append(
+        border[..., null.included_columns], border[..., true] @ values[:, None], axis=-1)
+    both = flat_rows(project_out(both, linear.frame_columns))
+    fitted, moved = both[:, :-1], both[:, -1]
+    remaining = moved - fitted @ (pseudo_inverse(fitted.T @ fitted) @ (fitted.T @ moved))
     return rms_px(linear, remaining.reshape(linear.residual.shape)) / linear.state.lens.focal
 
 

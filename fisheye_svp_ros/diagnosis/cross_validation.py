@@ -24,6 +24,7 @@ from fisheye_svp_ros.mixed_model import (
     factor_equations,
     fit_out,
     make_equations,
+    project_out,
 )
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
@@ -234,14 +235,9 @@ def cross_validate(
         _, _, combination = refit_shared(null, information, without, held)
         rows = null.fixed.border if offsets is None else null.leave_one_out.rows
         residual[frame] = rows[frame][:, at] @ combination
-    left = refit_poses((residual * ratio - repeating)[..., None],
+    left = project_out((residual * ratio - repeating)[..., None],
                        linear.frame_columns * ratio[..., None])
     return sum_squares(linear, left[..., 0] / ratio)
-
-
-def refit_poses(rows: Array, columns: Array) -> Array:
-    """Return rows (F, M, C) without what poses of columns (F, M, 6), fitted to them, take up."""
-    return np.asarray(rows - columns @ (np.linalg.pinv(columns, rcond=1e-9) @ rows))
 
 
 def noise_ratio(linear: Linearization) -> Array:
@@ -336,7 +332,7 @@ def split_frames(
 
 def misfits(linear: Linearization, out: Mask, rows: Array) -> Array:
     """Return sums of squares (C,), px^2, of whitened rows (F, M, C) of frames, poses refitted."""
-    left, weight = refit_poses(rows, linear.frame_columns[out]), linear.row_weight[out]
+    left, weight = project_out(rows, linear.frame_columns[out]), linear.row_weight[out]
     used = weight > 0
     return np.asarray(((left[used] / weight[used][:, None]) ** 2).sum(axis=0))
 

@@ -46,15 +46,13 @@ class EffectForms:
     untestable: dict[str, str]
     look_alikes: tuple[tuple[Effect, Index], ...]
 
-    def count_effects(self) -> int:
-        """Return how many effects are tested, single landmarks and causes without forms too."""
-        return len(CATALOGUE) - len(self.untestable)
-
 
 def effect_forms(linear: Linearization, left_out: Sequence[str] = ()) -> EffectForms:
     """Return the columns of the catalogue, without the effects left out."""
     effects, richest, untestable = _catalogue_effects(linear, left_out)
-    alike = _look_alikes(linear, left_out) if effects else []
+    # Effects that are not tested, of each camera, as others may be mistaken for them.
+    alike = [form for name, kind in CATALOGUE.unlisted.items() if effects and name not in left_out
+             for own in _forms(kind, linear) for form in own]
     ends = np.cumsum([0, *(len(effect.parameters) for effect in (*effects, *alike))])
     at = [np.arange(*ends[i : i + 2]) for i in range(len(ends) - 1)]
     blocks = [linear.effect_columns(effect) for effect in (*effects, *alike)]
@@ -97,12 +95,6 @@ def _catalogue_effects(
                 most = max(len(form.parameters) for form in lasting)
                 richest += [form for form in lasting if len(form.parameters) == most]
     return effects, richest, untestable
-
-
-def _look_alikes(linear: Linearization, left_out: Sequence[str]) -> list[Effect]:
-    """Return effects that are not tested, of each camera, as others may be mistaken for them."""
-    return [form for name, kind in CATALOGUE.unlisted.items() if name not in left_out
-            for own in _forms(kind, linear) for form in own]
 
 
 def simplest_form(kind: type[Effect], linear: Linearization) -> Effect:

@@ -17,6 +17,7 @@ from scipy import special
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.null_model import Alternative, NullModel
 from fisheye_svp_ros.effects.base import Effect
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.mixed_model import (
     IDENTIFIABLE,
     FactoredEquations,
@@ -93,8 +94,8 @@ class EffectTests:
 
     @property
     def effect_count(self) -> int:
-        """How many effects are tested: what p-values are corrected by."""
-        return self.null.fixed.forms.count_effects()
+        """How many effects are tested, single landmarks too: what p-values are corrected by."""
+        return len(CATALOGUE) - len(self.null.fixed.forms.untestable)
 
     def score(self, remaining: Array, columns: Index) -> Score:
         """Test columns by the information that remains once what is in the model is eliminated."""

@@ -12,7 +12,6 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
     HeldOut,
     gain_and_confidence,
     noise_ratio,
-    refit_poses,
     sum_squares,
 )
 from fisheye_svp_ros.diagnosis.decision import Bound, FileFigure, LensOffset, least_likely_offset
@@ -22,7 +21,7 @@ from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.uncertainty import LensCovariance
 from fisheye_svp_ros.diagnosis.written_lens import OpenShifts
 from fisheye_svp_ros.effects.base import Effect
-from fisheye_svp_ros.mixed_model import pseudo_inverse, solve_lower
+from fisheye_svp_ros.mixed_model import project_out, pseudo_inverse, solve_lower
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.ray_errors import (
     RANGES,
@@ -84,7 +83,7 @@ def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
         residual[frame] = (null.leave_one_out.rows[frame][:, at] @ combination)[:, None]
         residual[frame, :, 0] += null.fixed.border[frame][:, at[:-1]] @ off
     even = ratio[..., None]
-    left = refit_poses(residual * even, linear.frame_columns * even) / even
+    left = project_out(residual * even, linear.frame_columns * even) / even
     return sum_squares(linear, left[..., 0]), sum_squares(linear, left[..., 1])
 
 
@@ -95,7 +94,7 @@ def _rig_response(null: NullModel, at: Index) -> Array:
     otherwise a center that the rig would absorb counts as an error of the lens as given.
     """
     count = 6 * (null.linear.data.cameras - 1)
-    left = flat_rows(refit_poses(null.fixed.border[..., at], null.linear.frame_columns))
+    left = flat_rows(project_out(null.fixed.border[..., at], null.linear.frame_columns))
     products = left[:, :count].T @ left
     return pseudo_inverse(products[:, :count]) @ products
 
@@ -150,7 +149,7 @@ def _effect_bound(
 def _edge_cost(null: NullModel, moves: Array) -> tuple[float, float]:
     """Return what whitened moves (F, M) are at the edge once poses took up theirs, px and mrad."""
     linear = null.linear
-    left = refit_poses(moves[..., None], linear.frame_columns)[..., 0]
+    left = project_out(moves[..., None], linear.frame_columns)[..., 0]
     weight = np.where(linear.row_weight > 0, linear.row_weight, np.inf)
     px = np.hypot(*np.moveaxis((left / weight).reshape(len(left), -1, 2), -1, 0))
     theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))[:, ::2]

@@ -109,11 +109,6 @@ class _Search:
         return NullModel.estimate(self.data, self.state, problem.free, self.variances,
                              problem.options.left_out, self.finest)
 
-    @property
-    def removed_effects(self) -> set[str]:
-        """The effects that were given up: they are not asked for again."""
-        return {step.name for step in self.trace if step.is_removal}
-
 
 def select_causes(problem: Problem, progress: Progress) -> Selection:
     """Add causes to a fitted state until none is left that is significant and predicts better."""
@@ -148,8 +143,9 @@ def _change_effects(problem: Problem, search: _Search, null: NullModel, most: in
     tests, options = EffectTests(null), problem.options
     included, steps = eliminate_effects(tests, _known_effects(problem), options.quick)
     gone = [step.name for step in steps]
-    forms, tried = add_effects(
-        tests, included, most, {*search.removed_effects, *gone}, options.quick)
+    # What was given up is not asked for again.
+    refused = {step.name for step in (*search.trace, *steps) if step.is_removal}
+    forms, tried = add_effects(tests, included, most, refused, options.quick)
     search = replace(search, trace=(*search.trace, *steps, *tried))
     if gone or forms:
         return replace(search, state=_change_state(null, included, gone, forms))

@@ -184,8 +184,9 @@ class AveragedModel:
         root[place] = follow[:, likely]
         root[np.setdiff1d(np.arange(len(names)), place)] = np.eye(len(likely))
         return cls(averaged, tuple(
-            AveragedShift(_camera_name(shifts.effects[i]), float(found.weight[i]),
-                          float(found.mean[i]), float(found.stderr[i])) for i in likely),
+            AveragedShift(effect.parts[0][1] if isinstance(effect, OfCameras) else '',
+                          float(found.weight[i]), float(found.mean[i]), float(found.stderr[i]))
+            for i, effect in enumerate(shifts.effects) if found.weight[i]),
             tuple(kind for i in likely for kind in shifts.effects[i].kinds),
             root * found.stderr[likely], place)
 
@@ -213,10 +214,6 @@ class AveragedModel:
         del entries[0]['camera']
         known = {**(lens.uncertainty or {}), 'averaged_shift': entries[0]}
         return replace(lens, uncertainty=known)
-
-
-def _camera_name(effect: Effect) -> str:
-    return effect.parts[0][1] if isinstance(effect, OfCameras) else ''
 
 
 class CameraField(NamedTuple):

@@ -25,8 +25,10 @@ from fisheye_svp_ros.mixed_model.model_columns import (
     Components,
     RandomColumns,
     combine_offsets,
+    group_basis,
     multiply_rows,
     predict_rows,
+    project_out,
 )
 from fisheye_svp_ros.mixed_model.reml import (
     component_p_values,
@@ -42,7 +44,6 @@ from fisheye_svp_ros.mixed_model.score_tests import (
     component_traces,
     eliminate,
     fit_out,
-    group_basis,
     identifiable_basis,
     integrate_columns,
     pseudo_inverse,
@@ -69,7 +70,7 @@ __all__ = [
     'factor_equations', 'find_variances', 'fit_out', 'group_basis', 'identifiable_basis',
     'initial_variances', 'integrate_columns', 'is_called_for', 'leave_groups_out',
     'make_equations', 'multiply_rows', 'no_variances', 'posterior_covariance',
-    'posterior_variances', 'predict_rows', 'pseudo_inverse', 'satterthwaite_freedom',
-    'score_columns', 'score_components', 'score_each', 'solve_equations', 'solve_lower',
-    'unit_covariances', 'unit_labels',
+    'posterior_variances', 'predict_rows', 'project_out', 'pseudo_inverse',
+    'satterthwaite_freedom', 'score_columns', 'score_components', 'score_each', 'solve_equations',
+    'solve_lower', 'unit_covariances', 'unit_labels',
 ]

@@ -217,6 +217,19 @@ def _without_absent(random: RandomColumns, offset: Array) -> Array:
     return np.where((random.unit_label >= 0)[..., None], offset, 0.0)
 
 
+def group_basis(columns: Array) -> Array:
+    """Orthonormal bases (G, M, P) of each group's columns; zero columns where rank is missing."""
+    scale = np.sqrt((columns**2).sum(axis=1, keepdims=True))
+    u, s, _ = np.linalg.svd(columns / np.maximum(scale, 1e-300), full_matrices=False)
+    return np.asarray(u * (s > 1e-9)[:, None, :])
+
+
+def project_out(columns: Array, group_fixed: Array) -> Array:
+    """Return columns (G, M, X) without what those of each group (G, M, P), fitted, take up."""
+    basis = group_basis(group_fixed)
+    return np.asarray(columns - basis @ (np.swapaxes(basis, -1, -2) @ columns))
+
+
 def arrange_blocks(
     p: Products, g_label: Index, u_label: Index, s_label: Index, by_group: bool
 ) -> Blocks:

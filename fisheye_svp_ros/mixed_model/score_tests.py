@@ -24,6 +24,7 @@ from fisheye_svp_ros.mixed_model.equations import (
     no_variances,
     solve_lower,
 )
+from fisheye_svp_ros.mixed_model.model_columns import project_out
 from fisheye_svp_ros.mixed_model.solution import (
     Solution,
     solve_equations,
@@ -132,21 +133,12 @@ def pseudo_inverse(matrix: Array, floor: float = IDENTIFIABLE, least: float = 1e
 
 def identifiable_basis(group_fixed: Array, columns: Array, chosen: Index) -> Array:
     """Return combinations (X, m) of chosen columns (G, M, X), orthonormal beside groups' own."""
-    part = columns[..., chosen]
-    q = group_basis(group_fixed)
-    flat = flat_rows(part - q @ (np.swapaxes(q, -1, -2) @ part))
+    flat = flat_rows(project_out(columns[..., chosen], group_fixed))
     values, vectors = np.linalg.eigh(flat.T @ flat)
     kept = values > IDENTIFIABLE
     basis = np.zeros((columns.shape[-1], int(kept.sum())))
     basis[chosen] = vectors[:, kept] / np.sqrt(values[kept])
     return basis
-
-
-def group_basis(columns: Array) -> Array:
-    """Orthonormal bases (G, M, P) of each group's columns; zero columns where rank is missing."""
-    scale = np.sqrt((columns**2).sum(axis=1, keepdims=True))
-    u, s, _ = np.linalg.svd(columns / np.maximum(scale, 1e-300), full_matrices=False)
-    return np.asarray(u * (s > 1e-9)[:, None, :])
 
 
 def score_components(eq: Equations, now: Variances, kinds: Iterable[int]) -> Array:

@@ -24,7 +24,7 @@ from fisheye_svp_ros.mixed_model.equations import (
     solve_lower,
     solve_upper,
 )
-from fisheye_svp_ros.mixed_model.model_columns import RandomColumns, combine_offsets
+from fisheye_svp_ros.mixed_model.model_columns import RandomColumns, combine_offsets, group_basis
 
 _COLUMNS = 128  # of a triangle at a time: few of its zeros are multiplied
 
@@ -308,7 +308,7 @@ def _leave_out(
     # P of this group's rows, and P border
     p = np.eye(len(used)) - inside - root @ root.T
     remaining = border[used] - at_border - predicted
-    basis = column_basis(fixed[used])
+    basis, = group_basis(fixed[None, used])
     remaining -= basis @ (basis.T @ remaining)
     rows[used], found[used] = np.linalg.solve(p + basis @ basis.T, remaining), remaining
     return found
@@ -337,10 +337,3 @@ def _eliminated_products(
     same = unit[:, None] == unit
     return (np.where(same, step @ step.T, 0.0),
             np.einsum('mi,mix->mx', step, f.block_border[unit]))
-
-
-def column_basis(columns: Array) -> Array:
-    """Return an orthonormal basis (m, r) of columns (m, P)."""
-    scale = np.sqrt((columns**2).sum(axis=0))
-    u, s, _ = np.linalg.svd(columns / np.maximum(scale, 1e-300), full_matrices=False)
-    return u[:, s > 1e-9]

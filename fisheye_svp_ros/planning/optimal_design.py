@@ -24,7 +24,7 @@ from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ParameterError
-from fisheye_svp_ros.mixed_model import group_basis
+from fisheye_svp_ros.mixed_model import project_out
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.boards import is_flat, spacing
@@ -372,8 +372,7 @@ def information(linear: Linearization, effects: Sequence[Effect]) -> Array:
     """Return what each frame tells of all that is shared (F, K, K), its pose taken out."""
     columns = np.concatenate(
         [linear.shared_columns, *(linear.effect_columns(effect) for effect in effects)], axis=-1)
-    basis = group_basis(linear.frame_columns)
-    clean = columns - basis @ (np.swapaxes(basis, -1, -2) @ columns)
+    clean = project_out(columns, linear.frame_columns)
     return np.asarray(np.swapaxes(clean, -1, -2) @ clean)
 
 

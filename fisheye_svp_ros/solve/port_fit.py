@@ -9,7 +9,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, flat_rows
 from fisheye_svp_ros.effects.ray_effects import RadialProfileEffect
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.mixed_model import group_basis, pseudo_inverse
+from fisheye_svp_ros.mixed_model import project_out, pseudo_inverse
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
 from fisheye_svp_ros.optics.ports import MEDIA, FlatGlass
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
@@ -85,8 +85,7 @@ def _free_names(
     """Fit named parameters; return their standard errors, and the last one's likelihood ratio."""
     freed = adjust(data, state, names)
     linear = Linearization(data, freed, names)
-    basis, clean = group_basis(linear.frame_columns), linear.shared_columns
-    flat = flat_rows(clean - basis @ (np.swapaxes(basis, -1, -2) @ clean))
+    flat = flat_rows(project_out(linear.shared_columns, linear.frame_columns))
     inverse = pseudo_inverse(flat.T @ flat, 1e-13)
     square = linear.sum_of_squares / int(linear.row_mask.sum())
     gain = (Linearization(data, state, ()).sum_of_squares - linear.sum_of_squares) / square

@@ -5,8 +5,9 @@ import pytest
 from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import NullModel
-from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes, refit_poses
+from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.mixed_model import project_out
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame, rms_px, with_effect
@@ -33,7 +34,7 @@ def test_without_a_cause_the_rest_is_fitted_anew_however_large_it_is(size):
 def test_a_pose_takes_up_what_its_columns_do_and_nothing_else():
     rng = np.random.default_rng(0)
     columns, rows = rng.normal(size=(3, 20, 6)), rng.normal(size=(3, 20, 2))
-    left = refit_poses(rows, columns)
+    left = project_out(rows, columns)
     np.testing.assert_allclose(np.swapaxes(columns, -1, -2) @ left, 0.0, atol=1e-12)
-    moved = refit_poses(rows + columns @ rng.normal(size=(3, 6, 2)), columns)
+    moved = project_out(rows + columns @ rng.normal(size=(3, 6, 2)), columns)
     np.testing.assert_allclose(moved, left, atol=1e-12)

@@ -224,7 +224,9 @@ def _fit_camera(selection: Selection, camera: int, known: KnownTarget) -> _Camer
     names = tuple(selection.state.lens_names(selection.problem.free)[at])
     state = _single_camera(selection.state, pose, at, camera)
     target = None
-    if _has_target(selection):
+    # Whether anything was found that stays with the target.
+    stages = {STAGE_OF[name] for name in np.array(NAMES)[null.variances.alive]}
+    if 'target' in stages or any(map(displaces_landmarks, selection.state.terms)):
         seen = np.unique(own.views.landmark[own.views.used])
         variances = replace(null.variances, weight=null.variances.weight[
             np.searchsorted(null.random.landmark, seen)])
@@ -237,13 +239,6 @@ def _fit_camera(selection: Selection, camera: int, known: KnownTarget) -> _Camer
 
 def _single_camera(state: RigState, pose: Pose, lens: int, camera: int) -> RigState:
     return RigState(pose, identity(1), state.lenses[lens], camera_terms(state.terms, camera))
-
-
-def _has_target(selection: Selection) -> bool:
-    """Whether anything was found that stays with the target."""
-    alive = selection.null.variances.alive
-    return any(map(displaces_landmarks, selection.state.terms)) or any(
-        STAGE_OF[name] == 'target' for name in np.array(NAMES)[alive])
 
 
 def _compare(one: _Camera, other: _Camera, known: KnownTarget) -> TwoCameras:
