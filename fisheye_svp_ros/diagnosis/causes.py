@@ -33,12 +33,12 @@ _PORT_UNITS = {MEDIUM_INDEX: '', 'port_distance': 'm', 'port_tilt_x': 'rad', 'po
 class Cause:
     """One named cause with its parameters, evidence and what it may be mistaken for.
 
-    share: of the misfit of the simulation; survives: whether it is still needed with any one other
-    cause left out; heldout_rms_px, gain: of held-out frames once it is in the model;
-    refuted_by_frames: first and last frame of contiguous thirds that are predicted worse with it.
+    form: `Effect.key`; share: of the misfit of the simulation; survives: whether it is still
+    needed with any one other cause left out; heldout_rms_px, gain: of held-out frames once it is
+    in the model; refuted_by_frames: first and last frame of contiguous thirds that are predicted
+    worse with it.
     """
 
-    effect: str
     form: str
     parameters: dict[str, dict[str, Any]]
     p_value: float
@@ -49,6 +49,11 @@ class Cause:
     indistinguishable_from: list[str]
     to_separate: str
     refuted_by_frames: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def effect(self) -> str:
+        """The name of the effect."""
+        return self.form.partition('(')[0]
 
     @property
     def effect_class(self) -> type[Effect]:
@@ -87,7 +92,7 @@ def selected_causes(
         parameters = parameters_of(effect, values, errors[columns])
         alike = confounded_effects(tests, name, columns)
         causes.append(Cause(
-            name, effect.key, parameters,
+            effect.key, parameters,
             tests.test_removal(tests.null.included_columns, columns, effect).p_value,
             shares[name], _survives(tests, effect, columns), rms, gain, alike,
             '; '.join([effect.to_separate, *_look_alike_texts(tests, alike, columns)]),
@@ -110,9 +115,8 @@ def medium_cause(medium: Medium, stderr: dict[str, float], rms: float, gain: flo
             'value': float(values[name]), 'stderr': stderr.get(name, 0.0), 'unit': unit}
         for name, unit in _PORT_UNITS.items() if name in (MEDIUM_INDEX, *medium.names)}
     return Cause(
-        FlatPortEffect.name, f'{FlatPortEffect.name}(medium)', parameters, medium.p_value,
-        medium.share, True, rms, gain, [RadialProfileEffect.name] if medium.alike else [],
-        FlatPortEffect.to_separate)
+        f'{FlatPortEffect.name}(medium)', parameters, medium.p_value, medium.share, True, rms,
+        gain, [RadialProfileEffect.name] if medium.alike else [], FlatPortEffect.to_separate)
 
 
 def _look_alike_texts(tests: EffectTests, alike: Sequence[str], columns: Index) -> list[str]:
@@ -185,14 +189,13 @@ def confounded_effects(tests: EffectTests, name: str, columns: Index) -> list[st
     return same
 
 
-def plain_cause(
-    name: str, parameters: dict[str, dict[str, Any]], p_value: float, share: float
+def _plain_cause(
+    name: str, part: str, value: float, stderr: float, unit: str, p_value: float = 0.0
 ) -> Cause:
     """Return a cause that moves no prediction: it lies in the table or in the noise."""
-    return Cause(
-        name, name, parameters, p_value, share, True, float('nan'), 0.0, [],
-        CATALOGUE[name].to_separate,
-    )
+    parameters = {part: {'value': value, 'stderr': stderr, 'unit': unit}}
+    return Cause(name, parameters, p_value, 0.0, True, float('nan'), 0.0, [],
+                 CATALOGUE[name].to_separate)
 
 
 def table_causes(observations: Observations, outliers: Outliers, step: float) -> list[Cause]:
@@ -202,11 +205,10 @@ def table_causes(observations: Observations, outliers: Outliers, step: float) ->
     # One of many outliers is chance.
     if swapped > 1 or 2 * swapped >= len(outliers.rows) > 0:
         fraction = swapped / len(observations)
-        value = {'value': fraction, 'stderr': fraction / np.sqrt(swapped), 'unit': '1'}
-        causes.append(plain_cause('wrong_ids', {'fraction': value}, 0.0, 0.0))
+        error = fraction / np.sqrt(swapped)
+        causes.append(_plain_cause('wrong_ids', 'fraction', fraction, error, '1'))
     if step:
-        value = {'value': step, 'stderr': 0.0, 'unit': 'px'}
-        causes.append(plain_cause('quantisation', {'step': value}, 0.0, 0.0))
+        causes.append(_plain_cause('quantisation', 'step', step, 0.0, 'px'))
     return causes
 
 
@@ -214,8 +216,8 @@ def growth_cause(growth: NoiseGrowth | None) -> list[Cause]:
     """Return noise that grows with the angle as a cause, if it does."""
     if growth is None:
         return []
-    value = {'value': growth.value, 'stderr': growth.stderr, 'unit': '1/rad^2'}
-    return [plain_cause('noise_vs_angle', {'growth': value}, growth.p_value, 0.0)]
+    return [_plain_cause('noise_vs_angle', 'growth', growth.value, growth.stderr, '1/rad^2',
+                         growth.p_value)]
 
 
 def outlier_rows(

@@ -22,9 +22,9 @@ from fisheye_svp_ros.mixed_model import (
     RandomColumns,
     Variances,
     factor_equations,
-    fit_out,
     make_equations,
     project_out,
+    subtract_fit,
 )
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
@@ -211,7 +211,7 @@ def refit_shared(
     scale = null.scale[: null.column_count]
     combination[: null.column_count] += np.where(gone, values * scale, 0.0)
     kept = np.flatnonzero(~gone)
-    left = fit_out(information, kept, combination, 1e-13)
+    left = subtract_fit(information, kept, combination, 1e-13)
     return kept, (combination - left)[kept] / null.scale[kept], left
 
 

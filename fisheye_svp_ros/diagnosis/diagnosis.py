@@ -18,7 +18,6 @@ from fisheye_svp_ros.diagnosis.evaluation import (
     MAX_RMS_RATIO,
     Evaluation,
     Figures,
-    FitQuality,
     Intrinsic,
 )
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
@@ -251,10 +250,9 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds (design, section 7)."""
-
-        def entry(fit: FitQuality) -> dict[str, Any]:
-            return {name: value for name, value in asdict(fit).items() if value is not None}
-
+        base, named, lens, extended = (
+            {name: value for name, value in asdict(fit).items() if value is not None}
+            for fit in self.figures[:4])
         external: dict[str, Any] = {}
         if self.cameras:
             external['cameras'] = [pair.to_dict() for pair in self.cameras]
@@ -266,15 +264,14 @@ class Diagnosis:
             'noise_px': self.noise_px,
             'frames': self.frames,
             'observations': self.observations,
-            'base': entry(self.figures.base),
+            'base': base,
             'components': [part._asdict() for part in self.components],
-            'causes': [asdict(cause) for cause in self.causes],
-            'named': entry(self.figures.named),
-            'lens': entry(self.figures.lens_only) | {
-                'ray_error_mrad': self.conclusion.ray_error_mrad(),
-                **self.averaged_model.to_dict(),
-                **({} if field is None else {'image_field': field.to_dict()})},
-            'extended': entry(self.figures.extended),
+            'causes': [{'effect': cause.effect, **asdict(cause)} for cause in self.causes],
+            'named': named,
+            'lens': {**lens, 'ray_error_mrad': self.conclusion.ray_error_mrad(),
+                     **self.averaged_model.to_dict(),
+                     **({} if field is None else {'image_field': field.to_dict()})},
+            'extended': extended,
             **self.conclusion.to_dict(),
             'photographs': [
                 {'frame': frame, 'camera': camera, 'name': name}

@@ -23,13 +23,13 @@ from fisheye_svp_ros.mixed_model import (
     FactoredEquations,
     Score,
     eliminate,
-    fit_out,
     integrate_columns,
     predict_rows,
     pseudo_inverse,
     satterthwaite_freedom,
     score_columns,
     score_each,
+    subtract_fit,
 )
 
 # False alarms: this much for all effects together, the same again for the random components.
@@ -193,7 +193,7 @@ class EffectTests:
         info = null.factorization.information
         combination = np.zeros(len(info))
         combination[columns] = score.estimate * null.scale[columns]
-        combination = fit_out(info, included, combination)
+        combination = subtract_fit(info, included, combination)
         freedom = satterthwaite_freedom(null.factorization, combination, covariance)
         p = float(special.fdtrc(score.rank, freedom, max(score.statistic, 0.0) / score.rank))
         if p < _DOUBTFUL_P and (
@@ -308,7 +308,7 @@ def _cluster_p_value(
     Biometrika 73 (1986).
     """
     info, both = null.factorization.information, np.concatenate([included, columns])
-    residual = fit_out(info, both, null.residual_combination(included))
+    residual = subtract_fit(info, both, null.residual_combination(included))
     weight, remaining = _border_rows(null, combination, residual)
     used = null.linear.row_mask
     landmark = np.repeat(null.random.columns.unit, 2, axis=-1)[used]

@@ -43,7 +43,6 @@ from fisheye_svp_ros.mixed_model.score_tests import (
     Score,
     component_traces,
     eliminate,
-    fit_out,
     identifiable_basis,
     integrate_columns,
     pseudo_inverse,
@@ -51,6 +50,7 @@ from fisheye_svp_ros.mixed_model.score_tests import (
     score_columns,
     score_components,
     score_each,
+    subtract_fit,
 )
 from fisheye_svp_ros.mixed_model.solution import (
     LeaveOneOut,
@@ -67,10 +67,9 @@ __all__ = [
     'IDENTIFIABLE', 'LAMBDA_ABSENT', 'Components', 'Equations', 'FactoredEquations', 'LeaveOneOut',
     'Posterior', 'RandomColumns', 'Score', 'Solution', 'Variances', 'combine_offsets',
     'component_p_values', 'component_traces', 'eliminate', 'estimate_variances',
-    'factor_equations', 'find_variances', 'fit_out', 'group_basis', 'identifiable_basis',
-    'initial_variances', 'integrate_columns', 'is_called_for', 'leave_groups_out',
-    'make_equations', 'multiply_rows', 'no_variances', 'posterior_covariance',
-    'posterior_variances', 'predict_rows', 'project_out', 'pseudo_inverse',
-    'satterthwaite_freedom', 'score_columns', 'score_components', 'score_each', 'solve_equations',
-    'solve_lower', 'unit_covariances', 'unit_labels',
+    'factor_equations', 'find_variances', 'group_basis', 'identifiable_basis', 'initial_variances',
+    'integrate_columns', 'is_called_for', 'leave_groups_out', 'make_equations', 'multiply_rows',
+    'no_variances', 'posterior_covariance', 'posterior_variances', 'predict_rows', 'project_out',
+    'pseudo_inverse', 'satterthwaite_freedom', 'score_columns', 'score_components', 'score_each',
+    'solve_equations', 'solve_lower', 'subtract_fit', 'unit_covariances', 'unit_labels',
 ]

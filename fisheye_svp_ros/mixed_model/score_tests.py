@@ -109,7 +109,7 @@ def eliminate(information: Array, included: Index) -> Array:
     return np.asarray(information - information[:, included] @ inverse @ information[included])
 
 
-def fit_out(
+def subtract_fit(
     information: Array, included: Index, combination: Array, floor: float = IDENTIFIABLE
 ) -> Array:
     """Return a combination (X,) of the border, less what included columns take up of it."""

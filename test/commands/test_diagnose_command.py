@@ -394,7 +394,7 @@ class TestWords:
         """Of several parameters the most significant one, whatever their order."""
         first = found.causes[0]
         entry = next(iter(first.parameters.values()))
-        board = replace(first, effect='board_pose', share=2 * first.share, parameters={
+        board = replace(first, form='board_pose', share=2 * first.share, parameters={
             f'board1.{name}': entry | {'value': 1e-3 * value, 'stderr': 1e-4, 'unit': 'm'}
             for name, value in zip('xyz', (0.1, 0.2, 0.6), strict=True)})
         words = headline(with_changes(found, causes=[first, board]))
@@ -419,7 +419,7 @@ class TestWords:
         assert 'look for the cause' in following
 
     def test_what_happened_to_the_frames_is_no_reason_to_keep_the_lens(self, found):
-        cause = replace(found.causes[0], effect='rolling_shutter', to_separate='use a tripod')
+        cause = replace(found.causes[0], form='rolling_shutter', to_separate='use a tripod')
         shutter = replace(found.lens, corrections={'rolling_shutter': {}})
         told = [verdict_sentences(with_changes(
             found, causes=[cause], advice=[], lenses={'': lens}))[2]

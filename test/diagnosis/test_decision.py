@@ -197,8 +197,8 @@ def test_the_worst_of_several_lenses_may_be_so_by_chance() -> None:
 def test_the_largest_error_of_the_target_is_said(
     effect: str, values: dict[str, float], words: str
 ) -> None:
-    cause = Cause(effect, effect, {name: {'value': value} for name, value in values.items()},
+    cause = Cause(effect, {name: {'value': value} for name, value in values.items()},
                   1e-9, 0.2, True, 0.1, 0.3, [], '')
-    smaller = replace(cause, effect='board_pose' if effect != 'board_pose' else 'landmark_survey',
+    smaller = replace(cause, form='board_pose' if effect != 'board_pose' else 'landmark_survey',
                       share=0.1)
     assert _largest_error(None, [smaller, cause]) == words  # type: ignore[arg-type]

@@ -102,7 +102,7 @@ def _deciding(found: Diagnosis, about: str, **changes: object) -> Diagnosis:
 
 
 def _tilt(value: float, error: float) -> Cause:
-    return Cause('sensor_tilt', 'sensor_tilt', {'x': {
+    return Cause('sensor_tilt', {'x': {
         'value': value, 'stderr': error, 'unit': 'rad'}}, 1e-9, 0.2, True, 0.1, 0.3, [], '')
 
 
@@ -112,7 +112,7 @@ def test_a_board_that_is_longer_one_way_is_not_one_of_another_scale(
     found: Diagnosis, parameter: str, words: str
 ) -> None:
     """Who reads that the scale is off by 0.47 % corrects the size of a square."""
-    scale = replace(_tilt(0.0, 0.0), effect='landmark_scale', parameters={
+    scale = replace(_tilt(0.0, 0.0), form='landmark_scale', parameters={
         parameter: {'value': 0.0047, 'stderr': 0.0002, 'unit': '1'}})
     assert headline(replace(found, causes=[scale])).startswith(f'{words} ({parameter} = 0.47')
 
@@ -120,7 +120,7 @@ def test_a_board_that_is_longer_one_way_is_not_one_of_another_scale(
 def test_only_a_bent_target_is_to_be_flattened(found: Diagnosis) -> None:
     again = _deciding(found, 'target', say='measure_again')
     assert target_words(replace(again, causes=[])) == 'Measure the target, or replace it'
-    bent = replace(_tilt(0.0, 0.0), effect='target_shape')
+    bent = replace(_tilt(0.0, 0.0), form='target_shape')
     assert target_words(replace(again, causes=[bent])) == (
         'Measure the target, or flatten or replace it')
 
@@ -200,7 +200,7 @@ def test_outliers_alone_are_no_riddle_in_the_verdict(found: Diagnosis) -> None:
 
 def test_words_about_the_target_agree_with_its_decision(found: Diagnosis) -> None:
     """diagnosis.json had `correct`; the terminal said to measure the target."""
-    bent = replace(_tilt(0.0, 0.0), effect='target_shape')
+    bent = replace(_tilt(0.0, 0.0), form='target_shape')
     kept = replace(_deciding(found, 'target', say='correct'), causes=[bent])
     assert not kept.offers_extended
     assert target_words(kept) == 'Correct the target: measure it, or flatten or replace it'
@@ -246,7 +246,7 @@ def test_photographs_are_named_only_beside_what_to_do_with_them(found: Diagnosis
 
 
 def test_a_step_without_an_error_is_not_within_it(found: Diagnosis) -> None:
-    step = replace(_tilt(0.0, 0.0), effect='quantisation', parameters={
+    step = replace(_tilt(0.0, 0.0), form='quantisation', parameters={
         'step': {'value': 0.25, 'stderr': 0.0, 'unit': 'px'}})
     assert size(found, step) == 'step = 0.25 px'
 
