@@ -41,7 +41,7 @@ def trial(seed: int) -> Outcome:
     """Calibrate and diagnose one set."""
     seen, truth = draw_set(seed)
     given, found = study.calibrated_and_diagnosed(seen, (WIDTH, HEIGHT), free_intrinsics=True)
-    named = extended_lenses({'': given}, found.evaluation.null.linear.state, seen)['']
+    named = found.evaluation.extended_lenses(found.evaluation.null.linear.state)['']
     shift, names = found.averaged_model.shifts, [cause.effect for cause in found.causes]
     written = getattr(found.lens.viewpoint_shift, 'e0', 0.0)
     return Outcome(
