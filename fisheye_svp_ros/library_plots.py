@@ -18,12 +18,13 @@ from fisheye_svp_ros.library import (
 )
 from fisheye_svp_ros.library_checks import check_type
 from fisheye_svp_ros.library_results import Budgeted
+from fisheye_svp_ros.reporting.budget_report import DISPLAY_UNITS
 from fisheye_svp_ros.reporting.diagnosis_plots import draw_arrows, draw_image_frame
 from fisheye_svp_ros.solve.measured_poses import rms_px
+from fisheye_svp_ros.study.budget import UNITS
 
 _ANGLES = 181
 _CELLS = 16  # over the width of the image: the typical arrow is as long as one
-_UNITS = {'position': (1e3, 'mm'), 'axis': (180 / np.pi, 'deg'), 'depth': (1e3, 'mm')}
 
 
 def plot_lens(*lenses: AnyLens) -> Figure:
@@ -75,7 +76,7 @@ def plot_budget(budget: Budgeted, quantity: str = 'position') -> Figure:
     if quantity not in budget.error:
         raise ParameterError(f'{quantity!r} is no quantity of a budget; known are '
                              f'{", ".join(budget.error)}')
-    factor, unit = _UNITS.get(quantity, (1.0, 'px'))
+    unit, factor = DISPLAY_UNITS[UNITS[quantity]]
     figure = Figure(figsize=(8, 5), layout='constrained')
     axis = figure.subplots()
     for spread, error, noise in zip(np.degrees(budget.spreads), budget.error[quantity],

@@ -15,7 +15,7 @@ from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, picture
 from fisheye_svp_ros.study.budget import QUANTITIES, UNITS, Budget, Point
 
 _LINEAR_AXIS_RATIO = 30.0  # times, from the least to the largest error
-_DISPLAY_UNITS = {'m': ('mm', 1e3), 'rad': ('deg', float(np.degrees(1.0))), 'px': ('px', 1.0)}
+DISPLAY_UNITS = {'m': ('mm', 1e3), 'rad': ('deg', 180 / np.pi), 'px': ('px', 1.0)}
 _LABELS = {
     'position': 'position of the camera', 'axis': 'viewing axis', 'residual': 'mean residual',
     'epipolar': 'epipolar distance', 'depth': 'stereo points',
@@ -59,7 +59,7 @@ def rows(points: Sequence[Point], asked: BudgetRequest) -> list[tuple[str, ...]]
     """Return the table's rows, under the header."""
     found = []
     for point in asked.relevant_points(points):
-        unit, factor = _DISPLAY_UNITS[UNITS[point.quantity]]
+        unit, factor = DISPLAY_UNITS[UNITS[point.quantity]]
         own = (point.parameters, point.misfit) if asked.own else ()
         found.append((
             _LABELS[point.quantity],
@@ -87,7 +87,7 @@ def answer(points: Sequence[Point], asked: BudgetRequest) -> str:
         return (f'Not known: {where} {asked.model} keeps {len(judged) - len(unknown)} of '
                 f'{len(judged)} limits; {untold}.')
     worst = max(broken, key=lambda point: point.error / point.limit)
-    unit, factor = _DISPLAY_UNITS[UNITS[worst.quantity]]
+    unit, factor = DISPLAY_UNITS[UNITS[worst.quantity]]
     limit = 'your limit' if asked.given else 'the effect of noise'
     needed = max(point.nearest_range for point in (*broken, *unknown))
     neglected = 'suffices' if asked.port else 'may be neglected'
@@ -134,7 +134,7 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: BudgetReque
     with picture(path, 12.5, 6.4) as figure:
         axes = figure.subplots(2, 3)
         for axis, point in zip(axes.flat, points, strict=False):
-            unit, factor = _DISPLAY_UNITS[UNITS[point.quantity]]
+            unit, factor = DISPLAY_UNITS[UNITS[point.quantity]]
             error = np.ma.masked_invalid(factor * budget.error[point.quantity])
             mesh = axis.pcolormesh(
                 budget.ranges, np.degrees(budget.spreads), error, shading='nearest',

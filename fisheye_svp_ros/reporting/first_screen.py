@@ -139,7 +139,7 @@ def first_screen(
 
 def _reason(decision: Decision, d: Diagnosis) -> str:
     """Return why, with the photographs whose board is numbered from another end."""
-    why = decision.why[:1].upper() + decision.why[1:]
+    why = _capital(decision.why)
     if decision is not d.decision['photographs'] or not d.record.turned:
         return why
     names = [one.photograph for one in d.record.turned]

@@ -9,7 +9,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import ObservationError
-from fisheye_svp_ros.scene.observations import Observations, rig_cameras
+from fisheye_svp_ros.scene.observations import Observations, rig_cameras, select_cameras
 
 ROUNDING = 1e-7  # px: what is simulated without noise scatters by less, nothing measured does
 _COPIED_SHARE = 0.5  # of the image points: no two photographs have so many alike
@@ -25,8 +25,7 @@ def order_cameras(table: Observations, cameras: tuple[str, ...]) -> Observations
         held = ', '.join(filter(None, table.cameras)) or 'one without a name'
         raise ObservationError(f'{table.source}: its cameras ({held}) are not those of the rig, '
                                + ', '.join(cameras))
-    order = np.array([cameras.index(name) for name in table.cameras])
-    return replace(table, cameras=cameras, camera=order[table.camera])
+    return select_cameras(table, cameras)
 
 
 def put_right_camera_first(table: Observations) -> Observations:
