@@ -39,7 +39,7 @@ class Measurement(NamedTuple):
 
     uv_left, uv_right (N, 2), px; foot (N, 2), px: nearest point of the epipolar curve; distance,
     vertical (N,), px: to the curve, and to it in the same column; true, measured (N, 3), m, world;
-    metrics: Error2 in both readings and Error3, see `study.metrics.stereo_depth_metrics`.
+    metrics: Error2 in both readings and Error3, see `study.solutions.stereo_depth_metrics`.
     """
 
     uv_left: Array
