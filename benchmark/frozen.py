@@ -28,8 +28,8 @@ import yaml
 
 from benchmark.blind import OUTSIDE_SIZES, SIZES, tasks
 from benchmark.blind_trial import MODES, Task, draw_case
+from benchmark.study import in_processes
 from benchmark.two_cameras import KINDS, pair
-from benchmark.workers import in_processes
 from fisheye_svp_ros.cli import main as fisheye_svp
 from fisheye_svp_ros.io.files import write_json
 from fisheye_svp_ros.io.lens_files import save_lens

@@ -41,7 +41,7 @@ from benchmark.compare.sets import (  # noqa: E402
     photograph_set,
     table_set,
 )
-from benchmark.workers import in_processes  # noqa: E402
+from benchmark.study import in_processes  # noqa: E402
 from fisheye_svp_ros.arrays import Array, Mask  # noqa: E402
 from fisheye_svp_ros.diagnosis import (  # noqa: E402
     Diagnosis,

@@ -23,7 +23,7 @@ from fisheye_svp_ros.paper.tables import LENSES, LOCALIZATION, OUT_OF_LINE
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.scene.rigs import paper_pose
-from fisheye_svp_ros.solve.localization import normal_equations
+from fisheye_svp_ros.solve.localization import pose_equations
 
 COMMAND = 'python -m benchmark.paper stopping (make paper-search)'
 DAMPINGS = ('marquardt', 'levenberg')
@@ -72,7 +72,7 @@ def excess_of_published(localized: LocalizedSpread, lens: Lens) -> Excess:
     offset = 1e-3 * (published - localized.rows[radius, :3])
     views = localized.views.take([radius])
     pose = localized.solved.pose.take([radius])
-    cost, (hessian, _) = _equations(ForwardModel(lens.svp()), pose, views)
+    cost, (hessian, _) = pose_equations(ForwardModel(lens.svp()), pose, views)
     h = hessian[0]
     position_only = h[:3, :3] - h[:3, 3:] @ np.linalg.solve(h[3:, 3:], h[3:, :3])
     return Excess(1e3 * offset, float(offset @ position_only @ offset / cost[0]))
@@ -100,7 +100,7 @@ def stopped_early(localized: tuple[LocalizedSpread, ...], lens: Lens) -> Array:
 def _descend(model: ForwardModel, views: Views, start: Pose, kind: str) -> Array:
     """Return z (G, S), m, at which each gain first stops a descent of fixed relative damping."""
     pose = start
-    cost, (hessian, gradient) = _equations(model, pose, views)
+    cost, (hessian, gradient) = pose_equations(model, pose, views)
     z = np.full((len(GAINS), len(cost)), np.nan)
     for _ in range(_MAX_STEPS):
         own = np.einsum('sii->si', hessian) if kind == 'marquardt' else np.ones_like(gradient)
@@ -108,17 +108,9 @@ def _descend(model: ForwardModel, views: Views, start: Pose, kind: str) -> Array
         damped = hessian + _DAMPING * np.einsum('si,ij->sij', weight, np.eye(6))
         pose = pose.retract(-np.linalg.solve(damped, gradient[..., None])[..., 0])
         before = cost
-        cost, (hessian, gradient) = _equations(model, pose, views)
+        cost, (hessian, gradient) = pose_equations(model, pose, views)
         stops = np.isnan(z) & (before - cost < np.array(GAINS)[:, None])
         z = np.where(stops, pose.position[:, 2], z)
         if not np.isnan(z).any():
             break
     return np.where(np.isnan(z), pose.position[:, 2], z)
-
-
-def _equations(
-    model: ForwardModel, pose: Pose, views: Views
-) -> tuple[Array, tuple[Array, Array]]:
-    linear = model.linearise(pose, views)
-    cost, (hessian, gradient) = normal_equations(linear.uv, linear.d_pose, views)
-    return cost, (hessian, gradient)

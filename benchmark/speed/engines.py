@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
-from benchmark.speed.harness import OURS, Side
+from benchmark.speed.harness import OURS, Goal, Row, Side, available, measure
 from fisheye_svp_ros.optics.engines import use as use
 
 
@@ -28,6 +28,16 @@ def sides(
     return {
         name_of(engine) + way: partial(_side, engine, way, run, keywords) for engine in engines()
     }
+
+
+def row(
+    title: str, unit: tuple[str, float], makers: dict[str, Callable[[], Side]], repeats: int,
+    goals: Sequence[tuple[str, str, float]] = (), error_unit: str = 'm', text: str = '',
+) -> Row:
+    """Measure the sides of a row; unit: its name and size, s; goals: engine, peer and ratio."""
+    sides, left_out = available(makers)
+    return Row(title, *unit, measure(sides, repeats), error_unit, left_out,
+               [Goal(name_of(engine), peer, ratio) for engine, peer, ratio in goals], text)
 
 
 def _side(engine: str, way: str, run: Callable[[], Any], keywords: dict[str, Any]) -> Side:

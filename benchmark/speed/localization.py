@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmark.speed import engines
 from benchmark.speed.adjustment import exact_view, scipy_pose
-from benchmark.speed.harness import Goal, Row, Side, available, measure, require
+from benchmark.speed.harness import Row, Side, require
 from benchmark.speed.peers import LOCALIZERS, Solve
 from benchmark.speed.scenes import Scene, localization, shift_lens, svp_lens
 from fisheye_svp_ros.arrays import Array
@@ -18,6 +18,7 @@ from fisheye_svp_ros.solve.localization import localize
 
 _CHECKED = 50  # views whose answers are compared
 _EXACT = 1e-14
+_UNIT = ('µs each', 1e-6)
 _NOTES = {
     'poselib': 'tolerances 1e-10, no robust loss',
     'pycolmap': 'gradient tolerance 1e-10; ends by a looser one of its own',
@@ -33,10 +34,10 @@ def rows(many: int = 10_000, looped: int = 100, repeats: int = 7) -> list[Row]:
     svp, shift = svp_lens(), shift_lens()
     return [
         _one(localization(svp, looped), repeats),
-        _many('SVP Kannala-Brandt', localization(svp, many), looped, repeats, {
-            'numpy': {'poselib': 1.3, 'GTSAM': 15.0}, 'numba': {'poselib': 4.0, 'GTSAM': 40.0},
-        }),
-        _many('ShiftVP', localization(shift, many), looped, repeats, {}),
+        _many('SVP Kannala-Brandt', localization(svp, many), looped, repeats, [
+            ('numpy', 'poselib', 1.3), ('numpy', 'GTSAM', 15.0), ('numba', 'poselib', 4.0),
+            ('numba', 'GTSAM', 40.0)]),
+        _many('ShiftVP', localization(shift, many), looped, repeats, []),
     ]
 
 
@@ -53,12 +54,12 @@ def _one(scene: Scene, repeats: int) -> Row:
 
     makers = engines.sides(ours, work=len(views), error=_off(truth))
     makers |= _peers(scene, len(views), truth)
-    goals = [Goal(engines.name_of('numba'), 'poselib', 2.5)]
-    return _row('One localization at a time, SVP Kannala-Brandt', makers, repeats, goals)
+    return engines.row('One localization at a time, SVP Kannala-Brandt', _UNIT, makers, repeats,
+                       [('numba', 'poselib', 2.5)])
 
 
 def _many(
-    lens: str, scene: Scene, looped: int, repeats: int, goals: dict[str, dict[str, float]]
+    lens: str, scene: Scene, looped: int, repeats: int, goals: list[tuple[str, str, float]]
 ) -> Row:
     model, truth = ForwardModel(scene.lens), _exact_positions(scene)
     total = len(scene.views.uv)
@@ -68,11 +69,7 @@ def _many(
 
     makers = engines.sides(ours, work=total, error=_off(truth))
     makers |= _peers(scene, min(looped, total), truth)
-    return _row(
-        f'{total} localizations, {lens}', makers, repeats,
-        [Goal(engines.name_of(engine), peer, ratio)
-         for engine, ratios in goals.items() for peer, ratio in ratios.items()],
-    )
+    return engines.row(f'{total} localizations, {lens}', _UNIT, makers, repeats, goals)
 
 
 def _peers(scene: Scene, looped: int, truth: Array) -> dict[str, Callable[[], Side]]:
@@ -93,13 +90,6 @@ def _peers(scene: Scene, looped: int, truth: Array) -> dict[str, Callable[[], Si
         for name, peer in LOCALIZERS.items()
         if scene.lens.viewpoint_shift is None or name in _ANY_LENS
     }
-
-
-def _row(
-    title: str, makers: dict[str, Callable[[], Side]], repeats: int, goals: list[Goal]
-) -> Row:
-    sides, left_out = available(makers)
-    return Row(title, 'µs each', 1e-6, measure(sides, repeats), 'm', left_out, goals)
 
 
 def _exact_positions(scene: Scene) -> Array:

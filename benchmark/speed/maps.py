@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmark.speed import engines
-from benchmark.speed.harness import Row, Side, available, measure, require
+from benchmark.speed.harness import Row, Side, require
 from benchmark.speed.peers import camera_matrix
 from benchmark.speed.scenes import shift_lens, svp_lens
 from fisheye_svp_ros.optics.lens import Lens
@@ -52,5 +52,4 @@ def _maps(title: str, lens: Lens, repeats: int, opencv: bool = False) -> Row:
     makers: dict[str, Callable[[], Side]] = engines.sides(ours, work=1, error=error)
     if opencv:
         makers |= {OPENCV: theirs}
-    sides, left_out = available(makers)
-    return Row(title, 'ms', 1e-3, measure(sides, repeats), 'px', left_out, text=_TEXT)
+    return engines.row(title, ('ms', 1e-3), makers, repeats, error_unit='px', text=_TEXT)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
 from benchmark.speed import engines
 from benchmark.speed.compiled import Kernel, MrcalCore
-from benchmark.speed.harness import Goal, Row, Side, available, measure, require
+from benchmark.speed.harness import Row, Side, require
 from benchmark.speed.peers import camera_matrix
 from benchmark.speed.scenes import points, shift_lens, svp_lens
 from fisheye_svp_ros.arrays import Array
@@ -21,6 +21,7 @@ from fisheye_svp_ros.scene.observations import views_of
 KERNEL = 'hand-written C'
 MRCAL = "mrcal's CAHVORE core"
 OPENCV = 'cv2.fisheye.projectPoints'
+_UNIT = ('ns a point', 1e-9)
 _WIDEST = {'shift': np.radians(100.0), 'svp': np.radians(80.0)}
 
 
@@ -45,10 +46,10 @@ def _project(count: int, repeats: int) -> Row:
         own = core.prepared(seen)
         return Side(MRCAL, lambda: core.project(own), count, _off(exact))
 
-    return _row(
-        'Projection, ShiftVP', repeats,
+    return engines.row(
+        'Projection, ShiftVP', _UNIT,
         engines.sides(ours, work=count, error=_off(exact)) | {KERNEL: kernel, MRCAL: mrcal},
-        [('numpy', MRCAL, 1.3), ('numba', MRCAL, 4.5), ('numba', KERNEL, 1 / 1.5)],
+        repeats, [('numpy', MRCAL, 1.3), ('numba', MRCAL, 4.5), ('numba', KERNEL, 1 / 1.5)], 'px',
     )
 
 
@@ -82,10 +83,10 @@ def _project_with_pose(count: int, repeats: int) -> Row:
             note='differentiates by the point only, by automatic differentiation',
         )
 
-    return _row(
-        'Projection with derivatives by the pose, ShiftVP', repeats,
+    return engines.row(
+        'Projection with derivatives by the pose, ShiftVP', _UNIT,
         engines.sides(ours, work=count, error=_off(exact)) | {KERNEL: kernel, MRCAL: mrcal},
-        [('numpy', MRCAL, 2.0), ('numba', MRCAL, 6.0)],
+        repeats, [('numpy', MRCAL, 2.0), ('numba', MRCAL, 6.0)], 'px',
     )
 
 
@@ -105,23 +106,12 @@ def _svp(count: int, repeats: int) -> Row:
             count, _off(exact), note='differentiates by the intrinsics, too',
         )
 
-    return _row(
-        'Projection with derivatives by the pose, SVP Kannala-Brandt', repeats,
+    return engines.row(
+        'Projection with derivatives by the pose, SVP Kannala-Brandt', _UNIT,
         engines.sides(ours, work=count, error=_off(exact)) | {KERNEL: kernel, OPENCV: opencv},
-        [('numpy', OPENCV, 1.8), ('numba', OPENCV, 4.0)],
+        repeats, [('numpy', OPENCV, 1.8), ('numba', OPENCV, 4.0)], 'px',
     )
 
 
 def _off(exact: Array) -> Callable[[Array], float]:
     return lambda uv: float(np.abs(uv - exact).max())
-
-
-def _row(
-    title: str, repeats: int, makers: dict[str, Callable[[], Side]],
-    goals: Sequence[tuple[str, str, float]],
-) -> Row:
-    sides, left_out = available(makers)
-    return Row(
-        title, 'ns a point', 1e-9, measure(sides, repeats), 'px', left_out,
-        [Goal(engines.name_of(engine), peer, ratio) for engine, peer, ratio in goals],
-    )

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from benchmark.speed import engines
-from benchmark.speed.harness import Goal, Row, Side, available, measure, require
+from benchmark.speed.harness import Row, Side, require
 from benchmark.speed.peers import TOLERANCE
 from benchmark.speed.rig_adjustment import gtsam_rig, mrcal_pose, mrcal_rig, opencv_rig, scipy_rig
 from benchmark.speed.scenes import StereoScene, stereo, svp_lens
@@ -40,8 +40,8 @@ def _kannala_brandt(views: int, repeats: int) -> Row:
     makers |= {
         name: partial(_peer, name, *peer, scene, off) for name, peer in _PEERS.items()
     }
-    goals = [Goal(engines.name_of(e), OPENCV, ratio) for e, ratio in (('numpy', 4), ('numba', 20))]
-    return _row(scene, 'SVP Kannala-Brandt', makers, repeats, goals)
+    return _row(scene, 'SVP Kannala-Brandt', makers, repeats,
+                [('numpy', OPENCV, 4), ('numba', OPENCV, 20)])
 
 
 def _stereographic(views: int, repeats: int) -> Row:
@@ -59,10 +59,8 @@ def _stereographic(views: int, repeats: int) -> Row:
             )
 
         makers = _ours(scene, off)
-        goals = [Goal(engines.name_of('numba'), 'mrcal', 3.0)]
-        return _row(
-            scene, 'SVP stereographic', makers | {'mrcal': mrcal}, repeats, goals
-        )
+        return _row(scene, 'SVP stereographic', makers | {'mrcal': mrcal}, repeats,
+                    [('numba', 'mrcal', 3.0)])
 
 
 def _peer(
@@ -94,9 +92,8 @@ def _off(scene: StereoScene) -> Callable[[Pose], float]:
 
 def _row(
     scene: StereoScene, lens: str, makers: dict[str, Callable[[], Side]], repeats: int,
-    goals: list[Goal],
+    goals: list[tuple[str, str, float]],
 ) -> Row:
-    sides, left_out = available(makers)
     views, board = len(scene.left.uv), len(scene.board)
     title = f'Stereo calibration, {views} × {board}, {6 * views + 6} unknowns, {lens}'
-    return Row(title, 'ms', 1e-3, measure(sides, repeats), 'm', left_out, goals)
+    return engines.row(title, ('ms', 1e-3), makers, repeats, goals)
