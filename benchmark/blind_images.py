@@ -307,7 +307,7 @@ def report(trials: Sequence[Trial], size: float) -> list[str]:
     hidden = [t for t in mine if t.effect in HIDDEN]
     clean = [t for t in mine if t.effect in CLEAN]
     aside = [t for t in mine if t.effect in ASIDE]
-    counts = {e: Counter(_shown(t, names) for t in mine if t.effect == e
+    counts = {e: Counter(e if e in names else names[0] for t in mine if t.effect == e
                          for names in t.named or [[NOTHING]]) for e in (*HIDDEN, *CLEAN, *ASIDE)}
     others = {name for c in counts.values() for name in c} - {*HIDDEN, NOTHING}
     columns = [*HIDDEN, *sorted(others), NOTHING]
@@ -345,10 +345,6 @@ def report(trials: Sequence[Trial], size: float) -> list[str]:
             f'{", ".join(" or ".join(names) for names in t.named) or "nothing"}; '
             f'left: {", ".join(t.left) or "nothing"}' for t in failed)]
     return lines
-
-
-def _shown(trial: Trial, names: list[str]) -> str:
-    return trial.effect if trial.effect in names else names[0]
 
 
 def _rate(results: Sequence[bool]) -> str:

@@ -8,11 +8,11 @@ Writes docs/results/compare.md.
 
 from __future__ import annotations
 
-import argparse
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from itertools import chain
 from pathlib import Path
@@ -25,6 +25,7 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
 import numpy as np  # noqa: E402
 
 import fisheye_svp_ros as fsvp  # noqa: E402
+from benchmark import study  # noqa: E402
 from benchmark.compare.halves import (  # noqa: E402
     all_pairs,
     differences,
@@ -41,7 +42,6 @@ from benchmark.compare.sets import (  # noqa: E402
     photograph_set,
     table_set,
 )
-from benchmark.study import in_processes  # noqa: E402
 from fisheye_svp_ros.arrays import Array, Mask  # noqa: E402
 from fisheye_svp_ros.diagnosis import (  # noqa: E402
     Diagnosis,
@@ -49,7 +49,6 @@ from fisheye_svp_ros.diagnosis import (  # noqa: E402
     diagnose,
     predict_other_data,
 )
-from fisheye_svp_ros.io.files import write_text  # noqa: E402
 from fisheye_svp_ros.library_results import Localized  # noqa: E402
 from fisheye_svp_ros.scene.observations import Observations  # noqa: E402
 from fisheye_svp_ros.solve.initial_rig import localize_frames  # noqa: E402
@@ -58,8 +57,6 @@ from fisheye_svp_ros.solve.measured_poses import (  # noqa: E402
 )
 from fisheye_svp_ros.solve.rig_state import group_by_frame  # noqa: E402
 
-_DOC = Path(__file__).parents[2] / 'docs' / 'results' / 'compare.md'
-_MARK = '<!-- figures -->'
 _OV = (1280, 800)
 TOOLS = {**PEERS, **PYTHON_PEERS}
 SETS: dict[str, Callable[[Path], Set]] = {
@@ -223,19 +220,19 @@ def page(sets: list[tuple[Set, list[Row]]], halves: list[str], honesty: list[str
 
 def main() -> None:
     """Compare on every set that is there, write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.compare')
+    parser = study.parser('compare', __doc__, study.RESULTS / 'compare.md')
     parser.add_argument('data', type=Path)
     parser.add_argument('--only', nargs='+', choices=SETS, default=list(SETS))
-    parser.add_argument('--workers', type=int, default=os.cpu_count(), help='processes for halves')
-    parser.add_argument('-o', '--output', type=Path, default=_DOC)
     asked = parser.parse_args()
     sets = [SETS[name](asked.data) for name in asked.only if (asked.data / name).is_dir()]
     # Whole sets one by one: their seconds are compared.
-    rows = in_processes('comparing', compared, sets, 1)
+    rows = study.in_processes('comparing', compared, sets, 1)
     halves, honesty = ({data.name: list(parts(data)) for data in sets}
                        for parts in (half_sets, all_pairs))
-    scores = iter(in_processes('halves', compared, [*chain(*halves.values())], asked.workers))
-    apart = iter(in_processes('errors', differences, [*chain(*honesty.values())], asked.workers))
+    scores = iter(study.in_processes(
+        'halves', compared, [*chain(*halves.values())], asked.workers))
+    apart = iter(study.in_processes(
+        'errors', differences, [*chain(*honesty.values())], asked.workers))
     text = page(
         list(zip(sets, rows, strict=True)),
         halves_table({name: [next(scores) for _ in many] for name, many in halves.items()}),
@@ -243,8 +240,7 @@ def main() -> None:
                        for name, many in honesty.items()}))
     print(text)
     if asked.only == list(SETS):
-        head = asked.output.read_text(encoding='utf-8').split(_MARK)[0]
-        write_text(asked.output, f'{head}{_MARK}\n\n{text}')
+        study.write_figures(asked.output, ['', text.rstrip('\n')])
 
 
 def _versions() -> str:
@@ -259,4 +255,5 @@ def _versions() -> str:
 
 
 if __name__ == '__main__':
-    main()
+    # By its full name: processes that are spawned find nothing that is in `__main__`.
+    import_module('benchmark.compare.__main__').main()
