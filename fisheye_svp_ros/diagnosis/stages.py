@@ -208,13 +208,10 @@ def _conclude(
     conclusion = conclude(
         evaluation, causes, components, advice, candidates,
         any(pair.verdict == 'contradict' for pair in cameras))
-    lenses = {
-        name: conclusion.with_ray_error(averaged.with_shift_entry(lens, name), name)
-        for name, lens in lenses.items()}
     field = evaluation.written_field
-    if field is not None:
-        lenses = {name: field.add_to(lens, camera)
-                  for camera, (name, lens) in enumerate(lenses.items())}
+    for camera, (name, lens) in enumerate(lenses.items()):
+        lens = conclusion.with_ray_error(averaged.with_shift_entry(lens, name), name)
+        lenses[name] = lens if field is None else field.add_to(lens, camera)
     return Diagnosis(
         evaluation,
         evaluation.figures,

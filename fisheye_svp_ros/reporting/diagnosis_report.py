@@ -174,7 +174,7 @@ def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the bars of the budget: stage, percent without and with a name, the names."""
     shares = stage_shares(diagnosis.components)
     names = {stage: ', '.join(cause.effect for cause in diagnosis.causes
-                              if cause.effect_class.budget_stage() == stage) for stage in shares}
+                              if cause.stage == stage) for stage in shares}
     total = diagnosis.figures.base.rms_px**2
     return {
         'bars': [

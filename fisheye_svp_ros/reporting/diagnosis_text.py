@@ -145,7 +145,7 @@ def lens_contents(d: Diagnosis) -> str:
     """Return what the extended lens has that the lens as given has not."""
     field = d.evaluation.written_field
     parts = ['intrinsics fitted to these data'] if d.intrinsics else []
-    parts += [c.effect for c in d.causes if c.effect_class.budget_stage() == 'lens']
+    parts += [c.effect for c in d.causes if c.stage == 'lens']
     parts += ['a viewpoint shift that is likely, not confirmed'] if d.averaged_model.shifts else []
     parts += ['an image field'] if field is not None and field.fields else []
     return f'with {join_names(parts)}' if parts else 'as it was fitted'
@@ -248,7 +248,7 @@ def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
         value, low, high = map(percent, d.figures.gain.interval.values())
         text += (f'; this removes {value} (95 % interval {low} to {high}) of the error above the '
                  'noise')
-    if 'target' in {c.effect_class.budget_stage() for c in moving}:
+    if 'target' in {c.stage for c in moving}:
         text += _file_clause(d)
     for (label, base, extended, _), compared in zip(
         known_rows(d, known), known.values(), strict=True
@@ -298,11 +298,11 @@ def _next_step(d: Diagnosis) -> str:
               if one.gain > 0 and one.what != USE_EXTENDED][:_MAX_CAUSES]
     steps += [advice_text(one) for one in d.advice if one.what == DIAGNOSE_AIR]
     held = [c.effect for c in d.causes
-            if c.effect_class.budget_stage() == 'frame' and c.effect in d.lens.corrections]
+            if c.stage == 'frame' and c.effect in d.lens.corrections]
     if held and d.decision['lens'].say == 'use_extended':
         steps.append(f'it includes {join_names(held)}')
     steps += [f'to confirm {c.effect}: {_remedy(c)}' for c in d.causes
-              if c.effect_class.budget_stage() == 'frame' and not c.indistinguishable_from]
+              if c.stage == 'frame' and not c.indistinguishable_from]
     steps += [
         f'to separate {c.effect} from {join_names(c.indistinguishable_from, "and")}: {_remedy(c)}'
         for c in d.causes if c.indistinguishable_from

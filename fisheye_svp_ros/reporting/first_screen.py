@@ -294,8 +294,8 @@ def largest_cause(d: Diagnosis) -> str:
     """
     causes = sorted(d.causes, key=lambda cause: (-cause.share, cause.p_value))
     if causes:
-        first, stage = causes[0], causes[0].effect_class.budget_stage()
-        other = next((one for one in causes if {stage, one.effect_class.budget_stage()}
+        first, stage = causes[0], causes[0].stage
+        other = next((one for one in causes if {stage, one.stage}
                       == {'lens', 'target'}), None)
         second = _sentence(d, other) if other else ''
         return _sentence(d, first) + (f', and {second[0].lower()}{second[1:]}' if second else '')
