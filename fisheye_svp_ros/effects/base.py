@@ -33,7 +33,6 @@ from fisheye_svp_ros.scene.observations import Views
 
 _PAUSE = 4.0  # times the median time between views: over so long no motion is known
 _MAX_PLAUSIBLE = 30.0  # times what would be a large value of a parameter
-STAGES = {'target': 3, 'pose': 6, 'ray': 2, 'image': 2, 'detector': 2, 'noise': 0}
 
 
 class Untestable(Exception):
