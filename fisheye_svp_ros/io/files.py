@@ -78,8 +78,8 @@ def read_text(path: str | Path, error: type[FisheyeSvpError], most: int = MAX_BY
 def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it to `path` when the block succeeds.
 
-    In a block of `together`, when that succeeds.  Raises OutputError, naming the path, where it
-    cannot be written.
+    In a block of `write_together`, when that succeeds.  Raises OutputError, naming the path, where
+    it cannot be written.
     """
     target, waiting = path_of(path), _waiting.get()
     if target.exists() and not target.is_file():
@@ -148,7 +148,7 @@ def _defer_signals() -> Iterator[None]:
 
 
 def written(path: Path) -> Path:
-    """Return where a file is that was written before, if need be in this block of `together`."""
+    """Return where a file is that was written before, if need be in this `write_together`."""
     return (_waiting.get() or {}).get(path, path)
 
 
