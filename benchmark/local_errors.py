@@ -37,11 +37,12 @@ SIZE = (1280, 960)
 
 
 class Taken(NamedTuple):
-    """What a camera photographed, and the e0 (m) and bend (m) behind it."""
+    """What a camera photographed, and the e0 (m), bend (m) and lens behind it."""
 
     table: Observations
     shift: float
     bend: float
+    lens: Lens
 
 
 def draw_set(number: int) -> Taken:
@@ -60,7 +61,7 @@ def draw_set(number: int) -> Taken:
     seen = photographed(lens, printed, points, poses, rng.uniform(0.08, 0.2), rng)
     far = 2 * (rng.random((len(seen), 1)) < 0.004) * rng.normal(size=(len(seen), 2))
     table = replace(seen, uv=seen.uv + own_errors(seen, centre, rng) + far)
-    return Taken(table.take(rng.random(len(seen)) < rng.uniform(0.9, 1.0)), shift, bend)
+    return Taken(table.take(rng.random(len(seen)) < rng.uniform(0.9, 1.0)), shift, bend, lens)
 
 
 def bent(corners: Array, bend: float, rng: Rng) -> Array:
@@ -94,7 +95,7 @@ def own_errors(seen: Observations, centre: Array, rng: Rng) -> Array:
 
 def trial(number: int) -> dict[str, Any]:
     """Return what was hidden, what was named, and e0 with its standard error, mm."""
-    table, shift, bend = draw_set(number)
+    table, shift, bend, _ = draw_set(number)
     lens, diagnosis = study.calibrated_and_diagnosed(table, SIZE)
     options = DiagnosisOptions(included=('viewpoint_shift',))
     found, asked = diagnosis.to_dict(), diagnose(table, lens, options=options).to_dict()

@@ -1,4 +1,4 @@
-"""Halves of a set's frames against each other: what lenses predict, and errors as stated."""
+"""Stated errors beside those that are there: between halves of frames, of simulated lenses."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from benchmark.compare.peers import Fit, NotHereError, opencv_rational
 from benchmark.compare.python_peers import calibsense_fisheye, installed
 from benchmark.compare.sets import BOARDS, Set, grid_of, one_board_a_frame
+from benchmark.local_errors import draw_set
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.optics.lens import INTRINSICS, parameter_values
@@ -20,11 +21,12 @@ from fisheye_svp_ros.study.trust import assess_lens, calibrate_without_outliers
 
 DEALS = 10  # random halves of each set
 WITHIN = 1.959964  # standard errors, 95 %
+SIMULATED = 45  # sets
 _ANGLE = 70.0  # degrees: `cv2.fisheye` fits all sets to the points within it
 
 
 class Difference(NamedTuple):
-    """fx, fy, cx, cy (4,) of one half minus those of the other, and their joint error (4,), px."""
+    """How far fx, fy, cx, cy (4,) of a tool are from others, and the stated error (4,), px."""
 
     tool: str
     apart: Array
@@ -112,17 +114,30 @@ def differences(pair: tuple[Set, Set]) -> list[Difference]:
         for kind, error in one.errors.items() if kind in second[tool].errors]
 
 
+def simulated_errors(number: int) -> dict[str, list[Difference]]:
+    """Return how far intrinsics are from those of a simulated lens, by what is wrong with it."""
+    table, shift, bend, lens = draw_set(number)
+    true = np.array(parameter_values(lens, INTRINSICS))
+    kind = 'moving viewpoint' if shift else f'bend of {1e3 * bend:g} mm'
+    try:
+        stated = intrinsics_of(Set('simulated', table, table, (lens.width, lens.height)))
+    except FisheyeSvpError:
+        return {kind: []}
+    return {kind: [Difference(f'{tool}, {name}' if name else tool, one.intrinsics - true, error)
+                   for tool, one in stated.items() for name, error in one.errors.items()]}
+
+
 def honesty_table(found: dict[str, list[Difference]]) -> list[str]:
-    """Return how many differences lie within their 95 % intervals, by tool; found: by set."""
+    """Return how many differences lie within their 95 % intervals, by tool; found: by kind."""
     tools = dict.fromkeys(one.tool for many in found.values() for one in many)
     lines = [
         f'| tool | differences | within 95 % | {" | ".join(found)} | difference / stated error, '
-        'rms | stated error of fx, px |', f'|---|{"---:|" * (len(found) + 4)}']
+        'rms | its stated error for fx, px |', f'|---|{"---:|" * (len(found) + 4)}']
     for tool in tools:
         by_set = [[one for one in many if one.tool == tool] for many in found.values()]
         every = [one for many in by_set for one in many]
         ratio = _ratios(every)
-        stated = ' / '.join(_stated(many) for many in by_set)
+        stated = ' / '.join(map(_stated, by_set))
         lines.append(
             f'| {tool} | {ratio.size} | {_share(every)} | {" | ".join(map(_share, by_set))} | '
             f'{np.sqrt((ratio**2).mean()):.2f} | {stated} |')
@@ -139,4 +154,4 @@ def _share(many: list[Difference]) -> str:
 
 
 def _stated(many: list[Difference]) -> str:
-    return f'{np.nanmedian([one.error[0] for one in many]) / np.sqrt(2):.2f}' if many else '-'
+    return f'{np.nanmedian([one.error[0] for one in many]):.2f}' if many else '-'

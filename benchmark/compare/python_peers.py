@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import redirect_stdout
+from io import StringIO
+from multiprocessing import get_context
 from typing import Any
 
 import cv2
@@ -110,15 +115,34 @@ def lensboy_model(config: Callable[[Any, Set], Any]) -> Fit:
 
         frames = [lensboy.Frame(np.searchsorted(on_board, grid_numbers(points, grid)), uv)
                   for points, uv in zip(*board_points(data.train, grid, start), strict=True)]
-        try:
-            found = lensboy.calibrate_camera(square[on_board], frames, config(lensboy, data))
-        except (cv2.error, RuntimeError, ValueError) as reason:
-            raise NotHereError(f'finds no lens: {reason}') from reason
-        board = found.target_warp.warp_target(square).reshape(grid.width, grid.width, 3)
-        return [Fitted(lambda xyz: found.camera_model.project_points(np.ascontiguousarray(xyz)),
-                       lambda table: warped_places(table, grid, board), before=PLANE_LIMIT)]
+        # In a process of its own, which may crash: splines do where a fit diverges.
+        with ProcessPoolExecutor(1, mp_context=get_context('spawn')) as pool:
+            try:
+                camera, warp = pool.submit(
+                    _lensboy_fit, square[on_board], frames, config(lensboy, data)).result()
+            except (cv2.error, BrokenProcessPool, RuntimeError, ValueError) as reason:
+                raise NotHereError(f'finds no lens: {reason}') from reason
+        board = warp.warp_target(square).reshape(grid.width, grid.width, 3)
+
+        def project(xyz: Array) -> Array:
+            before = np.isfinite(xyz).all(axis=1) & (xyz[:, 2] > 0)
+            uv = np.full((len(xyz), 2), np.nan)
+            uv[before] = camera.project_points(xyz[before])
+            return uv
+
+        return [Fitted(project, lambda table: warped_places(table, grid, board),
+                       before=PLANE_LIMIT)]
 
     return installed(fit)
+
+
+def _lensboy_fit(*asked: Any) -> tuple[Any, Any]:
+    """Return camera and warp as lensboy fits them, which prints each of its passes."""
+    import lensboy
+
+    with redirect_stdout(StringIO()):
+        found = lensboy.calibrate_camera(*asked)
+    return found.camera_model, found.target_warp
 
 
 def _opencv(terms: str) -> Callable[[Any, Set], Any]:

@@ -142,8 +142,8 @@ def test_differences_are_counted_beside_their_errors():
              'b': [Difference('tool', 0 * ones, np.array([1.0, 1.0, 1.0, np.nan])),
                    Difference('other', 2 * ones, ones)]}
     lines = honesty_table(found)
-    assert lines[2] == '| tool | 7 | 86 % | 75 % | 100 % | 1.28 | 0.71 / 0.71 |'
-    assert lines[3] == '| other | 4 | 0 % | - | 0 % | 2.00 | - / 0.71 |'
+    assert lines[2] == '| tool | 7 | 86 % | 75 % | 100 % | 1.28 | 1.00 / 1.00 |'
+    assert lines[3] == '| other | 4 | 0 % | - | 0 % | 2.00 | - / 1.00 |'
 
 
 def test_halves_are_pooled():

@@ -14,7 +14,7 @@ def test_a_shift_is_found_beside_local_errors():
 
 
 def test_a_set_is_what_it_says():
-    (table, shift, bend), same = draw_set(4), draw_set(4)
+    (table, shift, bend, _), same = draw_set(4), draw_set(4)
     assert (shift, bend) == (3e-3, 4e-4)
     assert (table.uv == same.table.uv).all()
     assert 14 < len(table.frames) < 35
