@@ -127,7 +127,8 @@ def lensboy_model(config: Callable[[Any, Set], Any]) -> Fit:
         def project(xyz: Array) -> Array:
             before = np.isfinite(xyz).all(axis=1) & (xyz[:, 2] > 0)
             uv = np.full((len(xyz), 2), np.nan)
-            uv[before] = camera.project_points(xyz[before])
+            if before.any():
+                uv[before] = camera.project_points(xyz[before])
             return uv
 
         return [Fitted(project, lambda table: warped_places(table, grid, board),
