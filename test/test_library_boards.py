@@ -11,7 +11,7 @@ from helpers.photographs import BOARD, LENS, photograph, poses, true_corners, wr
 
 import fisheye_svp_ros as fsvp
 from fisheye_svp_ros import cli
-from fisheye_svp_ros.commands import outputs
+from fisheye_svp_ros.commands import notes
 from fisheye_svp_ros.commands.watch import _display_unit
 from fisheye_svp_ros.library_results import Budgeted
 
@@ -113,6 +113,6 @@ def test_the_note_on_formats_comes_once_a_day(
 ) -> None:
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     monkeypatch.setattr('fisheye_svp_ros.io.columns.arrow', lambda: (None, 'no Parquet'))
-    outputs.note_formats()
-    outputs.note_formats()
+    notes.note_formats()
+    notes.note_formats()
     assert capsys.readouterr().err.count('no Parquet') == 1

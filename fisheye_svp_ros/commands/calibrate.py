@@ -18,14 +18,8 @@ from fisheye_svp_ros.commands.detect import (
     search_options,
 )
 from fisheye_svp_ros.commands.lenses import add_port_arguments, load_with_notes, port_of
-from fisheye_svp_ros.commands.outputs import (
-    counted,
-    note_gross_errors,
-    note_huge,
-    output_file,
-    output_path,
-    say,
-)
+from fisheye_svp_ros.commands.notes import counted, note_gross_errors, note_huge, say
+from fisheye_svp_ros.commands.outputs import output_file, output_path
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, ParameterError
 from fisheye_svp_ros.io.files import write_json, write_text, write_together
 from fisheye_svp_ros.io.lens_files import save_lens

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from fisheye_svp_ros.commands.node_sweeps import start_in_step, values
-from fisheye_svp_ros.commands.outputs import note_formats, output_folder
+from fisheye_svp_ros.commands.notes import note_formats
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.processes import Processes, missing_rclpy
 from fisheye_svp_ros.errors import OutputError
 from fisheye_svp_ros.io.bags import Bag

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fisheye_svp_ros.commands.outputs import output_file, output_folder, say
+from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.outputs import output_file, output_folder
 from fisheye_svp_ros.detect.finders import DETECTORS
 from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
 from fisheye_svp_ros.errors import ParameterError

@@ -22,13 +22,8 @@ from fisheye_svp_ros.commands.lenses import (
     lenses_of,
     load_lenses,
 )
-from fisheye_svp_ros.commands.outputs import (
-    note_copies,
-    note_huge,
-    note_left_out,
-    note_unconnected,
-    output_folder,
-)
+from fisheye_svp_ros.commands.notes import note_copies, note_huge, note_left_out, note_unconnected
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.plan import view_count, view_limits
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.csv_files import write_table

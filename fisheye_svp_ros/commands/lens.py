@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from fisheye_svp_ros.commands.lenses import load_with_notes
-from fisheye_svp_ros.commands.outputs import output_file, say
+from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.outputs import output_file
 from fisheye_svp_ros.effects.extension import LANDMARKS
 from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.errors import ParameterError

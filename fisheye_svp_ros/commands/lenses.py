@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fisheye_svp_ros.commands.outputs import say
+from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.effects.ray_effects import DomePortEffect
 from fisheye_svp_ros.errors import LensError, ParameterError
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file

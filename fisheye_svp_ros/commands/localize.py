@@ -14,13 +14,8 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.commands.detect import add_observation_arguments, read_input
 from fisheye_svp_ros.commands.lenses import add_lens_argument, lenses_of, load_lenses
-from fisheye_svp_ros.commands.outputs import (
-    note_doubtful,
-    note_gross_errors,
-    note_left_out,
-    output_folder,
-    say,
-)
+from fisheye_svp_ros.commands.notes import note_doubtful, note_gross_errors, note_left_out, say
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.csv_files import write_table

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fisheye_svp_ros.commands.outputs import say
+from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.commands.processes import Processes
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io.parameters import SWEEP, parameters_of, read_parameter_file, rows

@@ -10,7 +10,8 @@ import numpy as np
 
 from fisheye_svp_ros.commands.detect import image_size, positive_count
 from fisheye_svp_ros.commands.lenses import load_with_notes
-from fisheye_svp_ros.commands.outputs import output_folder, say
+from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError

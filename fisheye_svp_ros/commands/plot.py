@@ -6,9 +6,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from fisheye_svp_ros.commands.outputs import output_folder, say
+from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.errors import OutputError
-from fisheye_svp_ros.io.bags import Bag, is_recording
+from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import read_columns
 from fisheye_svp_ros.io.files import write_together
 from fisheye_svp_ros.io.recording import (
@@ -19,6 +20,7 @@ from fisheye_svp_ros.io.recording import (
     residual_sets,
     tabulate,
 )
+from fisheye_svp_ros.io.recording_files import is_recording
 from fisheye_svp_ros.reporting.terminal import progress
 
 _FIELDS = 4  # residual fields a lens

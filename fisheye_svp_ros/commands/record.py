@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> None:
 
 def _sweep(name: str, bag: Path) -> None:
     from fisheye_svp_ros.commands.node_sweeps import read_sweep, record_sweep
-    from fisheye_svp_ros.commands.outputs import counted, say
+    from fisheye_svp_ros.commands.notes import counted, say
     from fisheye_svp_ros.io.bags import Bag
     from fisheye_svp_ros.reporting.terminal import progress
 
@@ -61,7 +61,7 @@ def _sweep(name: str, bag: Path) -> None:
 
 
 def _record(args: argparse.Namespace) -> None:
-    from fisheye_svp_ros.commands.outputs import say
+    from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.io.bags import BagWriter
 
     with ending_quietly():

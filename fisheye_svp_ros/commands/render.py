@@ -10,7 +10,8 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.commands.lenses import load_with_notes
-from fisheye_svp_ros.commands.outputs import output_folder, say
+from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.errors import GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.files import write_together

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from fisheye_svp_ros.commands.executors import dask, process_pool
 from fisheye_svp_ros.commands.node_sweeps import read_sweep
-from fisheye_svp_ros.commands.outputs import counted, note_formats, output_folder, say
+from fisheye_svp_ros.commands.notes import counted, note_formats, say
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.errors import OutputError, ParameterError
 from fisheye_svp_ros.io.columns import TableParts, as_numbers, read_columns
 from fisheye_svp_ros.io.files import (

@@ -6,7 +6,8 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
-from fisheye_svp_ros.commands.outputs import note_formats, output_folder, say
+from fisheye_svp_ros.commands.notes import note_formats, say
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import write_columns

@@ -11,7 +11,8 @@ import numpy as np
 
 from fisheye_svp_ros.commands.detect import image_size
 from fisheye_svp_ros.commands.lenses import Lenses, lenses_of, load_lenses
-from fisheye_svp_ros.commands.outputs import output_folder, say
+from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.detect.photographs import (
     IMAGES,
     count_photographs,

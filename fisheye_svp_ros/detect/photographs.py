@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from fisheye_svp_ros.detect.image_messages import image_pixels
 from fisheye_svp_ros.errors import ObservationError
-from fisheye_svp_ros.io.bags import Bag, is_recording
+from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.files import read_bytes
+from fisheye_svp_ros.io.recording_files import is_recording
 from fisheye_svp_ros.scene.observations import STEREO
 
 Pixels = NDArray[Any]  # (H, W), uint8 or uint16, grey

@@ -5,13 +5,12 @@ They are written so that a crash loses what came since the last flush only.
 
 from __future__ import annotations
 
-import re
 import struct
 import tempfile
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache
 from io import BytesIO
 from pathlib import Path
@@ -32,7 +31,6 @@ from rosbags.rosbag2.storage_mcap import McapWriter, write_channel, write_string
 from rosbags.typesys import Stores, get_typestore
 
 from fisheye_svp_ros.errors import BagError
-from fisheye_svp_ros.io.files import read_yaml
 from fisheye_svp_ros.io.mcap import (
     MAX_BYTES,
     RawMessage,
@@ -41,8 +39,8 @@ from fisheye_svp_ros.io.mcap import (
     listed_topics,
     whole_messages,
 )
+from fisheye_svp_ros.io.recording_files import metadata_topics, recording_files
 
-_SUFFIXES = ('.mcap', '.db3', '.mcap.zstd', '.db3.zstd')
 _ZSTD = b'\x28\xb5\x2f\xfd'  # CDR begins with 0
 _EXPANDS = 1000  # times the size of a file, at most
 _BLOCK_BYTES = 1 << 20  # bytes
@@ -50,27 +48,6 @@ _MAX_LISTED = 3  # places of damage
 _DEPTH = 100  # messages that a player offers to send again, of latched topics as well
 _CHECKSUM = 9 + 3 * 8  # bytes from the start of a chunk to its checksum
 _UNLIMITED_TIME = QosTime(9223372036, 854775807)  # as rmw has it
-
-
-def is_recording(path: Path) -> bool:
-    """Say whether a path is called as a file of a recording is, or a folder with one in it."""
-    return bool(_files_in(path)) if path.is_dir() else path.name.lower().endswith(_SUFFIXES)
-
-
-def recording_files(path: Path) -> list[Path]:
-    """Return the files of a recording, by the numbers in their names; a file is one, whatever."""
-    return sorted(_files_in(path) if path.is_dir() else [path], key=lambda file: [
-        (int(word), '') if word.isdecimal() else (0, word)
-        for word in re.split(r'(\d+)', file.name)])
-
-
-def metadata_topics(folder: Path) -> set[tuple[str, str]]:
-    """Return the topics and types that the metadata of a recording lists; empty without."""
-    with suppress(BagError, KeyError, TypeError):
-        known = read_yaml(folder / 'metadata.yaml', BagError)['rosbag2_bagfile_information']
-        topics = [topic['topic_metadata'] for topic in known['topics_with_message_count']]
-        return {(str(topic['name']), str(topic['type'])) for topic in topics}
-    return set()
 
 
 @contextmanager
@@ -103,12 +80,6 @@ def unpacked_message(data: bytes) -> bytes:
     if zstandard.frame_content_size(data) > MAX_BYTES:
         raise ValueError(f'it is compressed from more than {MAX_BYTES} bytes')
     return zstandard.ZstdDecompressor().decompress(data, max_output_size=MAX_BYTES)
-
-
-def _files_in(folder: Path) -> list[Path]:
-    """Return the files of a recording; of one that is there both ways, as it plays, the plain."""
-    files = [file for file in folder.iterdir() if file.name.endswith(_SUFFIXES)]
-    return [file for file in files if file.suffix != '.zstd' or file.with_suffix('') not in files]
 
 
 def _unpack(file: Path, whole: Path) -> None:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError
-from fisheye_svp_ros.io.bags import is_recording
 from fisheye_svp_ros.io.csv_files import (
     FramePoses,
     read_poses,
@@ -21,6 +20,7 @@ from fisheye_svp_ros.io.csv_files import (
     write_poses,
 )
 from fisheye_svp_ros.io.files import path_of, read_json
+from fisheye_svp_ros.io.recording_files import is_recording
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.registry import Registry
 from fisheye_svp_ros.scene.observations import Observations

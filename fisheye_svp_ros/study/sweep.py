@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.parameters import SWEEP, Sweep, rows, sweep_of, with_values
-from fisheye_svp_ros.io.recording import Columns
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views, views_of
@@ -49,6 +48,9 @@ from fisheye_svp_ros.study.solutions import (
     measure_points,
     solve_rigs,
 )
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.io.recording import Columns
 
 _SETS_PER_SOLVE = 512  # sets solved at once: more take more memory and no less time
 

@@ -14,7 +14,7 @@ from helpers.surround import CAMERAS, LENS, NOISE, RIG, photographs
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands.calibrate import fit_rig, print_rig, write_rig
-from fisheye_svp_ros.commands.outputs import note_unconnected
+from fisheye_svp_ros.commands.notes import note_unconnected
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
 from fisheye_svp_ros.io.rig_files import (

@@ -18,7 +18,7 @@ from helpers.nodes import hears_sigint, until
 from helpers.targets import plane, poses_around
 
 from fisheye_svp_ros import __version__, cli, commands
-from fisheye_svp_ros.commands.outputs import note_doubtful, note_gross_errors
+from fisheye_svp_ros.commands.notes import note_doubtful, note_gross_errors
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_files import CsvTable
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens

@@ -1,0 +1,114 @@
+"""What a command has to say beside its results, on standard error."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fisheye_svp_ros.scene.observations import frame_name, list_frames
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.scene.observations import Observations
+    from fisheye_svp_ros.solve.outliers import Outliers
+
+_MAX_SIMILAR_NOTES = 3  # frames whose reasons differ by numbers alone; of more, the first only
+_DAY = 86_400.0  # s
+_DIGITS = re.compile(r'\d')
+_MAX_TARGET_SIZE = 20.0  # m; a target larger than this was measured in other units
+
+
+def say(note: str) -> None:
+    """Print a note."""
+    print(f'fisheye-svp: note: {note}', file=sys.stderr)
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number of things, one of them in the singular."""
+    return f'{count} {noun}' if count == 1 else f'{count} {noun}s'
+
+
+def note_formats() -> None:
+    """Say it where tables come in one form only, once a day."""
+    from fisheye_svp_ros.io.columns import arrow
+
+    _, problem = arrow()
+    if not problem:
+        return
+    home = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache')
+    mark = home / 'fisheye_svp_ros' / 'no_parquet.said'
+    with suppress(OSError):  # said each time where no mark can be kept
+        if mark.exists() and time.time() - mark.stat().st_mtime < _DAY:
+            return
+        mark.parent.mkdir(parents=True, exist_ok=True)
+        mark.touch()
+    say(problem)
+
+
+def note_left_out(table: Observations, frames: Sequence[int]) -> None:
+    """Name the frames of a table that could not be posed, if there are any."""
+    if frames:
+        say('left out, their points do not determine a pose (all near one line, or of another '
+            f'lens?): {list_frames(table, frames)}')
+
+
+def note_copies(table: Observations, frames: Sequence[int]) -> None:
+    """Name the frames of a table that are other frames once more, if there are any."""
+    if frames:
+        say('left out, their image points repeat those of an earlier frame: '
+            f'{list_frames(table, frames)}')
+
+
+def note_huge(table: Observations) -> None:
+    """Ask for the unit of a target that is larger than targets are."""
+    across = float((table.xyz.max(axis=0) - table.xyz.min(axis=0)).max())
+    if across > _MAX_TARGET_SIZE:
+        say(f'the target is {across:.0f} m across; x, y, z must be in m, not in mm')
+
+
+def note_gross_errors(table: Observations, gross: Outliers) -> None:
+    """Say how many rows of a table are set aside, and which are furthest off."""
+    if len(gross.rows):
+        worst = ', '.join(
+            f'{frame_name(table, int(table.frame[gross.rows[i]]))} landmark '
+            f'{table.landmark[gross.rows[i]]} '
+            f'({gross.px[i]:.1f} px)' for i in (-gross.px).argsort()[:3])
+        frames = table.frame[gross.rows]
+        whole = [frame for frame in dict.fromkeys(frames.tolist())
+                 if (frames == frame).sum() == (table.frame == frame).sum()]
+        views = (f'; all points of {list_frames(table, whole)} are outliers: check their order'
+                 if whole else '')
+        say(f'{len(gross.rows)} of {len(table)} points are outliers and are rejected, '
+            f'furthest {worst}{views}')
+
+
+def note_doubtful(
+    table: Observations, frames: Sequence[int], reasons: Sequence[str]
+) -> None:
+    """Name the frames of a table whose poses should not be relied on as they are, and why."""
+    alike: dict[str, list[tuple[int, str]]] = {}
+    for frame, reason in zip(frames, reasons, strict=True):
+        if reason:
+            alike.setdefault(_DIGITS.sub('', reason), []).append((frame, reason))
+    for doubtful in alike.values():
+        shown = len(doubtful) if len(doubtful) <= _MAX_SIMILAR_NOTES else 1
+        for frame, reason in doubtful[:shown]:
+            say(f'{frame_name(table, frame)}: {reason}')
+        if rest := [frame for frame, _ in doubtful[shown:]]:
+            say(f'{list_frames(table, rest)}: likewise')
+
+
+def note_unconnected(table: Observations) -> None:
+    """Say which cameras share no frame with others, so that nothing relates them."""
+    from fisheye_svp_ros.solve.rig_calibration import connected_cameras
+
+    first, *others = connected_cameras(table)
+    for group in others:
+        say(f'{" and ".join(group)}: no frame shared with {" and ".join(first)}, so their '
+            'relative pose is not estimated, and no rig.yaml is written')
+        first += group
