@@ -38,13 +38,22 @@ def pair() -> Simulated:
         lens='fish214', radius=0.5, style='vergent', noise_px=0.2, poses_file='calibration')
 
 
-def test_importing_loads_nothing_else() -> None:
-    code = ('import sys, fisheye_svp_ros as f; dir(f); f.__version__; '
+RECORDINGS = ('rosbags', 'mcap', 'apsw', 'zstandard')
+
+
+@pytest.mark.parametrize(('statement', 'heavy'), [
+    ('import fisheye_svp_ros as f; dir(f); f.__version__',
+     ('numpy', 'scipy', 'matplotlib', 'numba', 'pyarrow', 'yaml', 'cv2', *RECORDINGS)),
+    ('import fisheye_svp_ros.commands.paper', ('numpy',)),
+    ('import fisheye_svp_ros.library, fisheye_svp_ros.commands.sweep', RECORDINGS),
+])
+def test_what_is_not_needed_is_not_loaded(statement: str, heavy: tuple[str, ...]) -> None:
+    code = (f'import sys; {statement}; '
             'print(sorted({m.partition(".")[0] for m in sys.modules}))')
     loaded = subprocess.run([sys.executable, '-c', code], cwd=ROOT, check=True, text=True,
                             capture_output=True).stdout
-    for heavy in ('numpy', 'scipy', 'matplotlib', 'numba', 'rosbags', 'pyarrow', 'yaml', 'cv2'):
-        assert f"'{heavy}'" not in loaded
+    for name in heavy:
+        assert f"'{name}'" not in loaded
 
 
 def test_names_are_there_and_typed_and_no_modules() -> None:

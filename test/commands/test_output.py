@@ -175,8 +175,8 @@ def test_a_command_that_is_killed_leaves_all_or_nothing(
     begun = time.monotonic()
     assert kills.done(words('localize', given, tmp_path / 'whole')) == (0, '')
     length, outcome = time.monotonic() - begun, kills.Outcome()
-    whole = kills.files(tmp_path / 'whole')
-    assert 'localize.json' in whole
+    whole, rest = kills.files(tmp_path / 'whole')
+    assert 'localize.json' in whole and not rest
     for number, (how, part) in enumerate((
         (signal.SIGTERM, 0.5), (signal.SIGTERM, 0.95), (signal.SIGKILL, 0.9),
         (signal.SIGKILL, 0.97),
@@ -202,6 +202,6 @@ print(os.getpid())
     orphans = kills.left_running(int(lost.stdout))
     assert len(orphans) == 1
     os.kill(orphans[0], signal.SIGKILL)
-    assert kills.temporary([*kills.files(tmp_path)]) == ['.a.csv.x1.csv']
+    assert kills.files(tmp_path) == ({}, ['.a.csv.x1.csv'])
     outcome.fault('part', 'SIGKILL after 1 s')
     assert '| plan | 0 | 0 | 0 | 0 | 1 |' in kills.section({'plan': outcome}, {}, {}, 'so')
