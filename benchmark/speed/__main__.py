@@ -32,10 +32,10 @@ _PARTS = {
     'localization': localization.rows,
     'stereo': stereo.rows,
     'variants': variants.rows,
-    'growth': growth.tables,
     'nodes': nodes.tables,
     'commands': commands.tables,
     'sweeps': sweeps.tables,
+    'growth': growth.tables,
 }
 
 
@@ -46,14 +46,16 @@ def main() -> None:
     parser.add_argument('-o', '--output', type=Path, default=Path('docs/results/benchmarks.md'))
     args = parser.parse_args()
     chosen = '' if args.only == list(_PARTS) else f' --only {" ".join(args.only)}'
-    sections = []
+    sections, unfinished = [], args.output.with_name(f'{args.output.name}.part')
     with progress('measuring', len(args.only)) as advance:
         for part in args.only:
             sections += _PARTS[part]()
-            # After every part, so that Ctrl-C keeps what is measured.
+            # After every part, so that Ctrl-C keeps what is measured; the page changes at the end,
+            # since the tests, which are timed too, read it.
             text = document(f'python -m benchmark.speed{chosen}', NOISE_PX, sections)
-            write_text(args.output, text)
+            write_text(unfinished, text)
             advance()
+    unfinished.replace(args.output)
     print(args.output)
 
 
