@@ -111,7 +111,7 @@ bench: .venv-bench/ready
 	@echo "Installing what is compared into .venv-bench: some minutes, this once"
 	$(PYTHON) -m venv .venv-bench
 	.venv-bench/bin/pip install --quiet --upgrade pip
-	$(QUIETLY) .venv-bench/bin/pip install --quiet -e '.[fast$(ROS)]' -r benchmark/requirements.txt
+	$(QUIETLY) .venv-bench/bin/pip install --quiet -e '.[fast,parquet$(ROS)]' -r benchmark/requirements.txt
 	.venv-bench/bin/pip install --quiet --no-deps mrcal || echo 'mrcal: not to be had here'
 	test -d .venv-bench/mrcal || git clone --quiet --depth 1 https://github.com/dkogan/mrcal \
 		.venv-bench/mrcal || echo 'mrcal: no sources to be had; its rows are left out'

@@ -35,10 +35,8 @@ import fisheye_svp_ros as fsvp
 np.ones((500, 500)) @ np.ones((500, 500))  # BLAS starts its threads
 fsvp.calibrate(sys.argv[1], 'kannala_brandt', (1280, 800))
 """
-_TEXT = (
-    'Each once, with all cores, on the clock. A goal with × is a multiple of the row before. '
-    '"Until the lens is printed": `calibrate` computes its errors and the report after that.'
-)
+_TEXT = """Each once, with all cores, on the clock. A goal with × is a multiple of the row before.
+"Until the lens is printed": `calibrate` computes its errors and the report after that."""
 
 
 class _Work(NamedTuple):

@@ -48,7 +48,7 @@ class Growth(NamedTuple):
     make: Callable[[int], Callable[[], Any]]
 
 
-def tables(repeats: int = 5) -> list[Table]:
+def tables(repeats: int = 3) -> list[Table]:
     """Return the table."""
     use('numpy')
     header = ('work', 'that grows', 'sizes', 'time, ms', 'exponent', 'memory, MB', 'exponent')

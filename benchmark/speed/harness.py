@@ -122,6 +122,7 @@ def measure(sides: Sequence[Side], repeats: int) -> list[Timing]:
         for _ in range(repeats):
             for times, side, count in zip(seconds, sides, loops, strict=True):
                 times.append(_time(side, count) / side.work)
+                gc.collect()  # what one run leaves may be gigabytes
     return [
         Timing(side.name, tuple(times), side.error(answer) if side.error else None, side.note)
         for side, times, answer in zip(sides, seconds, answers, strict=True)

@@ -41,7 +41,7 @@ def _kannala_brandt(views: int, repeats: int) -> Row:
         name: partial(_peer, name, *peer, scene, off) for name, peer in _PEERS.items()
     }
     return _row(scene, 'SVP Kannala-Brandt', makers, repeats,
-                [('numpy', OPENCV, 4), ('numba', OPENCV, 20)])
+                [('numpy', OPENCV, 4), ('numba', OPENCV, 20), ('numpy, own start', OPENCV, 1.5)])
 
 
 def _stereographic(views: int, repeats: int) -> Row:
