@@ -66,7 +66,7 @@ class Cause:
         return self.effect_class.budget_stage()
 
     @property
-    def parts(self) -> list[str]:
+    def members(self) -> list[str]:
         """What its parameters are of (PART.NAME): single boards or landmarks, say."""
         return list(dict.fromkeys(name.partition('.')[0] for name in self.parameters))
 

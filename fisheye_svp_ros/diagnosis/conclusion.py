@@ -116,12 +116,12 @@ def _use_causes(evaluation: Evaluation, causes: Sequence[Cause]) -> list[Advice]
     of_target = [cause for cause in causes if cause.stage == 'target']
     gain = gains['named'].value - max(gains['lens'].value, 0.0)
     if of_target and gain > 0:
-        boards = {int(part[5:]) for cause in of_target for part in cause.parts
+        boards = {int(part[5:]) for cause in of_target for part in cause.members
                   if part.startswith('board') and part[5:].isdigit()}
         advice.append(Advice(
             'measure the board, or flatten or replace it', boards=sorted(boards), gain=gain,
             landmarks=[int(part) for cause in causes
-                       if cause.effect_class.target_map == 'single' for part in cause.parts]))
+                       if cause.effect_class.target_map == 'single' for part in cause.members]))
     return advice
 
 
@@ -361,7 +361,7 @@ def _largest_error(evaluation: Evaluation, causes: Sequence[Cause]) -> str:
         which = f'board {one.board}' if len(maps) > 1 else 'the board'
         return f'{which} is bent by {1e3 * one.peak_to_valley:.2g} mm'
     if worst.effect == 'landmark_survey':
-        count = len(worst.parts)
+        count = len(worst.members)
         return f'{count} landmark{"s are" if count > 1 else " is"} displaced'
     if worst.effect == 'landmark_scale':
         most = max((abs(p['value']) for p in worst.parameters.values()), default=0.0)

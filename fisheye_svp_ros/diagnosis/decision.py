@@ -30,7 +30,7 @@ class Figure(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Bound:
+class EffectBound:
     """The largest size of an effect that these data do not exclude (95 %).
 
     z: the estimate over its standard error; edge_px, edge_mrad: what that size costs at the edge
@@ -53,7 +53,7 @@ class Decision:
     why: str
     figure: Figure
     confidence: float | None
-    bound: list[Bound] = field(default_factory=list)
+    bound: list[EffectBound] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
@@ -127,7 +127,7 @@ class LensFacts(NamedTuple):
     named_gain: tuple[float, float]
     file: FileFigure
     offset: LensOffset | None
-    bounds: list[Bound]
+    bounds: list[EffectBound]
     noise_px: float
     falling: bool
     frames: int
@@ -189,7 +189,7 @@ def _doubt(facts: LensFacts, gained: Figure) -> Decision | None:
     return Decision('undecided', why, gained, sure, bounds)
 
 
-def _keep_text(bounds: Sequence[Bound], off: LensOffset | None) -> str:
+def _keep_text(bounds: Sequence[EffectBound], off: LensOffset | None) -> str:
     worst = max(bounds, key=lambda one: one.edge_px, default=None)
     cost = '' if worst is None else (
         f'; effects that these data do not exclude cause at most {worst.edge_px:.2g} px '

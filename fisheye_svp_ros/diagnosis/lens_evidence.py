@@ -14,7 +14,12 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
     noise_ratio,
     sum_squares,
 )
-from fisheye_svp_ros.diagnosis.decision import Bound, FileFigure, LensOffset, least_likely_offset
+from fisheye_svp_ros.diagnosis.decision import (
+    EffectBound,
+    FileFigure,
+    LensOffset,
+    least_likely_offset,
+)
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.model_errors import mask_shared
 from fisheye_svp_ros.diagnosis.null_model import NullModel
@@ -113,7 +118,7 @@ def _shared_values(evaluation: Evaluation) -> tuple[Array, Array]:
     return now, given
 
 
-def find_bounds(null: NullModel) -> list[Bound]:
+def find_bounds(null: NullModel) -> list[EffectBound]:
     """Return how large effects that are not in the model may be, the target free as well."""
     columns, prior = [null.included_columns], [np.zeros(null.column_count)]
     smallest: dict[str, tuple[Effect, Index]] = {}
@@ -132,7 +137,7 @@ def find_bounds(null: NullModel) -> list[Bound]:
 
 def _effect_bound(
     null: NullModel, effect: Effect, mine: Index, every: Index, prior: Array
-) -> Bound:
+) -> EffectBound:
     information, count, scale = null.information, len(mine), null.scale[mine]
     inverse = pseudo_inverse(information[np.ix_(every, every)] + np.diag(prior), 1e-13)
     value = (inverse @ information[every, -1])[-count:] / scale
@@ -143,7 +148,7 @@ def _effect_bound(
     largest = size + _NORMAL_95 * error
     way = value / size if size > error else vectors[:, -1]
     px, mrad = _edge_cost(null, (null.fixed.border[..., mine] * scale) @ (largest * way))
-    return Bound(effect.name, largest, effect.parameters[0].unit, z, px, mrad)
+    return EffectBound(effect.name, largest, effect.parameters[0].unit, z, px, mrad)
 
 
 def _edge_cost(null: NullModel, moves: Array) -> tuple[float, float]:

@@ -11,7 +11,7 @@ import pytest
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.conclusion import _largest_error, _measure_landmarks
 from fisheye_svp_ros.diagnosis.decision import (
-    Bound,
+    EffectBound,
     FileFigure,
     LensFacts,
     LensOffset,
@@ -26,8 +26,8 @@ from fisheye_svp_ros.diagnosis.decision import (
 BETTER = FileFigure(0.123, 0.081, 0.75, 0.6, 0.84, 1.0)
 WORSE = FileFigure(0.337, 0.345, -0.4, -0.8, -0.05, 0.03)
 SAME = FileFigure(0.1, 0.1, 0.01, -0.2, 0.2, 0.55)
-SMALL = Bound('viewpoint_shift', 0.0004, 'm', 0.7, 0.02, 0.05)
-LIKELY = Bound('viewpoint_shift', 0.0092, 'm', 2.6, 0.32, 0.58)
+SMALL = EffectBound('viewpoint_shift', 0.0004, 'm', 0.7, 0.02, 0.05)
+LIKELY = EffectBound('viewpoint_shift', 0.0092, 'm', 2.6, 0.32, 0.58)
 SOUND = LensFacts(
     [], [], False, (0.0, 0.0), SAME, LensOffset(0.3, 0.8, 0.6, 0.1), [SMALL], 0.05, True, 12)
 
@@ -149,7 +149,7 @@ def test_enough_photographs_with_a_large_error_say_where_it_is_from() -> None:
 
 def test_all_that_is_likely_is_named() -> None:
     """Of three effects that are alike, only one was."""
-    tilt = Bound('sensor_tilt', 0.002, 'rad', 2.7, 0.31, 0.6)
+    tilt = EffectBound('sensor_tilt', 0.002, 'rad', 2.7, 0.31, 0.6)
     found = decide_lens(SOUND._replace(bounds=[LIKELY, SMALL, tilt]))
     assert found.say == 'undecided'
     assert 'viewpoint_shift or sensor_tilt, which may cause up to 0.32 px' in found.why

@@ -23,7 +23,7 @@ from fisheye_svp_ros.diagnosis import (
     diagnose,
 )
 from fisheye_svp_ros.diagnosis.causes import UnconfirmedCause
-from fisheye_svp_ros.diagnosis.decision import Bound, Figure
+from fisheye_svp_ros.diagnosis.decision import EffectBound, Figure
 from fisheye_svp_ros.diagnosis.variance_budget import Structure
 from fisheye_svp_ros.reporting.cause_text import percent, size
 from fisheye_svp_ros.reporting.diagnosis_plots import point_residuals
@@ -62,8 +62,8 @@ def test_a_rise_is_warned_of_where_it_is_one(
 
 def test_bounds_are_read_in_percent_and_millimetres(found: Diagnosis) -> None:
     """A decentering "up to 0.0012" told nobody anything."""
-    bounds = [Bound('decentering', 0.0012, '1', 0.7, 0.02, 0.05),
-              Bound('viewpoint_shift', 0.0004, 'm', 0.7, 0.02, 0.05)]
+    bounds = [EffectBound('decentering', 0.0012, '1', 0.7, 0.02, 0.05),
+              EffectBound('viewpoint_shift', 0.0004, 'm', 0.7, 0.02, 0.05)]
     said = first_screen(_deciding(found, 'lens', bound=bounds), 'table').bound
     assert 'decentering up to 0.12 % (' in said
     assert 'viewpoint_shift up to 0.4 mm (' in said

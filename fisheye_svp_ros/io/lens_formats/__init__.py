@@ -54,7 +54,7 @@ class Foreign(NamedTuple):
     cameras: tuple[str, ...] = ()
 
     @classmethod
-    def of(
+    def from_lenses(
         cls, form: str, found: Mapping[str, tuple[Lens, float]], rigs: Sequence[Pose] = ()
     ) -> Foreign:
         """Return what a file holds; found: each lens with how far it is from the file, px."""

@@ -41,7 +41,7 @@ def read(text: str, where: str) -> Foreign:
     found = {f'cam{i}': _lens(f'cam{i}', camera, size, f'{where}: camera {i}')
              for i, (camera, size) in enumerate(zip(cameras, sizes, strict=True))}
     rigs = _rigs(fields.sections({'T_imu_cam': [], **document}, 'T_imu_cam', where), where)
-    return Foreign.of('Basalt', found, rigs)
+    return Foreign.from_lenses('Basalt', found, rigs)
 
 
 def _lens(name: str, camera: Mapping[str, Any], size: Any, where: str) -> tuple[Lens, float]:

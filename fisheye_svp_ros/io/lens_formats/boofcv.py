@@ -24,5 +24,5 @@ def read(text: str, where: str) -> Foreign:
     k = fields.numbers(distortion, 'radial', len(listed) if isinstance(listed, list) else 2, place)
     tangential = fields.values({'t1': 0.0, 't2': 0.0, **distortion}, ('t1', 't2'), place)
     bent = models.Distortion(models.omnidirectional(offset), k, (), tangential)
-    return Foreign.of('BoofCV', {
+    return Foreign.from_lenses('BoofCV', {
         'camera': models.nearest_lens('camera', size, intrinsics, bent, where)})

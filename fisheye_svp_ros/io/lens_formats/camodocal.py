@@ -44,5 +44,5 @@ def read(text: str, where: str) -> Foreign:
             values('distortion_parameters', ('k1', 'k2', 'p1', 'p2')), base)
     size = fields.values(document, ('image_width', 'image_height'), where)
     name = str(document.get('camera_name', 'camera'))
-    return Foreign.of('CamOdoCal', {
+    return Foreign.from_lenses('CamOdoCal', {
         name: models.nearest_lens(name, size, intrinsics, distortion, where)})

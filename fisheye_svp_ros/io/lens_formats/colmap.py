@@ -85,7 +85,7 @@ def read(text: str, where: str) -> Foreign:
             raise LensError(f'{place}: width, height and the parameters of {model} must be '
                             f'numbers ({cause})') from cause
         found[camera] = _lens(f'camera{camera}', model, (width, height), values, place)
-    return Foreign.of('COLMAP', found)
+    return Foreign.from_lenses('COLMAP', found)
 
 
 def _lens(

@@ -33,6 +33,6 @@ def read(text: str, where: str) -> Foreign:
     else:
         raise LensError(f'{where}: distortion_model is {kind!r}; equidistant and '
                         'radial-tangential can be read')
-    return Foreign.of('EuRoC', {'camera': models.nearest_lens(
+    return Foreign.from_lenses('EuRoC', {'camera': models.nearest_lens(
         'camera', fields.numbers(document, 'resolution', 2, where),
         fields.numbers(document, 'intrinsics', 4, where), distortion, where)})

@@ -38,7 +38,7 @@ def read(text: str, where: str) -> Foreign:
                 raise LensError(f'{where}: {names[len(rigs) + 1]} has no T_cn_cnm1, and {name} '
                                 'after it has one; the chain is broken')
             rigs.append(_rig(camera['T_cn_cnm1'], f'{where}: {name}'))
-    return Foreign.of('Kalibr', found, rigs)
+    return Foreign.from_lenses('Kalibr', found, rigs)
 
 
 def _lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float]:

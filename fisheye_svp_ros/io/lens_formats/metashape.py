@@ -32,7 +32,7 @@ def read(text: str, where: str) -> Foreign:
     if not found:
         raise LensError(f'{where}: no adjusted calibration in it; align the photographs first')
     names = ['camera'] if len(found) == 1 else [f'sensor{i}' for i in range(len(found))]
-    return Foreign.of('Metashape', {
+    return Foreign.from_lenses('Metashape', {
         name: _lens(name, one, f'{where}: {name}' if len(found) > 1 else where)
         for name, one in zip(names, found, strict=True)})
 

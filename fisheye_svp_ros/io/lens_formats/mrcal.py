@@ -69,7 +69,7 @@ def read(text: str, where: str) -> Foreign:
         lens = _read_splined(model, values, size, where)
         return Foreign('mrcal', {'camera': lens}, (), {})
     if model in _PERSPECTIVE:
-        return Foreign.of('mrcal', {'camera': models.nearest_lens(
+        return Foreign.from_lenses('mrcal', {'camera': models.nearest_lens(
             'camera', size, values[:4], models.opencv_distortion(values[4:]), where)})
     if match is None:
         raise LensError(f'{where}: lensmodel is {model}; CAHVORE with its linearity, '
@@ -86,7 +86,7 @@ def read(text: str, where: str) -> Foreign:
 
     shift = Gennery(0.0, *values[9:12]) if any(values[9:12]) else None
     limit = np.pi / 2 / abs(linearity) * (1 - 1e-3) if abs(linearity) > 0.5 else np.pi * 0.999
-    return Foreign.of('mrcal', {
+    return Foreign.from_lenses('mrcal', {
         'camera': models.fit_curve('camera', size, values[:4], curve, limit, where, shift)})
 
 

@@ -35,7 +35,7 @@ def read(text: str, where: str) -> Foreign:
     else:
         found = {f'camera{i}': _lens(f'camera{i}', one, f'{where}: camera{i}')
                  for i, one in enumerate(different, start=1)}
-    return Foreign.of('nerfstudio', found)
+    return Foreign.from_lenses('nerfstudio', found)
 
 
 def _lens(name: str, given: Mapping[str, Any], where: str) -> tuple[Lens, float]:

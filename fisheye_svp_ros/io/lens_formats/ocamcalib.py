@@ -48,7 +48,7 @@ def read(text: str, where: str) -> Foreign:
     focal = float(-direct[1])
     farthest = 2 * float(np.hypot(max(row, height - row), max(column, width - column)))
     base = _heights(direct[1:], farthest)
-    return Foreign.of('OCamCalib', {'camera': models.nearest_lens(
+    return Foreign.from_lenses('OCamCalib', {'camera': models.nearest_lens(
         'camera', (width, height), (focal * fx, focal * fy, column, row, focal * skew),
         models.Distortion(base), where)})
 

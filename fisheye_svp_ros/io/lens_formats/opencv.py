@@ -71,7 +71,7 @@ def read(text: str, where: str) -> Foreign:
         turn = np.reshape(_matrix(value(('R',)), ((3, 3),), where), (3, 3))
         place = _matrix(value(('T',)), ((3, 1), (1, 3)), where)
         rigs = (fields.pose(place, turn, f'{where}: R, T'),)
-    return Foreign.of('OpenCV', pair, rigs)
+    return Foreign.from_lenses('OpenCV', pair, rigs)
 
 
 def _distortion(d: Sequence[float], document: Mapping[str, Any], where: str) -> models.Distortion:

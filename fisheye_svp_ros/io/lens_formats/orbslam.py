@@ -27,12 +27,12 @@ def read(text: str, where: str) -> Foreign:
     prefixes = {camera: next((p for p in known if f'{p}fx' in document), '')
                 for camera, known in _CAMERAS.items()}
     if not prefixes['right']:
-        return Foreign.of(
+        return Foreign.from_lenses(
             'ORB-SLAM3', {'camera': _lens('camera', prefixes['left'], document, where)})
     found = {camera: _lens(camera, prefix, document, f'{where}: {prefix.rstrip(".")}')
              for camera, prefix in prefixes.items()}
     rigs = tuple(_rig(document[name], f'{where}: {name}') for name in _STEREO if name in document)
-    return Foreign.of('ORB-SLAM3', found, rigs[:1])
+    return Foreign.from_lenses('ORB-SLAM3', found, rigs[:1])
 
 
 def _lens(

@@ -58,7 +58,7 @@ def read(text: str, where: str) -> Foreign:
         raise LensError(f'{where}: not a whole camera_info; {cause.args[0]} is missing') from cause
     except (TypeError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
-    return Foreign.of('ROS', {
+    return Foreign.from_lenses('ROS', {
         name: _fit_lens(model, size, (k[0], k[4], k[2], k[5], k[1]), tuple(d), name, where)})
 
 
@@ -74,7 +74,7 @@ def _read_message(text: str, where: str) -> Foreign:
         raise LensError(str(cause)) from cause
     except (LookupError, TypeError, ValueError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
-    return Foreign.of('ROS', {name: _fit_lens(*model, name, where)})
+    return Foreign.from_lenses('ROS', {name: _fit_lens(*model, name, where)})
 
 
 @lru_cache(maxsize=64)
