@@ -59,9 +59,10 @@ def tables() -> list[Table]:
             except subprocess.CalledProcessError as error:
                 rows.append((work.name, f'ended with {error.returncode}', '', 'no'))
                 continue
-            goal = seconds <= (work.goal or (work.times or np.inf) * before)
+            limit = work.goal or (work.times or np.inf) * before
             text = f'{work.goal:g}' if work.goal else f'{work.times:g} ×' if work.times else ''
-            rows.append((work.name, number(seconds), text, ('yes' if goal else 'no') * bool(text)))
+            met = ('yes' if seconds <= limit else 'no') if text else ''
+            rows.append((work.name, number(seconds), text, met))
             before = seconds
     absent = [path.name for path in (*(_SHARED / one for one in _CORNERS), _PHOTOGRAPHS)
               if not path.is_dir()]
