@@ -48,6 +48,7 @@ coverage: $(VENV)/ready
 		--cov-report=term:skip-covered $(PYTEST)
 
 lint: $(VENV)/ready
+	$(BIN)/ruff format --check --quiet .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache

@@ -31,7 +31,8 @@ setup(
     version='1.0.0',
     packages=find_packages(include=[package_name, f'{package_name}.*']),
     package_data={
-        package_name: ['py.typed', '*.pyi'], f'{package_name}.reporting': ['templates/*'],
+        package_name: ['py.typed', '*.pyi'],
+        f'{package_name}.reporting': ['templates/*'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
@@ -56,23 +57,37 @@ setup(
     ],
     extras_require={
         # Genuine ROS 2 Jazzy, where there are wheels of it; elsewhere an installation is sourced.
-        'ros': [f'{package}; {wheels}' for package in (
-            'ros-jazzy-rclpy[fastrtps]>=7.1.6,<7.2', 'ros-jazzy-common-interfaces>=5.3.6,<5.4',
-            'ros-jazzy-std-srvs>=5.3.6,<5.4',
-        )],
+        'ros': [
+            f'{package}; {wheels}'
+            for package in (
+                'ros-jazzy-rclpy[fastrtps]>=7.1.6,<7.2',
+                'ros-jazzy-common-interfaces>=5.3.6,<5.4',
+                'ros-jazzy-std-srvs>=5.3.6,<5.4',
+            )
+        ],
         'fast': ['numba>=0.59'],
         'parquet': ['pyarrow>=15'],
         'dask': ['distributed>=2023.7'],
         'test': [
             # pytest-xdist 3.8 does not see its groups in pytest 9.2.
-            'pytest>=7.4,<9.2', 'pytest-xdist>=3.3', 'mpmath>=1.3', 'psutil>=5.9',
-            'hypothesis>=6.80', 'pytest-cov>=4.1', 'jsonschema>=4.10', 'statsmodels>=0.14',
+            'pytest>=7.4,<9.2',
+            'pytest-xdist>=3.3',
+            'mpmath>=1.3',
+            'psutil>=5.9',
+            'hypothesis>=6.80',
+            'pytest-cov>=4.1',
+            'jsonschema>=4.10',
+            'statsmodels>=0.14',
             'pytest-rerunfailures>=12.0',
         ],
         'docs': ['sphinx>=7.2', 'myst-parser>=2.0', 'furo'],
         # mypy takes the types of NumPy 2.5, which are written for Python 3.12, for others.
         'lint': [
-            'numpy<2.5', 'ruff>=0.6', 'mypy>=1.11', 'import-linter>=2.17', 'types-PyYAML',
+            'numpy<2.5',
+            'ruff==0.17.*',
+            'mypy>=1.11',
+            'import-linter>=2.17',
+            'types-PyYAML',
             'scipy-stubs',
         ],
     },

@@ -45,10 +45,13 @@ def trial(seed: int) -> Outcome:
     shift, names = found.averaged_model.shifts, [cause.effect for cause in found.causes]
     written = getattr(found.lens.viewpoint_shift, 'e0', 0.0)
     return Outcome(
-        truth.viewpoint_shift.e0, written,  # type: ignore[union-attr]
-        shift[0].stderr if shift else 0.0, shift[0].weight if shift else 0.0,
+        truth.viewpoint_shift.e0,
+        written,  # type: ignore[union-attr]
+        shift[0].stderr if shift else 0.0,
+        shift[0].weight if shift else 0.0,
         'viewpoint_shift' in names,
-        tuple(study.ray_error(lens, truth, seen.uv) for lens in (given, named, found.lens)))
+        tuple(study.ray_error(lens, truth, seen.uv) for lens in (given, named, found.lens)),
+    )
 
 
 def report(outcomes: Sequence[Outcome], command: str) -> str:
@@ -56,19 +59,38 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
     kinds = {
         'a shift that is not named': [one for one in outcomes if one.e0 and not one.named],
         'a shift that is named': [one for one in outcomes if one.e0 and one.named],
-        'no shift': [one for one in outcomes if not one.e0], 'all': list(outcomes)}
+        'no shift': [one for one in outcomes if not one.e0],
+        'all': list(outcomes),
+    }
     rows = []
     for name, some in kinds.items():
         if some:
             errors = np.array([one.errors for one in some])
             ratio = errors[:, 1:] / errors[:, :1]
-            rows.append([name, len(some), *(
-                f'{np.exp(np.log(one).mean()):.3f} ({(one > 1.1).sum()})' for one in ratio.T)])
-    return '\n'.join([
-        '# Averaging over a viewpoint shift', '', *study.paragraph(__doc__), f'    {command}', '',
-        'Ray error over that of `calibrate`, geometric means; in brackets how many lenses are '
-        'more than 10 % worse than the one given.', '',
-        *study.table('sets | number | confirmed causes alone | as written', rows), ''])
+            rows.append(
+                [
+                    name,
+                    len(some),
+                    *(
+                        f'{np.exp(np.log(one).mean()):.3f} ({(one > 1.1).sum()})'
+                        for one in ratio.T
+                    ),
+                ]
+            )
+    return '\n'.join(
+        [
+            '# Averaging over a viewpoint shift',
+            '',
+            *study.paragraph(__doc__),
+            f'    {command}',
+            '',
+            'Ray error over that of `calibrate`, geometric means; in brackets how many lenses are '
+            'more than 10 % worse than the one given.',
+            '',
+            *study.table('sets | number | confirmed causes alone | as written', rows),
+            '',
+        ]
+    )
 
 
 def draw(path: Path, outcomes: Sequence[Outcome]) -> None:
@@ -77,26 +99,39 @@ def draw(path: Path, outcomes: Sequence[Outcome]) -> None:
         left, right = figure.subplots(1, 2)
         open_ = [one for one in outcomes if not one.named]
         for some, color, label in (
-                ([one for one in outcomes if one.named], NOISE, 'named'),
-                ([one for one in open_ if one.weight], AFTER, 'averaged'),
-                ([one for one in open_ if not one.weight], BEFORE, 'not written')):
-            left.errorbar([1e3 * one.e0 for one in some], [1e3 * one.written for one in some],
-                          [1e3 * one.stderr for one in some], fmt='o', ms=4, lw=1, color=color,
-                          label=label)
+            ([one for one in outcomes if one.named], NOISE, 'named'),
+            ([one for one in open_ if one.weight], AFTER, 'averaged'),
+            ([one for one in open_ if not one.weight], BEFORE, 'not written'),
+        ):
+            left.errorbar(
+                [1e3 * one.e0 for one in some],
+                [1e3 * one.written for one in some],
+                [1e3 * one.stderr for one in some],
+                fmt='o',
+                ms=4,
+                lw=1,
+                color=color,
+                label=label,
+            )
             before, after = (np.array([one.errors[i] for one in some]) for i in (1, 2))
             right.plot(before, after, 'o', ms=4, color=color)
         left.axline((0, 0), slope=1, color=INK, lw=0.8)
         left.set(xlabel='true e0 / mm', ylabel='e0 in the lens file / mm')
         right.axline((1, 1), slope=1, color=INK, lw=0.8)
-        right.set(xscale='log', yscale='log', xlabel='ray error, confirmed causes alone / mrad',
-                  ylabel='ray error of the lens file / mrad')
+        right.set(
+            xscale='log',
+            yscale='log',
+            xlabel='ray error, confirmed causes alone / mrad',
+            ylabel='ray error of the lens file / mrad',
+        )
         legend_below(figure, left)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Draw, diagnose and compare sets."""
     outcomes, output = study.run_sets(
-        'averaging', __doc__, trial, report, arguments, (120, 'of photographs'))
+        'averaging', __doc__, trial, report, arguments, (120, 'of photographs')
+    )
     draw(output / 'images' / 'averaging.png', outcomes)
 
 

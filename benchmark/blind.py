@@ -78,8 +78,12 @@ def load(directory: Path) -> dict[str, tuple[str, list[Outcome]]]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the trials that the command line asks for and write the report."""
-    parser = study.parser('blind', __doc__, trials=(200, 'a mode, and a size of one effect'),
-                          seed=(0, 'another seed, other trials'))
+    parser = study.parser(
+        'blind',
+        __doc__,
+        trials=(200, 'a mode, and a size of one effect'),
+        seed=(0, 'another seed, other trials'),
+    )
     parser.add_argument('--modes', nargs='+', choices=MODES, default=MODES, help='what to hide')
     asked = parser.parse_args(arguments)
     for mode in asked.modes:

@@ -29,7 +29,8 @@ def landmark_survey(scene: Scene, rng: Rng) -> Hidden:
     def truth(amount: float) -> Mapping[str, float]:
         return {
             f'{number}.{axis}': float(amount * moves[slot, i])
-            for number, slot in zip(ids, chosen, strict=True) for i, axis in enumerate('xyz')
+            for number, slot in zip(ids, chosen, strict=True)
+            for i, axis in enumerate('xyz')
         }
 
     return Hidden(1e-4, world=moved(moves), detail=f'landmarks {ids}', truth=truth)
@@ -104,7 +105,8 @@ def dot_centroid(scene: Scene, rng: Rng) -> Hidden:
         axes = plane_of(scene.points[mine])[1]
         rims[mine] = reach * np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ axes[:2]
     return Hidden(
-        5e-3, world=lambda w, a: replace(w, dots=a * rims),
+        5e-3,
+        world=lambda w, a: replace(w, dots=a * rims),
         truth=lambda a: {'radius_squared': a * a},
     )
 
@@ -112,7 +114,8 @@ def dot_centroid(scene: Scene, rng: Rng) -> Hidden:
 def rolling_shutter(scene: Scene, rng: Rng) -> Hidden:
     sign = rng.choice([-1.0, 1.0])
     return Hidden(
-        1e-4, world=lambda w, a: replace(w, readout=sign * a),
+        1e-4,
+        world=lambda w, a: replace(w, readout=sign * a),
         truth=lambda a: {'readout': sign * a},
     )
 
@@ -120,7 +123,8 @@ def rolling_shutter(scene: Scene, rng: Rng) -> Hidden:
 def stereo_time_offset(scene: Scene, rng: Rng) -> Hidden:
     sign, second = rng.choice([-1.0, 1.0]), scene.camera > 0
     return Hidden(
-        1e-4, world=lambda w, a: replace(w, times=w.times + sign * a * second),
+        1e-4,
+        world=lambda w, a: replace(w, times=w.times + sign * a * second),
         truth=lambda a: {'delay': sign * a},
     )
 
@@ -150,6 +154,7 @@ def rig_flex(scene: Scene, rng: Rng) -> Hidden:
 
 def wrong_ids(scene: Scene, rng: Rng) -> Hidden:
     """One pair of image points or more swap their ids: the amount only adds to their number."""
+
     def recorded(uv: Array, amount: float, rng: Rng) -> Array:
         uv = uv.copy()
         for _ in range(1 + rng.poisson(4 * amount / scene.noise)):
@@ -163,6 +168,7 @@ def wrong_ids(scene: Scene, rng: Rng) -> Hidden:
 
 def quantisation(scene: Scene, rng: Rng) -> Hidden:
     """Rounded to a step whose own error, step / sqrt(12), is the amount."""
+
     def recorded(uv: Array, amount: float, rng: Rng) -> Array:
         step = np.sqrt(12) * amount
         return np.asarray(np.round(uv / step) * step)
@@ -173,7 +179,8 @@ def quantisation(scene: Scene, rng: Rng) -> Hidden:
 def noise_vs_angle(scene: Scene, rng: Rng) -> Hidden:
     power = float(rng.uniform(1.5, 3.0))
     return Hidden(
-        0.1, scatter=lambda theta, a, _: (1 + a * theta**power)[..., None],
+        0.1,
+        scatter=lambda theta, a, _: (1 + a * theta**power)[..., None],
         detail=f'power {power:.1f}',
     )
 

@@ -45,8 +45,17 @@ BOARD = 'chessboard:9x6:25mm'
 NOISE = 0.0053  # px, of a corner's u and v in these photographs
 PHOTOGRAPHS = 20
 RATE = 10.0  # photographs a second, of a video
-LENS = Lens('blind', 640, 600, 214.0, 214.3, 320.4, 298.8, KannalaBrandt(-0.01, 0.004, -0.0015),
-            np.radians(94.0))
+LENS = Lens(
+    'blind',
+    640,
+    600,
+    214.0,
+    214.3,
+    320.4,
+    298.8,
+    KannalaBrandt(-0.01, 0.004, -0.0015),
+    np.radians(94.0),
+)
 PLAIN = Print(9, 6, 0.025)
 NOTHING = '-'
 
@@ -96,13 +105,17 @@ def _shift(amount: float, rng: Rng) -> World:
 def _bow(amount: float, rng: Rng) -> World:
     middle, turn = PLAIN.corners.mean(axis=0)[:2], rng.uniform(0, np.pi)
     along = np.array([np.cos(turn), np.sin(turn)])
-    return World(printed=replace(
-        PLAIN, bow=lambda place: 1e-3 * amount * (((place - middle) @ along) / 0.1) ** 2))
+    return World(
+        printed=replace(
+            PLAIN, bow=lambda place: 1e-3 * amount * (((place - middle) @ along) / 0.1) ** 2
+        )
+    )
 
 
 def _scale(amount: float, rng: Rng) -> World:
-    return World(printed=replace(
-        PLAIN, shift=lambda place: 1e-3 * amount * place * np.array([1.0, 0.0])))
+    return World(
+        printed=replace(PLAIN, shift=lambda place: 1e-3 * amount * place * np.array([1.0, 0.0]))
+    )
 
 
 def _survey(amount: float, rng: Rng) -> World:
@@ -111,8 +124,9 @@ def _survey(amount: float, rng: Rng) -> World:
 
     def shift(place: Array) -> Array:
         column, row = np.moveaxis(np.round(place / PLAIN.size), -1, 0)
-        return np.asarray(amount * off[np.clip(row, 0, 5).astype(int),
-                                       np.clip(column, 0, 8).astype(int)])
+        return np.asarray(
+            amount * off[np.clip(row, 0, 5).astype(int), np.clip(column, 0, 8).astype(int)]
+        )
 
     return World(printed=replace(PLAIN, shift=shift))
 
@@ -126,8 +140,9 @@ def _decentering(amount: float, rng: Rng) -> World:
 
     def moved(uv: Array) -> Array:
         x = _in_plane(uv)
-        return np.asarray(LENS.fx * ((x**2).sum(-1, keepdims=True) * p
-                                     + 2 * x * (x @ p)[..., None]))
+        return np.asarray(
+            LENS.fx * ((x**2).sum(-1, keepdims=True) * p + 2 * x * (x @ p)[..., None])
+        )
 
     return World(moved=moved)
 
@@ -143,8 +158,11 @@ def _tilt(amount: float, rng: Rng) -> World:
 
 
 def _skew(amount: float, rng: Rng) -> World:
-    return World(moved=lambda uv: 1e-3 * amount * np.stack(
-        [uv[..., 1] - LENS.cy, np.zeros(uv.shape[:-1])], axis=-1))
+    return World(
+        moved=lambda uv: (
+            1e-3 * amount * np.stack([uv[..., 1] - LENS.cy, np.zeros(uv.shape[:-1])], axis=-1)
+        )
+    )
 
 
 def _profile(amount: float, rng: Rng) -> World:
@@ -167,8 +185,11 @@ def _centre(amount: float, rng: Rng) -> World:
 def _step(amount: float, rng: Rng) -> World:
     du, dv = 0.1 * amount * _direction(rng)
     larger = 1 + 3e-4 * amount
-    return World(later=replace(LENS, fx=larger * LENS.fx, fy=larger * LENS.fy,
-                               cx=LENS.cx + du, cy=LENS.cy + dv))
+    return World(
+        later=replace(
+            LENS, fx=larger * LENS.fx, fy=larger * LENS.fy, cx=LENS.cx + du, cy=LENS.cy + dv
+        )
+    )
 
 
 def _shutter(amount: float, rng: Rng) -> World:
@@ -181,14 +202,22 @@ def _direction(rng: Rng) -> Array:
 
 
 HIDDEN: dict[str, Callable[[float, Rng], World]] = {
-    'viewpoint_shift': _shift, 'target_shape': _bow, 'landmark_scale': _scale,
-    'landmark_survey': _survey, 'decentering': _decentering, 'sensor_tilt': _tilt, 'skew': _skew,
-    'radial_profile': _profile, 'principal_point': _centre, 'session_step': _step,
+    'viewpoint_shift': _shift,
+    'target_shape': _bow,
+    'landmark_scale': _scale,
+    'landmark_survey': _survey,
+    'decentering': _decentering,
+    'sensor_tilt': _tilt,
+    'skew': _skew,
+    'radial_profile': _profile,
+    'principal_point': _centre,
+    'session_step': _step,
     'rolling_shutter': _shutter,
 }
 # Nothing that moves corners: photographs under these are to be found adequate.
 CLEAN: dict[str, World] = {
-    'nothing': World(), 'defocus': World(exposure=Exposure(blur=1.2, blur_edge=0.8)),
+    'nothing': World(),
+    'defocus': World(exposure=Exposure(blur=1.2, blur_edge=0.8)),
     'uneven light': World(exposure=Exposure(slope=(0.5, -0.3))),
 }
 ASIDE: dict[str, World] = {'over-exposed': World(exposure=Exposure(gain=1.4))}
@@ -232,12 +261,22 @@ def _field(world: World, lens: Lens, pose: Pose) -> Field | None:
 def photographs(effect: str, size: float, seed: int, folder: str) -> World:
     """Render the photographs of a trial into a folder; return what was done in them."""
     rng = np.random.default_rng([seed, sum(map(ord, effect))])
-    swung = swing(
-        LENS, PLAIN.corners, PLAIN.columns, np.arange(PHOTOGRAPHS) / RATE, rng,
-    ) if effect == 'rolling_shutter' else Swing(
-        board_views(LENS, PLAIN, PHOTOGRAPHS, (0.1, 0.28), rng), np.zeros((PHOTOGRAPHS, 6)))
+    swung = (
+        swing(
+            LENS,
+            PLAIN.corners,
+            PLAIN.columns,
+            np.arange(PHOTOGRAPHS) / RATE,
+            rng,
+        )
+        if effect == 'rolling_shutter'
+        else Swing(
+            board_views(LENS, PLAIN, PHOTOGRAPHS, (0.1, 0.28), rng), np.zeros((PHOTOGRAPHS, 6))
+        )
+    )
     world = (CLEAN | ASIDE).get(effect)
     if world is None:
+
         def make(amount: float) -> World:
             return HIDDEN[effect](amount, np.random.default_rng(seed))
 
@@ -280,9 +319,13 @@ def _asked(effect: str, size: float, seed: int, table: Observations, lens: Lens 
     fitted = lens or calibrate(table, 'kannala_brandt', (640, 600)).adjusted.lens
     answer = diagnose(table, fitted, free_intrinsics=lens is None)
     return Trial(
-        effect, size, seed, answer.verdict,
+        effect,
+        size,
+        seed,
+        answer.verdict,
         [[cause.effect, *cause.indistinguishable_from] for cause in answer.causes],
-        [one.variable for one in answer.remaining])
+        [one.variable for one in answer.remaining],
+    )
 
 
 def todo(trials: int, seed: int) -> list[tuple[str, int]]:
@@ -307,43 +350,68 @@ def report(trials: Sequence[Trial], size: float) -> list[str]:
     hidden = [t for t in mine if t.effect in HIDDEN]
     clean = [t for t in mine if t.effect in CLEAN]
     aside = [t for t in mine if t.effect in ASIDE]
-    counts = {e: Counter(e if e in names else names[0] for t in mine if t.effect == e
-                         for names in t.named or [[NOTHING]]) for e in (*HIDDEN, *CLEAN, *ASIDE)}
+    counts = {
+        e: Counter(
+            e if e in names else names[0]
+            for t in mine
+            if t.effect == e
+            for names in t.named or [[NOTHING]]
+        )
+        for e in (*HIDDEN, *CLEAN, *ASIDE)
+    }
     others = {name for c in counts.values() for name in c} - {*HIDDEN, NOTHING}
     columns = [*HIDDEN, *sorted(others), NOTHING]
-    rows = [[effect, sum(t.effect == effect for t in mine),
-             *(count[name] or '' for name in columns)] for effect, count in counts.items()]
+    rows = [
+        [effect, sum(t.effect == effect for t in mine), *(count[name] or '' for name in columns)]
+        for effect, count in counts.items()
+    ]
     lines = [
-        '# Blind tests through images', '',
+        '# Blind tests through images',
+        '',
         f'The effect was named in {_rate([t.hit for t in hidden])} of the sets. Unlike in '
         '[blind.md](blind.md), only',
         f'photographs are given: {PHOTOGRAPHS} of a board ({BOARD}), {LENS.width} x {LENS.height} '
         'px, rendered through a lens of',
         '94°. `detect`, `calibrate` and `diagnose` find the model error. A lens fitted without '
         'the effect',
-        f'leaves {size:g} times the noise ({NOISE} px) of it.', '',
+        f'leaves {size:g} times the noise ({NOISE} px) of it.',
+        '',
         '- `principal_point`: the lens was calibrated before it was bumped.',
         '- `rolling_shutter`: frames of a video of a swinging camera.',
         '- Defocus and uneven light count as clean: they are no errors of the lens.',
-        '- Over-exposed photographs are reported by `detect`, and have a row of their own.', '',
-        'Intervals are 95 %.', '', '```bash',
-        f'python -m benchmark.blind_images --trials {len(hidden)}', '```', '',
+        '- Over-exposed photographs are reported by `detect`, and have a row of their own.',
+        '',
+        'Intervals are 95 %.',
+        '',
+        '```bash',
+        f'python -m benchmark.blind_images --trials {len(hidden)}',
+        '```',
+        '',
         f'- effect named: {_rate([t.hit for t in hidden])}',
         f'- nothing else named: {_rate([t.hit and len(t.named) == 1 for t in hidden])}',
         f'- clean photographs found adequate: {_rate([t.verdict == "adequate" for t in clean])}',
         f'- no effect named in them: {_rate([not t.named for t in clean])}',
         '- over-exposed: `detect` reports all photographs in '
         f'{_rate([t.odd == PHOTOGRAPHS for t in aside])}; still found adequate: '
-        f'{_rate([t.verdict == "adequate" for t in aside])}', '',
-        'Trials by hidden effect (rows) and named effect (columns):', '',
+        f'{_rate([t.verdict == "adequate" for t in aside])}',
+        '',
+        'Trials by hidden effect (rows) and named effect (columns):',
+        '',
         *study.table('hidden | trials | ' + ' | '.join(columns), [row for row in rows if row[1]]),
     ]
     failed = [t for t in hidden if not t.hit] + [t for t in clean if t.verdict != 'adequate']
     if failed:
-        lines += ['', 'Every trial that failed:', '', *(
-            f'- {t.effect} #{t.seed}: {t.verdict}; named: '
-            f'{", ".join(" or ".join(names) for names in t.named) or "nothing"}; '
-            f'left: {", ".join(t.left) or "nothing"}' for t in failed)]
+        lines += [
+            '',
+            'Every trial that failed:',
+            '',
+            *(
+                f'- {t.effect} #{t.seed}: {t.verdict}; named: '
+                f'{", ".join(" or ".join(names) for names in t.named) or "nothing"}; '
+                f'left: {", ".join(t.left) or "nothing"}'
+                for t in failed
+            ),
+        ]
     return lines
 
 
@@ -356,8 +424,14 @@ def _rate(results: Sequence[bool]) -> str:
 def main() -> None:
     """Run the trials that are not there yet, and write the page."""
     args = study.parser(
-        'blind_images', __doc__, None, workers=False, trials=(100, 'with an effect (100)'),
-        size=(1.0, 'times the noise'), seed=(0, 'of the first of each effect')).parse_args()
+        'blind_images',
+        __doc__,
+        None,
+        workers=False,
+        trials=(100, 'with an effect (100)'),
+        size=(1.0, 'times the noise'),
+        seed=(0, 'of the first of each effect'),
+    ).parse_args()
     done = {(t.effect, t.size, t.seed) for t in load()}
 
     def keep(task: tuple[str, int]) -> None:
@@ -365,9 +439,15 @@ def main() -> None:
         with KEPT.open('a') as file:
             file.write(json.dumps(asdict(trial)) + '\n')
 
-    study.in_turn('blind images', keep, [
-        (effect, seed) for effect, seed in todo(args.trials, args.seed)
-        if (effect, args.size, seed) not in done])
+    study.in_turn(
+        'blind images',
+        keep,
+        [
+            (effect, seed)
+            for effect, seed in todo(args.trials, args.seed)
+            if (effect, args.size, seed) not in done
+        ],
+    )
     study.write_lines(study.RESULTS / 'blind_images.md', report(load(), args.size))
 
 

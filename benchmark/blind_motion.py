@@ -23,9 +23,7 @@ class Swing(NamedTuple):
     twist: Array
 
 
-def swing(
-    lens: Lens, corners: Array, columns: int, t: Array, rng: np.random.Generator
-) -> Swing:
+def swing(lens: Lens, corners: Array, columns: int, t: Array, rng: np.random.Generator) -> Swing:
     """Return where a camera is at times t (P,), s, that sees the corners (N, 3) all the while."""
     for _ in range(_TRIES):
         phase = rng.uniform(0, 2 * np.pi, 7)
@@ -66,8 +64,9 @@ def of_rows(lens: Lens, swung: Swing, points: Array, line_time: float) -> Array:
     uv = project(lens, swung.poses.into_body(points)).uv
     for _ in range(4):
         time = line_time * (uv[..., 1:] - (lens.height - 1) / 2)
-        turn = rotation_from_vector(time * swung.twist[:, None, 3:]) @ (
-            swung.poses.rotation[:, None])
+        turn = (
+            rotation_from_vector(time * swung.twist[:, None, 3:]) @ (swung.poses.rotation[:, None])
+        )
         off = points - swung.poses.position[:, None] - time * swung.twist[:, None, :3]
         uv = project(lens, (np.swapaxes(turn, -1, -2) @ off[..., None])[..., 0]).uv
     return np.asarray(uv)

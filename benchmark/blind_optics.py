@@ -49,7 +49,8 @@ class _Height(ImageHeight):
 def radial_profile(scene: Scene, rng: Rng) -> Hidden:
     own = scene.lens.image_height
     kinds = [
-        kind() for name, kind in IMAGE_HEIGHTS.items()
+        kind()
+        for name, kind in IMAGE_HEIGHTS.items()
         if name != 'kannala_brandt' and kind is not type(own)
     ]
     other = kinds[int(rng.integers(len(kinds)))]
@@ -78,7 +79,8 @@ def _scaled_lens(world: World, **factors: float) -> World:
 def focal_length(scene: Scene, rng: Rng) -> Hidden:
     sign = rng.choice([-1.0, 1.0])
     return Hidden(
-        1e-4, world=lambda w, a: _scaled_lens(w, fx=1 + sign * a, fy=1 + sign * a),
+        1e-4,
+        world=lambda w, a: _scaled_lens(w, fx=1 + sign * a, fy=1 + sign * a),
         truth=lambda a: {'relative': sign * a},
     )
 
@@ -96,7 +98,8 @@ def principal_point(scene: Scene, rng: Rng) -> Hidden:
 def aspect(scene: Scene, rng: Rng) -> Hidden:
     sign = rng.choice([-1.0, 1.0])
     return Hidden(
-        1e-4, world=lambda w, a: _scaled_lens(w, fx=1 + sign * a / 2, fy=1 - sign * a / 2),
+        1e-4,
+        world=lambda w, a: _scaled_lens(w, fx=1 + sign * a / 2, fy=1 - sign * a / 2),
         truth=lambda a: {'relative': sign * a},
     )
 
@@ -104,8 +107,11 @@ def aspect(scene: Scene, rng: Rng) -> Hidden:
 def skew(scene: Scene, rng: Rng) -> Hidden:
     sign, lens = rng.choice([-1.0, 1.0]), scene.lens
     slope = sign * lens.fx / lens.fy * np.array([1.0, 0.0])
-    return Hidden(1e-4, world=imaged(lambda uv, a: uv + a * slope * (uv[..., 1:] - lens.cy)),
-                  truth=lambda a: {'shear': sign * a})
+    return Hidden(
+        1e-4,
+        world=imaged(lambda uv, a: uv + a * slope * (uv[..., 1:] - lens.cy)),
+        truth=lambda a: {'shear': sign * a},
+    )
 
 
 def decentering(scene: Scene, rng: Rng) -> Hidden:
@@ -138,7 +144,8 @@ def sensor_tilt(scene: Scene, rng: Rng) -> Hidden:
         return np.asarray(centre + focal * (met @ turn[:, :2]))
 
     return Hidden(
-        1e-4, world=imaged(change),
+        1e-4,
+        world=imaged(change),
         truth=lambda a: {'about_x': a * np.cos(angle), 'about_y': a * np.sin(angle)},
     )
 
@@ -152,8 +159,14 @@ def flat_port(scene: Scene, rng: Rng) -> Hidden:
             radius, z = np.linalg.norm(points[..., :2], axis=-1), points[..., 2]
             shift = lens.viewpoint_shift
             theta = angle_behind_window(
-                radius, z, thickness, index, origin=lambda angle: shift.value_and_slope(
-                    angle, np.tan(angle / 2))[0] if shift else 0.0)
+                radius,
+                z,
+                thickness,
+                index,
+                origin=lambda angle: (
+                    shift.value_and_slope(angle, np.tan(angle / 2))[0] if shift else 0.0
+                ),
+            )
             way = points[..., :2] / np.maximum(radius, 1e-12)[..., None]
             height = lens.image_height.value_and_slope(theta)[0]
             uv = centre_of(lens) + focal_of(lens) * height[..., None] * way
@@ -171,8 +184,11 @@ def focal_drift(scene: Scene, rng: Rng) -> Hidden:
     warm = 1 - np.exp(-(scene.times - scene.times[0]) / pace)
     warm = (warm - warm.mean())[scene.frame] * rng.choice([-1.0, 1.0])
     growth, centre = warm[:, None, None], centre_of(scene.lens)
-    return Hidden(1e-4, world=imaged(lambda uv, a: uv + a * growth * (uv - centre)),
-                  detail=f'pace {pace / duration:.2f}')
+    return Hidden(
+        1e-4,
+        world=imaged(lambda uv, a: uv + a * growth * (uv - centre)),
+        detail=f'pace {pace / duration:.2f}',
+    )
 
 
 def session_step(scene: Scene, rng: Rng) -> Hidden:
@@ -182,8 +198,10 @@ def session_step(scene: Scene, rng: Rng) -> Hidden:
     centre = centre_of(scene.lens)
 
     return Hidden(
-        1e-4, world=imaged(lambda uv, a: uv + after * a * (way[0] * (uv - centre) + way[1:])),
-        detail=f'from frame {start}')
+        1e-4,
+        world=imaged(lambda uv, a: uv + after * a * (way[0] * (uv - centre) + way[1:])),
+        detail=f'from frame {start}',
+    )
 
 
 def detector_bias(scene: Scene, rng: Rng) -> Hidden:
@@ -196,7 +214,9 @@ def detector_bias(scene: Scene, rng: Rng) -> Hidden:
 
     # Beyond the largest one, the order of two points within a pixel would change.
     return Hidden(
-        0.01, largest=(1 - sharpness) / (2 * np.pi), world=imaged(change),
+        0.01,
+        largest=(1 - sharpness) / (2 * np.pi),
+        world=imaged(change),
         detail=f'sharpness {sharpness}',
         truth=lambda a: {} if sharpness else {'sine': sign * a},
     )

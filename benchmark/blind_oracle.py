@@ -138,9 +138,7 @@ def _forms(linear: LinearScene, name: str) -> tuple[Sequence[Effect], int]:
     return [LandmarkSurveyEffect((number,)) for number in often], 2 * len(often)
 
 
-def _f_test(
-    linear: LinearScene, name: str, moved: Array, residual: Array, level: float
-) -> bool:
+def _f_test(linear: LinearScene, name: str, moved: Array, residual: Array, level: float) -> bool:
     """F test of the form that has most power against displacements (F, M), over the noise."""
     nuisance = linear.nuisance
     forms, count = _forms(linear, name)

@@ -39,6 +39,7 @@ def wave(scene: Scene, rng: Rng) -> Hidden:
 
 def outliers(scene: Scene, rng: Rng) -> Hidden:
     """A few coordinates scatter five times as much."""
+
     def scatter(theta: Array, amount: float, rng: Rng) -> Array:
         return np.where(rng.random((*theta.shape, 2)) < amount**2 / 24, 5.0, 1.0)
 
@@ -93,15 +94,23 @@ def background(scene: Scene, rng: Rng) -> Callable[[World, float], World]:
     parts = rng.dirichlet(np.ones(3))
     offsets = rng.normal(size=scene.points.shape) * parts[0]
     distance = np.median(np.linalg.norm(scene.points - scene.points.mean(axis=0), axis=1))
-    static, framed = (draw_fields(scene.lens, rng, count, _BUMPS, (0.1, 0.4))
-                      for count in (1, int(scene.frame.max()) + 1))
+    static, framed = (
+        draw_fields(scene.lens, rng, count, _BUMPS, (0.1, 0.4))
+        for count in (1, int(scene.frame.max()) + 1)
+    )
 
     def world(world: World, amount: float) -> World:
         moved = replace(world, points=world.points + amount * offsets * distance / scene.lens.fx)
-        return moved.mapped(lambda uv: uv + amount * (
-            parts[1] * static(uv, np.zeros(len(uv), dtype=np.int64))
-            + parts[2] * framed(uv, scene.frame)
-        ))
+        return moved.mapped(
+            lambda uv: (
+                uv
+                + amount
+                * (
+                    parts[1] * static(uv, np.zeros(len(uv), dtype=np.int64))
+                    + parts[2] * framed(uv, scene.frame)
+                )
+            )
+        )
 
     return world
 

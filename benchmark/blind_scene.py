@@ -96,8 +96,11 @@ class Scene:
     def world(self) -> World:
         """Return the world in which the lens and the table tell the truth."""
         return World(
-            self.trajectory, self.rig.take(self.camera), self.times[self.frame],
-            np.broadcast_to(self.points, (len(self.frame), *self.points.shape)), self.lens,
+            self.trajectory,
+            self.rig.take(self.camera),
+            self.times[self.frame],
+            np.broadcast_to(self.points, (len(self.frame), *self.points.shape)),
+            self.lens,
         )
 
     def table(self, uv: Array, held_out: bool = False) -> Observations:
@@ -105,10 +108,16 @@ class Scene:
         chosen = self.seen & (self.held_out[self.frame] == held_out)[:, None]
         view, slot = np.nonzero(chosen)
         return make_observations(
-            self.frame[view], self.landmark[slot], uv[view, slot], self.points[slot],
-            camera=self.camera[view], board=self.board[slot], t=self.times[self.frame[view]],
+            self.frame[view],
+            self.landmark[slot],
+            uv[view, slot],
+            self.points[slot],
+            camera=self.camera[view],
+            board=self.board[slot],
+            t=self.times[self.frame[view]],
             sigma=np.full(len(view), self.noise) if self.stated else None,
-            cameras=('left', 'right') if self.cameras == 2 else ('',), source='blind',
+            cameras=('left', 'right') if self.cameras == 2 else ('',),
+            source='blind',
         )
 
 
@@ -181,9 +190,7 @@ def _area_centroid(corners: Array) -> Array:
     return np.asarray(middle[..., 0, :] + moments / (3 * cross.sum(axis=-1))[..., None])
 
 
-def draw_scene(
-    rng: Rng, needs: Needs, held_out: bool = False, landmarks: int = 54
-) -> Scene:
+def draw_scene(rng: Rng, needs: Needs, held_out: bool = False, landmarks: int = 54) -> Scene:
     """Draw a scene that has what is needed, with frames in between to hold out if asked for.
 
     About 3000 numbers: a camera sees nearly all landmarks, two cameras half of them each.
@@ -198,9 +205,17 @@ def draw_scene(
         times = np.cumsum(rng.uniform(0.8, 1.2, frames) * step)
         apart = np.arange(frames) % 3 == 1 if held_out else np.zeros(frames, dtype=bool)
         scene = Scene(
-            lens, free, float(rng.choice(_NOISE)), bool(rng.integers(2)), points, board,
-            np.sort(rng.choice(1000, len(points), replace=False)), times, apart,
-            _draw_trajectory(rng), _draw_rig(rng, stereo),
+            lens,
+            free,
+            float(rng.choice(_NOISE)),
+            bool(rng.integers(2)),
+            points,
+            board,
+            np.sort(rng.choice(1000, len(points), replace=False)),
+            times,
+            apart,
+            _draw_trajectory(rng),
+            _draw_rig(rng, stereo),
             np.ones((frames * (1 + stereo), len(points)), dtype=bool),
         )
         seen = _visible(scene)

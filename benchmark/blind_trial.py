@@ -92,12 +92,19 @@ def run_trial(task: Task) -> Outcome:
     scene, whole = case.scene, list(zip(task.names, case.hidden, case.amounts, strict=True))
     test = scene.table(case.given, held_out=True) if scene.held_out.any() else None
     outcome = Outcome(
-        task, _described(scene),
-        [f'{name}{f" ({one.detail})" if one.detail else ""} {amount:.3g}'
-         for name, one, amount in whole],
-        oracle=[oracle_finds(case.linear, name, one, amount, case.given)
-                for name, one, amount in whole if name in HIDDEN],
-        background=case.background)
+        task,
+        _described(scene),
+        [
+            f'{name}{f" ({one.detail})" if one.detail else ""} {amount:.3g}'
+            for name, one, amount in whole
+        ],
+        oracle=[
+            oracle_finds(case.linear, name, one, amount, case.given)
+            for name, one, amount in whole
+            if name in HIDDEN
+        ],
+        background=case.background,
+    )
     try:
         found = diagnose(
             scene.table(case.given), scene.lens, free_intrinsics=scene.free, held_out=test
@@ -109,8 +116,7 @@ def run_trial(task: Task) -> Outcome:
     outcome.causes = {cause.effect: cause.indistinguishable_from for cause in found.causes}
     outcome.remaining = [structure.variable for structure in found.remaining]
     outcome.hit = set(outcome.causes).union(*outcome.causes.values()).issuperset(task.names)
-    outcome.extra = [
-        e for e, same in outcome.causes.items() if not {e, *same} & set(task.names)]
+    outcome.extra = [e for e, same in outcome.causes.items() if not {e, *same} & set(task.names)]
     outcome.trace = [f'{s.effect}: corrected p {s.corrected:.1e}, {s.why}' for s in found.trace]
     if task.mode in ('one', 'background') and task.names:
         outcome.errors = _errors(case, task, found)
@@ -128,7 +134,9 @@ def draw_case(task: Task) -> Case:
     )
     while True:
         scene = draw_scene(
-            rng, _needs(task), held_out=task.mode == 'one' and task.size >= 1,
+            rng,
+            _needs(task),
+            held_out=task.mode == 'one' and task.size >= 1,
             landmarks=int(rng.choice([26, 54, 80])) if task.mode == 'clean' else 54,
         )
         case = _hide(task, scene, rng)
@@ -191,7 +199,11 @@ def _with_background(
 
 
 def _amount(
-    hidden: Hidden, size: float, scene: Scene, linear: LinearScene, theta: Array,
+    hidden: Hidden,
+    size: float,
+    scene: Scene,
+    linear: LinearScene,
+    theta: Array,
     rng: np.random.Generator,
 ) -> float | None:
     """Return the amount at which the effect has its size; None where it cannot.
@@ -199,6 +211,7 @@ def _amount(
     The size is the RMS, over the noise, of what is left once poses and free intrinsics are
     fitted; for scatter the RMS of its relative change.
     """
+
     def rms(amount: float) -> float:
         if hidden.scatter:
             factor = np.broadcast_to(hidden.scatter(theta, amount, rng), linear.ideal.shape)
@@ -231,13 +244,16 @@ def _solved(rms: Callable[[float], float], start: float, size: float) -> float |
 
 
 def _described(scene: Scene) -> str:
-    return ', '.join([
-        scene.lens.name, 'free' if scene.free else 'fixed',
-        'stereo' if scene.cameras == 2 else 'mono',
-        'boards' if scene.board.any() else 'cloud',
-        f'noise {scene.noise} px{" (stated)" if scene.stated else ""}',
-        f'{2 * int(scene.seen[~scene.held_out[scene.frame]].sum())} numbers',
-    ])
+    return ', '.join(
+        [
+            scene.lens.name,
+            'free' if scene.free else 'fixed',
+            'stereo' if scene.cameras == 2 else 'mono',
+            'boards' if scene.board.any() else 'cloud',
+            f'noise {scene.noise} px{" (stated)" if scene.stated else ""}',
+            f'{2 * int(scene.seen[~scene.held_out[scene.frame]].sum())} numbers',
+        ]
+    )
 
 
 def _errors(case: Case, task: Task, found: Diagnosis) -> dict[str, float]:
@@ -276,7 +292,8 @@ def _null_p_values(found: Diagnosis, free: bool) -> dict[str, float]:
         columns = null.form_columns(form)
         result = tests.adjust_p_value(tests.score(left, columns), null.included_columns, columns)
         wrong = [
-            value < 0 for value, parameter in zip(result.estimate, effect.parameters, strict=True)
+            value < 0
+            for value, parameter in zip(result.estimate, effect.parameters, strict=True)
             if parameter.positive
         ]
         if result.rank and not any(wrong):

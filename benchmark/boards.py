@@ -35,8 +35,9 @@ def unit(rng: Rng, size: int) -> Array:
 def directions(theta: Array | float, azimuth: Array | float) -> Array:
     """Return unit vectors (..., 3) at angles from z and about it, rad."""
     sin = np.sin(theta)
-    return np.stack(np.broadcast_arrays(
-        sin * np.cos(azimuth), sin * np.sin(azimuth), np.cos(theta)), axis=-1)
+    return np.stack(
+        np.broadcast_arrays(sin * np.cos(azimuth), sin * np.sin(azimuth), np.cos(theta)), axis=-1
+    )
 
 
 def facing(ahead: Array) -> Array:
@@ -81,8 +82,13 @@ def draw_fields(
 
 
 def angle_behind_window(
-    radius: Array, z: Array, thickness: float, glass: float, distance: float = 0.0,
-    medium: float = 1.0, origin: Callable[[Array], Array | float] = lambda angle: 0.0,
+    radius: Array,
+    z: Array,
+    thickness: float,
+    glass: float,
+    distance: float = 0.0,
+    medium: float = 1.0,
+    origin: Callable[[Array], Array | float] = lambda angle: 0.0,
 ) -> Array:
     """Return the angles (...) of rays to points at a radius and z, m, through a pane across z.
 
@@ -92,8 +98,11 @@ def angle_behind_window(
     for _ in range(60):
         angle = (low + high) / 2
         inside, beyond = (np.arcsin(np.sin(angle) / index) for index in (glass, medium))
-        reached = (distance - origin(angle)) * np.tan(angle) + thickness * np.tan(inside) + (
-            z - distance - thickness) * np.tan(beyond)
+        reached = (
+            (distance - origin(angle)) * np.tan(angle)
+            + thickness * np.tan(inside)
+            + (z - distance - thickness) * np.tan(beyond)
+        )
         low, high = np.where(reached < radius, angle, low), np.where(reached < radius, high, angle)
     return np.asarray(angle)
 
@@ -109,19 +118,32 @@ def photographed(
     lens: Lens, printed: Print, points: Array, poses: Pose, noise: float, rng: Rng
 ) -> Observations:
     """Return what a lens sees of a board whose corners are at points (L, 3), not as printed."""
-    seen = simulate(ForwardModel(lens), Landmarks(np.arange(len(points)), points), poses, noise,
-                    rng)
+    seen = simulate(
+        ForwardModel(lens), Landmarks(np.arange(len(points)), points), poses, noise, rng
+    )
     return replace(seen, xyz=printed.corners[seen.landmark], sigma=np.full(len(seen), np.nan))
 
 
 def draw_lens(rng: Rng) -> Lens:
     """Draw a lens; in one of three the viewpoint stands still."""
     k = rng.normal(0, [0.02, 0.008, 0.002, 0.0004])
-    shift = 0.0 if rng.random() < 1 / 3 else rng.choice([-1, 1], p=[0.2, 0.8]) * abs(
-        rng.normal(0, 3e-3))
+    shift = (
+        0.0
+        if rng.random() < 1 / 3
+        else rng.choice([-1, 1], p=[0.2, 0.8]) * abs(rng.normal(0, 3e-3))
+    )
     focal, (x, y) = rng.uniform(280, 380), rng.normal(0, 8, 2)
-    lens = Lens('truth', WIDTH, HEIGHT, focal, focal, WIDTH / 2 + x, HEIGHT / 2 + y,
-                KannalaBrandt(*k), np.radians(rng.uniform(65, 92)))
+    lens = Lens(
+        'truth',
+        WIDTH,
+        HEIGHT,
+        focal,
+        focal,
+        WIDTH / 2 + x,
+        HEIGHT / 2 + y,
+        KannalaBrandt(*k),
+        np.radians(rng.uniform(65, 92)),
+    )
     if lens.image_height.limit < 1.1 * lens.max_incidence:
         return draw_lens(rng)
     return lens.with_shift(Gennery(0.0, shift, shift * rng.normal(0, 0.15)))
@@ -165,9 +187,13 @@ def draw_set(
         there = true @ board.T + distance * directions(angle, azimuth)
         uv, theta = image_points(lens, there)
         away = np.linalg.norm(there, axis=1)
-        kept = (theta < lens.max_incidence) & (uv > 3).all(axis=1) & (
-            uv < [WIDTH - 4, HEIGHT - 4]).all(axis=1) & (away > 0.04) & (
-            np.abs(there @ board[:, 2]) > 0.2 * away)
+        kept = (
+            (theta < lens.max_incidence)
+            & (uv > 3).all(axis=1)
+            & (uv < [WIDTH - 4, HEIGHT - 4]).all(axis=1)
+            & (away > 0.04)
+            & (np.abs(there @ board[:, 2]) > 0.2 * away)
+        )
         if kept.sum() >= 25:
             moved = uv[kept] if warp is None else uv[kept] + warp(uv[kept])
             seen.append((np.flatnonzero(kept), moved + rng.normal(0, noise, moved.shape)))
@@ -207,5 +233,7 @@ def draw_warped_set(
 def joined(tables: Sequence[Observations]) -> Observations:
     """Return tables of the same cameras as one."""
     names = ('frame', 'landmark', 'uv', 'xyz', 'camera', 'board', 't', 'sigma')
-    return replace(tables[0], **{
-        name: np.concatenate([getattr(one, name) for one in tables]) for name in names})
+    return replace(
+        tables[0],
+        **{name: np.concatenate([getattr(one, name) for one in tables]) for name in names},
+    )

@@ -62,13 +62,22 @@ class Simulated(NamedTuple):
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the study, write it, print what came of it."""
     parser = study.parser(
-        'coverage', __doc__, study.RESULTS / 'coverage.json', workers=False,
-        image_size=('1280x800', 'of the tables'), name=('', 'of the data in the output'),
-        deals=(0, 'random ones, to halves'), cameras=(20, 'simulated ones'))
+        'coverage',
+        __doc__,
+        study.RESULTS / 'coverage.json',
+        workers=False,
+        image_size=('1280x800', 'of the tables'),
+        name=('', 'of the data in the output'),
+        deals=(0, 'random ones, to halves'),
+        cameras=(20, 'simulated ones'),
+    )
     parser.add_argument('tables', type=Path, nargs='*', help='of one camera and board')
     asked = parser.parse_args(arguments)
-    sets = [simulated(number) for number in range(asked.cameras)] if not asked.tables else [
-        measured(asked.tables, study.image_size(asked.image_size))]
+    sets = (
+        [simulated(number) for number in range(asked.cameras)]
+        if not asked.tables
+        else [measured(asked.tables, study.image_size(asked.image_size))]
+    )
     halves: list[Array] = []
     poses: list[Array] = []
     lenses: list[Lens] = []
@@ -92,8 +101,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 advance()
     told = coverage(halves) | {'halves': len(halves), 'named': dict(named.most_common())}
     if not asked.tables:
-        told |= {'poses': coverage(poses), 'stereo points': coverage(
-            of_a_rig(sets[i:i + 2], lenses[i:i + 2]) for i in range(0, len(sets) - 1, 2))}
+        told |= {
+            'poses': coverage(poses),
+            'stereo points': coverage(
+                of_a_rig(sets[i : i + 2], lenses[i : i + 2]) for i in range(0, len(sets) - 1, 2)
+            ),
+        }
     name = asked.name or (asked.tables[0].parent.name if asked.tables else 'simulated')
     saved = json.loads(asked.output.read_text()) if asked.output.is_file() else {}
     write_text(asked.output, json.dumps(saved | {name: told}, indent=1) + '\n')
@@ -102,8 +115,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def measured(paths: Sequence[Path], size: tuple[int, int]) -> Simulated:
     """Return what a real camera saw of one board, in one table."""
-    table = joined([replace(one, frame=1000 * i + one.frame)
-                    for i, one in enumerate(map(read_observations, paths))])
+    table = joined(
+        [
+            replace(one, frame=1000 * i + one.frame)
+            for i, one in enumerate(map(read_observations, paths))
+        ]
+    )
     unknown = np.full(len(table), np.nan)
     return Simulated(replace(table, sigma=unknown, t=unknown), size, None, None)
 
@@ -120,10 +137,12 @@ def coverage(pulls: Iterable[Array]) -> dict[str, Any]:
     return {
         'differences': int(every.shape[0] * every.shape[2]),
         'coverage_interval': [float(low), float(high)],
-        'coverage': {level: float((np.abs(every[:, i]) < WITHIN).mean())
-                     for i, level in enumerate(LEVELS)},
-        'pull_rms': {level: float(np.sqrt((every[:, i] ** 2).mean()))
-                     for i, level in enumerate(LEVELS)},
+        'coverage': {
+            level: float((np.abs(every[:, i]) < WITHIN).mean()) for i, level in enumerate(LEVELS)
+        },
+        'pull_rms': {
+            level: float(np.sqrt((every[:, i] ** 2).mean())) for i, level in enumerate(LEVELS)
+        },
     }
 
 
@@ -152,8 +171,9 @@ def of_a_rig(cameras: Sequence[Simulated], lenses: Sequence[Lens]) -> Array:
 def _pulls(difference: Array, parts: ErrorParts) -> Array:
     """Return differences (N, P) over their standard deviations at all levels."""
     levels = (parts.noise, parts.noise + parts.parameters, parts.total)
-    return np.stack([difference / np.sqrt(np.diagonal(part, axis1=1, axis2=2))
-                     for part in levels], axis=1)
+    return np.stack(
+        [difference / np.sqrt(np.diagonal(part, axis1=1, axis2=2)) for part in levels], axis=1
+    )
 
 
 def pulls_of(found: Diagnosis, test: Observations) -> Array:
@@ -165,8 +185,12 @@ def pulls_of(found: Diagnosis, test: Observations) -> Array:
     state = localize_frames(data, found.model.state)
     linear, pulls = Linearization(data, state, found.model.free), []
     for axis in (0, 1):
-        middle = np.array([np.median(v[w > 0]) for v, w in zip(
-            data.views.uv[..., axis], data.views.weight, strict=True)])
+        middle = np.array(
+            [
+                np.median(v[w > 0])
+                for v, w in zip(data.views.uv[..., axis], data.views.weight, strict=True)
+            ]
+        )
         first = data.views.uv[..., axis] < middle[:, None]
         sides = [side(data, state, mask) for mask in (first, ~first)]
         difference = sides[0][0].pose.difference(sides[1][0].pose)
@@ -176,8 +200,7 @@ def pulls_of(found: Diagnosis, test: Observations) -> Array:
 
 def side(data: RigViews, state: RigState, mask: Mask) -> tuple[RigState, Array]:
     """Pose the frames from some of their points; return also what makes poses of points."""
-    kept = replace(data, views=data.views._replace(
-        weight=np.where(mask, data.views.weight, 0.0)))
+    kept = replace(data, views=data.views._replace(weight=np.where(mask, data.views.weight, 0.0)))
     posed = adjust_poses(kept, state)
     return posed, pose_maps(Linearization(kept, posed, ()).frame_columns)
 
@@ -196,8 +219,9 @@ def simulated(number: int) -> Simulated:
         return np.asarray(uv + field(uv))
 
     table = replace(seen, uv=moved(seen.uv))
-    return Simulated(table, (1280, 960), poses,
-                     lambda points: moved(ForwardModel(lens).project(points).uv))
+    return Simulated(
+        table, (1280, 960), poses, lambda points: moved(ForwardModel(lens).project(points).uv)
+    )
 
 
 if __name__ == '__main__':

@@ -75,8 +75,9 @@ def run(task: tuple[str, int]) -> Outcome:
     shift = rng.choice([-1, 1]) * abs(rng.normal(0, SHIFT)) if kind == 'shift' else 0.0
     lens, noise = draw_lens(rng, 'kannala_brandt', 1.6), float(np.exp(rng.uniform(-3.0, -1.2)))
     tables = [_photograph(rng, lens, shift, noise) for _ in range(2)]
-    given, same = (fsvp.calibrate(one, 'kannala_brandt', (lens.width, lens.height)).lens
-                   for one in tables)
+    given, same = (
+        fsvp.calibrate(one, 'kannala_brandt', (lens.width, lens.height)).lens for one in tables
+    )
     moved = ''
     if kind == 'off':
         given, moved = _move(given, rng)
@@ -85,21 +86,31 @@ def run(task: tuple[str, int]) -> Outcome:
     answer = document['decision']['lens']
     bounds = {one['effect']: one['value'] for one in answer.get('bound', [])}
     before, now, after = (
-        _ray_error(one, lens, shift, tables[1]) for one in (given, same, found.lens))
+        _ray_error(one, lens, shift, tables[1]) for one in (given, same, found.lens)
+    )
     return Outcome(
-        kind, answer['say'], document['decision']['target']['say'],
+        kind,
+        answer['say'],
+        document['decision']['target']['say'],
         tuple(cause['effect'] for cause in document['causes']),
-        bounds.get('viewpoint_shift', np.nan), shift, document['file']['gain'],
-        1 - after / before, 1 - after / now, moved)
+        bounds.get('viewpoint_shift', np.nan),
+        shift,
+        document['file']['gain'],
+        1 - after / before,
+        1 - after / now,
+        moved,
+    )
 
 
-def _photograph(rng: np.random.Generator, lens: TrueLens, shift: float, noise: float
-                ) -> Observations:
+def _photograph(
+    rng: np.random.Generator, lens: TrueLens, shift: float, noise: float
+) -> Observations:
     """Return what the camera sees of a printed board."""
     scene: Scene | None = None
     while scene is None:
-        scene = draw_scene(rng, lens, 'board', fitted=True, stereo=False, moving=False,
-                           noise=noise)
+        scene = draw_scene(
+            rng, lens, 'board', fitted=True, stereo=False, moving=False, noise=noise
+        )
     offsets = Departure(landmarks=OFFSET * rng.normal(size=scene.target.points.shape))
     pupil = Departure(pupil=lambda theta, _: shift * _gennery(theta)[:, None] * [0.0, 0.0, 1.0])
     uv, named = observed(rng, scene, [offsets, pupil], 0.0)
@@ -116,9 +127,12 @@ def _move(lens: Lens, rng: np.random.Generator) -> tuple[Lens, str]:
     stated = (lens.calibration or {})['stderr']
     names: Sequence[str] = [('fx', 'fy'), ('cx',), ('cy',)][rng.integers(3)]
     sign = rng.choice([-1, 1])
-    return replace(lens.with_parameters(
-        names, [lens.parameters[name] + sign * OFF * stated[name] for name in names]),
-        calibration=lens.calibration), 'focal length' if len(names) > 1 else 'principal point'
+    return replace(
+        lens.with_parameters(
+            names, [lens.parameters[name] + sign * OFF * stated[name] for name in names]
+        ),
+        calibration=lens.calibration,
+    ), 'focal length' if len(names) > 1 else 'principal point'
 
 
 def _ray_error(lens: Lens, true: TrueLens, shift: float, table: Observations) -> float:
@@ -128,8 +142,12 @@ def _ray_error(lens: Lens, true: TrueLens, shift: float, table: Observations) ->
     """
     center = np.array([true.cx, true.cy])
     seen = np.quantile(np.linalg.norm(table.uv - center, axis=1), 0.98)
-    theta, azimuth = (one.ravel() for one in np.meshgrid(
-        np.linspace(0.02, true.theta_max, 25), np.linspace(0, 2 * np.pi, 16, endpoint=False)))
+    theta, azimuth = (
+        one.ravel()
+        for one in np.meshgrid(
+            np.linspace(0.02, true.theta_max, 25), np.linspace(0, 2 * np.pi, 16, endpoint=False)
+        )
+    )
     uv = image_points(true, theta, azimuth)
     inside = (np.linalg.norm(uv - center, axis=1) < seen) & (uv > 0).all(axis=1)
     inside &= (uv < [true.width, true.height]).all(axis=1)
@@ -150,22 +168,39 @@ def _share(hits: Sequence[bool]) -> str:
     """Return a share with its 95 % interval, in percent."""
     found = study.Rate.of(hits)
     low, high = found.interval
-    return (f'{100 * found.value:.0f} % ({100 * low:.0f} to {100 * high:.0f}, '
-            f'n = {found.trials})') if hits else 'none'
+    return (
+        (f'{100 * found.value:.0f} % ({100 * low:.0f} to {100 * high:.0f}, n = {found.trials})')
+        if hits
+        else 'none'
+    )
 
 
 def report(outcomes: Sequence[Outcome], command: str) -> str:
     """Return the page of results."""
     of = {kind: [one for one in outcomes if one.kind == kind] for kind in KINDS}
-    wanted = {'sound': {'keep'}, 'off': {'recalibrate'},
-              'shift': {'use_extended', 'recalibrate', 'undecided'}}
-    rows = [[kind, ', '.join(sorted(wanted[kind])),
-             _share([one.decision in wanted[kind] for one in found]),
-             *(sum(one.decision == say for one in found) for say in SAYS)]
-            for kind, found in of.items()]
-    lines = ['# Decisions about lenses whose truth is known', '', *study.paragraph(__doc__),
-             f'`{command}`', '',
-             *study.table('lens | expected | as expected | ' + ' | '.join(SAYS), rows), '']
+    wanted = {
+        'sound': {'keep'},
+        'off': {'recalibrate'},
+        'shift': {'use_extended', 'recalibrate', 'undecided'},
+    }
+    rows = [
+        [
+            kind,
+            ', '.join(sorted(wanted[kind])),
+            _share([one.decision in wanted[kind] for one in found]),
+            *(sum(one.decision == say for one in found) for say in SAYS),
+        ]
+        for kind, found in of.items()
+    ]
+    lines = [
+        '# Decisions about lenses whose truth is known',
+        '',
+        *study.paragraph(__doc__),
+        f'`{command}`',
+        '',
+        *study.table('lens | expected | as expected | ' + ' | '.join(SAYS), rows),
+        '',
+    ]
     bounded = [one for one in outcomes if np.isfinite(one.bound)]
     covered = [one.bound >= abs(one.shift) for one in bounded]
     finite = [one for one in outcomes if np.isfinite(one.true_gain)]
@@ -177,29 +212,34 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
             f'- Off in the {what}: recalibrate in '
             f'{_share([one.decision == "recalibrate" for one in mine])}; the rays of such a lens '
             f'err {np.median([one.given_over_same for one in mine]):.2f} times as much as those '
-            'of a calibration on the same data, median.')
-    lines += [f'- A test of the one parameter that is off, on data as good as those of the '
-              f'calibration, would find {100 * most:.0f} % at a level of 5 %.',
-              f'- The bound of the viewpoint shift covers the truth in {_share(covered)}.',
-              f'- Rank correlation of `file` with the true gain of rays: {rank.statistic:.2f}.',
-              '- Extended lenses more than 10 % worse than those given, where they are offered: '
-              f'{_share([one.true_gain < -0.1 for one in finite if one.offered])}; than those '
-              'that `calibrate` makes of the same data, all: '
-              f'{_share([one.same_data < -0.1 for one in finite])}.',
-              '- Ray error of the extended lens over that of `calibrate` on the same data, '
-              f'geometric mean: {np.exp(np.mean(np.log1p([-o.same_data for o in finite]))):.2f}.',
-              '']
+            'of a calibration on the same data, median.'
+        )
+    lines += [
+        f'- A test of the one parameter that is off, on data as good as those of the '
+        f'calibration, would find {100 * most:.0f} % at a level of 5 %.',
+        f'- The bound of the viewpoint shift covers the truth in {_share(covered)}.',
+        f'- Rank correlation of `file` with the true gain of rays: {rank.statistic:.2f}.',
+        '- Extended lenses more than 10 % worse than those given, where they are offered: '
+        f'{_share([one.true_gain < -0.1 for one in finite if one.offered])}; than those '
+        'that `calibrate` makes of the same data, all: '
+        f'{_share([one.same_data < -0.1 for one in finite])}.',
+        '- Ray error of the extended lens over that of `calibrate` on the same data, '
+        f'geometric mean: {np.exp(np.mean(np.log1p([-o.same_data for o in finite]))):.2f}.',
+        '',
+    ]
     return '\n'.join(lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the trials and write the page."""
-    asked = study.parser('decisions', __doc__, study.RESULTS / 'decisions.md',
-                         trials=(60, 'of each kind')).parse_args(arguments)
+    asked = study.parser(
+        'decisions', __doc__, study.RESULTS / 'decisions.md', trials=(60, 'of each kind')
+    ).parse_args(arguments)
     tasks = [(kind, i) for i in range(asked.trials) for kind in KINDS]
     outcomes = study.in_processes('decisions', run, tasks, asked.workers)
-    write_text(asked.output, report(
-        outcomes, f'python -m benchmark.decisions --trials {asked.trials}'))
+    write_text(
+        asked.output, report(outcomes, f'python -m benchmark.decisions --trials {asked.trials}')
+    )
 
 
 if __name__ == '__main__':

@@ -31,8 +31,18 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.simulate.targets import board_views
 
-LENS = Lens('wide', 848, 800, 285.2, 284.9, 424.3, 398.7,
-            KannalaBrandt(-0.011, 0.0041, -0.0012, 0.0001), np.radians(95.0), Gennery(e0=0.003))
+LENS = Lens(
+    'wide',
+    848,
+    800,
+    285.2,
+    284.9,
+    424.3,
+    398.7,
+    KannalaBrandt(-0.011, 0.0041, -0.0012, 0.0001),
+    np.radians(95.0),
+    Gennery(e0=0.003),
+)
 BOARD, PRINTED = 'chessboard:9x6:25mm', Print(9, 6, 0.025)
 STEP = 0.002  # m, from image to image
 PACE = 5.0  # images a second
@@ -54,10 +64,14 @@ def latencies(pictures: list[Any]) -> np.ndarray:
     node = rclpy.create_node('clock_keeper')
     arrived: dict[int, float] = {}
     node.create_subscription(
-        PoseWithCovarianceStamped, '/localizer/pose',
-        lambda m: arrived.setdefault(stamp_of(m), time.monotonic()), 100)
+        PoseWithCovarianceStamped,
+        '/localizer/pose',
+        lambda m: arrived.setdefault(stamp_of(m), time.monotonic()),
+        100,
+    )
     sender = node.create_publisher(
-        Image, '/image', QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
+        Image, '/image', QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
     sent: dict[int, float] = {}
 
     def send(number: int, stamp: int) -> None:
@@ -90,8 +104,11 @@ def latencies(pictures: list[Any]) -> np.ndarray:
 
 def main() -> None:
     """Measure, and print one line."""
-    count = study.parser('detector_latency', __doc__, None, workers=False,
-                         count=(40, 'images')).parse_args().count
+    count = (
+        study.parser('detector_latency', __doc__, None, workers=False, count=(40, 'images'))
+        .parse_args()
+        .count
+    )
     pictures = images(count)
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     study.stay_on_this_machine()
@@ -99,16 +116,23 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         lens = Path(folder) / 'lens.yaml'
         save_lens(LENS, lens)
-        nodes = [subprocess.Popen(study.node_command(*words)) for words in (
-            ('detector', f'board:={BOARD}'), ('localizer', f'lens:={lens}', 'patience:=0.0'))]
+        nodes = [
+            subprocess.Popen(study.node_command(*words))
+            for words in (
+                ('detector', f'board:={BOARD}'),
+                ('localizer', f'lens:={lens}', 'patience:=0.0'),
+            )
+        ]
         try:
             found = 1e3 * latencies(pictures)
         finally:
             for process in nodes:
                 process.terminate()
     low, middle, high = np.nanpercentile(found, [5, 50, 95])
-    print(f'{count} images of {LENS.width} x {LENS.height} px, {np.isfinite(found).sum()} poses: '
-          f'median {middle:.0f} ms, 5 to 95 %: {low:.0f} to {high:.0f} ms')
+    print(
+        f'{count} images of {LENS.width} x {LENS.height} px, {np.isfinite(found).sum()} poses: '
+        f'median {middle:.0f} ms, 5 to 95 %: {low:.0f} to {high:.0f} ms'
+    )
 
 
 if __name__ == '__main__':

@@ -37,8 +37,18 @@ from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 DETECTORS = ('saddle', 'sb', 'classic')
 ANGLES = (0, 25, 45, 60, 75, 85, 95)
-LENS = Lens('benchmark', 848, 800, 285.0, 285.0, 423.6, 399.3,
-            KannalaBrandt(-0.01, 0.004, -0.0015, 0.0), np.radians(94.0), Gennery(e0=0.004))
+LENS = Lens(
+    'benchmark',
+    848,
+    800,
+    285.0,
+    285.0,
+    423.6,
+    399.3,
+    KannalaBrandt(-0.01, 0.004, -0.0015, 0.0),
+    np.radians(94.0),
+    Gennery(e0=0.004),
+)
 PRINTED, BOARD = Print(9, 6, 0.025), 'chessboard:9x6:25mm'
 TARGET = """target_type: aprilgrid
 tagCols: 6
@@ -47,8 +57,12 @@ tagSize: 0.03
 tagSpacing: 0.3
 """
 # What else than chessboards, all of much the same size
-OTHERS = ('charuco:9x7:25mm:18mm:DICT_5X5_100', 'aprilgrid:target.yaml', 'circles:8x6:25mm',
-          'circles:4x9:18mm:asymmetric')
+OTHERS = (
+    'charuco:9x7:25mm:18mm:DICT_5X5_100',
+    'aprilgrid:target.yaml',
+    'circles:8x6:25mm',
+    'circles:4x9:18mm:asymmetric',
+)
 CONDITIONS = {
     'as it should be': Exposure(),
     'defocus of 1.5 px': Exposure(blur=1.5),
@@ -99,8 +113,10 @@ def _add(into: Corners, image: Array, board: Pattern, detector: str, points: Arr
     into.found += 1
     # Of boards that look the same when turned any order is right.
     orders = [np.argsort(turn.source) for turn in board.symmetries]
-    error = min((seen.uv - true[order][seen.ids] for order in orders),
-                key=lambda error: float(np.abs(error).max()))
+    error = min(
+        (seen.uv - true[order][seen.ids] for order in orders),
+        key=lambda error: float(np.abs(error).max()),
+    )
     into.error.append(error)
     into.sigma.append(seen.sigma)
     into.theta.append(theta[seen.ids])
@@ -110,11 +126,19 @@ def by_angle(results: dict[tuple[str, str], Corners], count: int) -> list[str]:
     """Return tables, one a condition: bias along the radius is not told from that across."""
     lines = []
     for condition in CONDITIONS:
-        rows = [_row(name, seen, count) for (its, name), seen in results.items()
-                if its == condition]
-        lines += ['', f'### {condition[0].upper()}{condition[1:]}', '', *study.table(
-            'detector | found | points | s | ' + ' | '.join(
-                f'{a} to {b}°' for a, b in itertools.pairwise(ANGLES)), rows)]
+        rows = [
+            _row(name, seen, count) for (its, name), seen in results.items() if its == condition
+        ]
+        lines += [
+            '',
+            f'### {condition[0].upper()}{condition[1:]}',
+            '',
+            *study.table(
+                'detector | found | points | s | '
+                + ' | '.join(f'{a} to {b}°' for a, b in itertools.pairwise(ANGLES)),
+                rows,
+            ),
+        ]
     return lines
 
 
@@ -134,8 +158,13 @@ def _row(name: str, seen: Corners, count: int) -> list[str]:
         stated = '' if name in UNFITTED_DETECTORS else f' / {over:.2f}'
         cells.append(f'{bias:.4f} / {scatter:.4f}{stated} ({own.sum()})')
     share = 100 * len(error) / seen.points
-    return [f'`{name}`', f'{seen.found} of {count}', f'{share:.0f} %',
-            f'{np.median(seen.seconds):.2f}', *cells]
+    return [
+        f'`{name}`',
+        f'{seen.found} of {count}',
+        f'{share:.0f} %',
+        f'{np.median(seen.seconds):.2f}',
+        *cells,
+    ]
 
 
 def real(folder: str, board: str) -> list[str]:
@@ -150,17 +179,34 @@ def real(folder: str, board: str) -> list[str]:
             continue
         residual = np.linalg.norm(fitted.adjusted.residual[fitted.views.used], axis=-1)
         found = sum(one.points is not None for one in seen.searched)
-        rows.append([f'`{name}`', f'{found} of {len(seen.searched)}',
-                     f'{np.sqrt((residual**2).mean()):.3f}', f'{np.median(residual):.3f}'])
-    return ['', '### Real photographs', '',
-            f'`{board}`, a Kannala-Brandt lens without a viewpoint shift fitted to them:', '',
-            *study.table('detector | found | rms, px | median, px', rows)]
+        rows.append(
+            [
+                f'`{name}`',
+                f'{found} of {len(seen.searched)}',
+                f'{np.sqrt((residual**2).mean()):.3f}',
+                f'{np.median(residual):.3f}',
+            ]
+        )
+    return [
+        '',
+        '### Real photographs',
+        '',
+        f'`{board}`, a Kannala-Brandt lens without a viewpoint shift fitted to them:',
+        '',
+        *study.table('detector | found | rms, px | median, px', rows),
+    ]
 
 
 def main() -> None:
     """Measure and write."""
-    parser = study.parser('detectors', __doc__, None, workers=False, count=(60, 'photographs'),
-                          board=('chessboard:4x6:30mm', 'of --photographs'))
+    parser = study.parser(
+        'detectors',
+        __doc__,
+        None,
+        workers=False,
+        count=(60, 'photographs'),
+        board=('chessboard:4x6:30mm', 'of --photographs'),
+    )
     parser.add_argument('--photographs', help='folder of real ones')
     args = parser.parse_args()
     cv2.setNumThreads(1)

@@ -61,40 +61,98 @@ def _real(data: Path, folder: Path) -> Iterator[Case]:
             text = (data / name / f'{part}.csv').read_text()
             (folder / f'{name}-{part}.csv').write_text(text)
         yield from _calibrated(folder, name, f'{name}-train.csv', '1280x800')
-        run = [f'{{inputs}}/{name}-train.csv', '--lens', f'{{inputs}}/{name}.yaml',
-               '--held-out', f'{{inputs}}/{name}-test.csv']
+        run = [
+            f'{{inputs}}/{name}-train.csv',
+            '--lens',
+            f'{{inputs}}/{name}.yaml',
+            '--held-out',
+            f'{{inputs}}/{name}-test.csv',
+        ]
         yield _diagnosis(name, *run)
         yield _diagnosis(f'{name}-quick', *run, '--quick')
-    yield _diagnosis('ov_plane-against', '{inputs}/ov_plane-train.csv', '--quick', '--lens',
-                     '{inputs}/ov_plane.yaml', '--against', '{inputs}/ov_cube-train.csv')
-    for name, board in (('chessboard', 'chessboard:4x6:30mm'),
-                        ('square_grid', 'squares:3x4:30mm:30mm')):
-        _run(['detect', str(data / 'photos' / name), '--board', board,
-              '-o', str(folder / f'{name}.csv')])
+    yield _diagnosis(
+        'ov_plane-against',
+        '{inputs}/ov_plane-train.csv',
+        '--quick',
+        '--lens',
+        '{inputs}/ov_plane.yaml',
+        '--against',
+        '{inputs}/ov_cube-train.csv',
+    )
+    for name, board in (
+        ('chessboard', 'chessboard:4x6:30mm'),
+        ('square_grid', 'squares:3x4:30mm:30mm'),
+    ):
+        _run(
+            [
+                'detect',
+                str(data / 'photos' / name),
+                '--board',
+                board,
+                '-o',
+                str(folder / f'{name}.csv'),
+            ]
+        )
         yield from _calibrated(folder, name, f'{name}.csv', '640x720')
         yield _diagnosis(name, f'{{inputs}}/{name}.csv', '--lens', f'{{inputs}}/{name}.yaml')
 
 
 def _rendered(folder: Path) -> Iterator[Case]:
     _run(['example', '-o', str(folder / 'example')])
-    _run(['detect', str(folder / 'example/photographs'), '--board', 'chessboard:9x6:25mm',
-          '-o', str(folder / 'example.csv')])
+    _run(
+        [
+            'detect',
+            str(folder / 'example/photographs'),
+            '--board',
+            'chessboard:9x6:25mm',
+            '-o',
+            str(folder / 'example.csv'),
+        ]
+    )
     yield from _calibrated(folder, 'example', 'example.csv', '480x450')
-    yield _diagnosis('example', '{inputs}/example.csv', '--lens', '{inputs}/example.yaml',
-                     '--poses', '{inputs}/example/truth/poses.csv', '--next', '2')
-    yield _diagnosis('example-for', '{inputs}/example.csv', '--quick', '--lens',
-                     '{inputs}/example.yaml', '--next', '2', '--for', 'e0')
+    yield _diagnosis(
+        'example',
+        '{inputs}/example.csv',
+        '--lens',
+        '{inputs}/example.yaml',
+        '--poses',
+        '{inputs}/example/truth/poses.csv',
+        '--next',
+        '2',
+    )
+    yield _diagnosis(
+        'example-for',
+        '{inputs}/example.csv',
+        '--quick',
+        '--lens',
+        '{inputs}/example.yaml',
+        '--next',
+        '2',
+        '--for',
+        'e0',
+    )
     hidden = next(one for one in KINDS.values() if one.rendered)
-    for name, seen in (('rig', pair(hidden, 0)), ('drawn-rig', pair(replace(
-            hidden, rendered=False), 1))):
+    for name, seen in (
+        ('rig', pair(hidden, 0)),
+        ('drawn-rig', pair(replace(hidden, rendered=False), 1)),
+    ):
         write_observations(folder / f'{name}.csv', seen.table)
         lenses = []
         for camera, lens in seen.lenses.items():
             save_lens(lens, folder / f'{name}-{camera}.yaml')
             lenses += ['--lens', f'{camera}={{inputs}}/{name}-{camera}.yaml']
         yield _diagnosis(name, f'{{inputs}}/{name}.csv', *lenses)
-    yield Case('rig-calibrate', ['calibrate', '{inputs}/rig.csv', '-o', '{output}/lenses',
-                                 '--image-size', 'left=1280x960,right=1024x768'])
+    yield Case(
+        'rig-calibrate',
+        [
+            'calibrate',
+            '{inputs}/rig.csv',
+            '-o',
+            '{output}/lenses',
+            '--image-size',
+            'left=1280x960,right=1024x768',
+        ],
+    )
 
 
 def _blind(folder: Path) -> Iterator[Case]:
@@ -110,8 +168,9 @@ def _blind(folder: Path) -> Iterator[Case]:
                 test: Observations = scene.table(case.given, held_out=True)
                 write_observations(folder / f'{name}-test.csv', test)
                 extra += ['--held-out', f'{{inputs}}/{name}-test.csv']
-            yield _diagnosis(name, f'{{inputs}}/{name}.csv', '--lens',
-                             f'{{inputs}}/{name}.yaml', *extra)
+            yield _diagnosis(
+                name, f'{{inputs}}/{name}.csv', '--lens', f'{{inputs}}/{name}.yaml', *extra
+            )
 
 
 def _each(mode: str) -> int:
@@ -172,8 +231,10 @@ def _content(path: Path, folders: Sequence[str]) -> Any:
     if path.suffix == '.csv':
         rows = np.genfromtxt(path, delimiter=',', names=True, dtype=None, encoding='utf-8')
         numbers = [name for name in rows.dtype.names if rows.dtype[name].kind in 'if']
-        return {'rows': len(rows),
-                'squares': {name: float(np.nansum(rows[name] ** 2.0)) for name in numbers}}
+        return {
+            'rows': len(rows),
+            'squares': {name: float(np.nansum(rows[name] ** 2.0)) for name in numbers},
+        }
     return None
 
 
@@ -186,8 +247,11 @@ def differences(before: Any, after: Any, place: str = '') -> Iterator[tuple[str,
     if isinstance(before, dict) and isinstance(after, dict):
         for key in before:
             yield from differences(before[key], after.get(key), f'{place}/{key}')
-        yield from (('new', f'{place}/{key}: {str(after[key])[:200]}')
-                    for key in after if key not in before)
+        yield from (
+            ('new', f'{place}/{key}: {str(after[key])[:200]}')
+            for key in after
+            if key not in before
+        )
     elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
         for number, both in enumerate(zip(before, after, strict=True)):
             yield from differences(*both, f'{place}/{number}')
@@ -205,7 +269,8 @@ def _of_text(before: str, after: str, place: str) -> Iterator[tuple[str, str]]:
     """Yield how texts differ: numbers by more than a unit of their last place, or words."""
     both = _numbers(before), _numbers(after)
     alike = len(both[0]) == len(both[1]) and all(
-        abs(_value(a) - _value(b)) <= 1.001 * _unit(a) for a, b in zip(*both, strict=True))
+        abs(_value(a) - _value(b)) <= 1.001 * _unit(a) for a, b in zip(*both, strict=True)
+    )
     if not alike or ' ' not in before:
         if not (alike and _NUMBER.sub('', before) == _NUMBER.sub('', after)):
             yield 'value', f'{place}: {before!r} -> {after!r}'
@@ -245,12 +310,16 @@ def compare(folder: Path, names: Sequence[str], workers: int) -> int:
         values = [text for kind, text in found if kind == 'value']
         count += len(values)
         kinds = [kind for kind, _ in found]
-        print(f'{one["name"]}: {len(values)} values differ, {kinds.count("words")} sentences, '
-              f'{kinds.count("new")} are new')
+        print(
+            f'{one["name"]}: {len(values)} values differ, {kinds.count("words")} sentences, '
+            f'{kinds.count("new")} are new'
+        )
         for kind, text in found:
             print(f'  {kind} {text}')
-    print(f'{len(cases)} runs, {count} values differ; {seconds[0]:.0f} s of processors before, '
-          f'{seconds[1]:.0f} s now')
+    print(
+        f'{len(cases)} runs, {count} values differ; {seconds[0]:.0f} s of processors before, '
+        f'{seconds[1]:.0f} s now'
+    )
     return count
 
 
@@ -266,8 +335,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument('what', choices=('record', 'compare'))
     parser.add_argument('folder', type=Path, help='where inputs and outcomes are kept')
     parser.add_argument('--data', type=Path, default=Path('data'), help='real sets, to record')
-    parser.add_argument('--subset', choices=('fast', 'all'), default='all',
-                        help=f'with compare: fast is {", ".join(FAST)}')
+    parser.add_argument(
+        '--subset',
+        choices=('fast', 'all'),
+        default='all',
+        help=f'with compare: fast is {", ".join(FAST)}',
+    )
     parser.add_argument('--only', nargs='+', default=[], help='with compare: these runs')
     parser.add_argument('--workers', type=int, default=2, help='processes')
     asked = parser.parse_args(arguments)

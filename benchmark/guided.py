@@ -86,8 +86,10 @@ class Hand:
             here, there = (self._by_eye(uv, seen.ids) for uv in (seen.uv, outline[seen.ids]))
             change = there.compose(here.inverse())
             size = np.linalg.norm(there.position - here.position)
-            self.board = self._shaken(_between(self.board, change.compose(self.board), 0.8), (
-                CORRECTION[0] + SHARE * size, CORRECTION[1]))
+            self.board = self._shaken(
+                _between(self.board, change.compose(self.board), 0.8),
+                (CORRECTION[0] + SHARE * size, CORRECTION[1]),
+            )
         return True
 
     @property
@@ -107,8 +109,10 @@ class Hand:
 
 def _between(start: Pose, end: Pose, share: float) -> Pose:
     turn = vector_from_rotation(end.rotation @ start.rotation.T)
-    return Pose(rotation_from_vector(share * turn) @ start.rotation,
-                start.position + share * (end.position - start.position))
+    return Pose(
+        rotation_from_vector(share * turn) @ start.rotation,
+        start.position + share * (end.position - start.position),
+    )
 
 
 def hidden(rng: np.random.Generator) -> Lens:
@@ -127,8 +131,10 @@ def camera(number: int, picture: Path | None = None) -> dict[str, Any]:
     lens, pattern = hidden(rng), parse_pattern(BOARD)
     field_of_view = 2 * lens.max_incidence * float(rng.normal(1, 0.02))
     sheet = nominal_lens(SIZE, field_of_view)
-    guide = Guide(start_session(sheet, pattern.points, ROOM, 'e0', GOAL),
-                  np.stack([turn.source for turn in pattern.symmetries]))
+    guide = Guide(
+        start_session(sheet, pattern.points, ROOM, 'e0', GOAL),
+        np.stack([turn.source for turn in pattern.symmetries]),
+    )
     hand = Hand(nominal_lens(SIZE, field_of_view), pattern.points, rng)
     printed, moved = Print(9, 6, 0.025), True
     seen: DetectedBoard | None = None
@@ -163,14 +169,21 @@ def camera(number: int, picture: Path | None = None) -> dict[str, Any]:
         first = not guide.session.taken and 0.4 < guide.score < MIN_SCORE
         if picture and pixels is not None and first:
             with replacing(picture) as path:
-                cv2.imwrite(str(path), draw_guide(pixels, guide, seen),
-                            [cv2.IMWRITE_JPEG_QUALITY, 75])
+                cv2.imwrite(
+                    str(path), draw_guide(pixels, guide, seen), [cv2.IMWRITE_JPEG_QUALITY, 75]
+                )
         moved = hand.move(guide, seen)
-    return {**judged(guide, lens), 'half_field_deg': float(np.degrees(lens.max_incidence)),
-            'images': images, 'seconds': t, 'given_up': refused,
-            'settled': bool(guide.stand.settled),
-            'guide_named': stands[-1].named, 'guide_alike': stands[-1].alike,
-            'guide_stderr_m': [s.stderr for s in stands]}
+    return {
+        **judged(guide, lens),
+        'half_field_deg': float(np.degrees(lens.max_incidence)),
+        'images': images,
+        'seconds': t,
+        'given_up': refused,
+        'settled': bool(guide.stand.settled),
+        'guide_named': stands[-1].named,
+        'guide_alike': stands[-1].alike,
+        'guide_stderr_m': [s.stderr for s in stands],
+    }
 
 
 def judged(guide: Guide, lens: Lens) -> dict[str, Any]:
@@ -184,11 +197,13 @@ def judged(guide: Guide, lens: Lens) -> dict[str, Any]:
     e0 = [c.parameters['e0'] for c in bare.causes if c.effect == 'viewpoint_shift']
     true = lens.viewpoint_shift.e0
     return {
-        'photographs': len(guide.session.taken), 'verdict': found.verdict,
+        'photographs': len(guide.session.taken),
+        'verdict': found.verdict,
         'classes': [[c.effect, *c.indistinguishable_from] for c in found.causes],
         'without_port': [[c.effect, *c.indistinguishable_from] for c in bare.causes],
         'e0_true_m': true,
-        'e0_m': e0[0]['value'] if e0 else None, 'e0_stderr_m': e0[0]['stderr'] if e0 else None,
+        'e0_m': e0[0]['value'] if e0 else None,
+        'e0_stderr_m': e0[0]['stderr'] if e0 else None,
         'error_over_stderr': (e0[0]['value'] - true) / e0[0]['stderr'] if e0 else None,
     }
 
@@ -199,8 +214,10 @@ def summary(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
     counts = [c['photographs'] for c in cameras]
     shift = 'viewpoint_shift'
     return {
-        'settled': sum(c['settled'] for c in cameras), 'cameras': len(cameras),
-        'photographs_median': float(np.median(counts)), 'photographs_most': max(counts),
+        'settled': sum(c['settled'] for c in cameras),
+        'cameras': len(cameras),
+        'photographs_median': float(np.median(counts)),
+        'photographs_most': max(counts),
         'named': sum(any(shift == one[0] for one in c['classes']) for c in cameras),
         'in_class': sum(any(shift in one for one in c['classes']) for c in cameras),
         'named_without_port': len(pulls),
@@ -212,11 +229,19 @@ def summary(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the trial, write it, print what came of it."""
-    asked = study.parser('guided', __doc__, study.RESULTS / 'next' / 'guided.json', workers=False,
-                         cameras=(10, 'hidden ones')).parse_args(arguments)
+    asked = study.parser(
+        'guided',
+        __doc__,
+        study.RESULTS / 'next' / 'guided.json',
+        workers=False,
+        cameras=(10, 'hidden ones'),
+    ).parse_args(arguments)
     cameras = study.in_turn(
-        'cameras', lambda number: camera(number, PICTURE if not number else None),
-        range(asked.cameras), lambda some: write_text(asked.output, study.json_lines(some)))
+        'cameras',
+        lambda number: camera(number, PICTURE if not number else None),
+        range(asked.cameras),
+        lambda some: write_text(asked.output, study.json_lines(some)),
+    )
     sys.stdout.write(json.dumps(summary(cameras), indent=1) + '\n')
 
 

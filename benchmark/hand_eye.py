@@ -37,8 +37,11 @@ _SHIFT = Gennery(e0=0.015)
 _SQUARE, _COLUMNS, _ROWS = 0.03, 11, 8
 _BEND = 3e-4  # m
 _NEAR = 40.0  # px: rays are compared where image points are
-_OPENCV = {'Tsai': cv2.CALIB_HAND_EYE_TSAI, 'Park': cv2.CALIB_HAND_EYE_PARK,
-           'Daniilidis': cv2.CALIB_HAND_EYE_DANIILIDIS}
+_OPENCV = {
+    'Tsai': cv2.CALIB_HAND_EYE_TSAI,
+    'Park': cv2.CALIB_HAND_EYE_PARK,
+    'Daniilidis': cv2.CALIB_HAND_EYE_DANIILIDIS,
+}
 
 
 class Case(NamedTuple):
@@ -81,16 +84,19 @@ def draw_case(seed: int, hidden: bool, bent: bool) -> Case:
     uv = uv + rng.normal(0, _NOISE_PX, uv.shape)
     inside = ((uv > 0) & (uv < (lens.width, lens.height))).all(axis=-1)
     frame, landmark = np.nonzero(inside)
-    table = make_observations(frame, landmark, np.asarray(uv[frame, landmark]),
-                              said[landmark], source='robot')
+    table = make_observations(
+        frame, landmark, np.asarray(uv[frame, landmark]), said[landmark], source='robot'
+    )
     truth = Transforms(
         Pose(rotation_from_vector(rng.normal(0, 0.5, 3)), rng.normal(0, 0.04, 3)),
         Pose(rotation_from_vector(rng.normal(0, 1.0, 3)), rng.normal(0, 0.5, 3)),
-        float(1 + rng.normal(0, 5e-4)))
+        float(1 + rng.normal(0, 5e-4)),
+    )
     noise = float(rng.uniform(1e-4, 4e-4)), float(np.radians(rng.uniform(0.02, 0.08)))
     flange = truth.flange(camera)
     flange = Pose(flange.rotation, flange.position / truth.scale).retract(
-        rng.normal(size=(_FRAMES, 6)) * np.repeat(noise, 3))
+        rng.normal(size=(_FRAMES, 6)) * np.repeat(noise, 3)
+    )
     poses = {i: flange.take(i) for i in range(_FRAMES)}
     return Case(lens, table, poses, truth, noise)
 
@@ -115,16 +121,25 @@ def run_trial(task: tuple[int, bool]) -> Outcome:
     alone = calibrate(case.table, 'kannala_brandt', (_LENS.width, _LENS.height))
     with_robot, found = calibrate_hand_eye(alone, case.table, case.poses)
     truth = case.truth
-    z = np.concatenate([found.camera.difference(truth.camera),
-                        found.target.difference(truth.target), [found.scale - truth.scale]])
+    z = np.concatenate(
+        [
+            found.camera.difference(truth.camera),
+            found.target.difference(truth.target),
+            [found.scale - truth.scale],
+        ]
+    )
     return Outcome(
-        'viewpoint_shift' if hidden else '', (z / found.stderr).tolist(),
+        'viewpoint_shift' if hidden else '',
+        (z / found.stderr).tolist(),
         _error(found.camera, truth.camera),
-        {name: _error(_opencv(alone, case, method), truth.camera)
-         for name, method in _OPENCV.items()},
+        {
+            name: _error(_opencv(alone, case, method), truth.camera)
+            for name, method in _OPENCV.items()
+        },
         (found.noise_m / case.noise[0], found.noise_rad / case.noise[1]),
         (_ray_error(alone, case), _ray_error(with_robot, case)),
-        _named(case, alone) if diagnosed else None)
+        _named(case, alone) if diagnosed else None,
+    )
 
 
 def _error(found: Pose, truth: Pose) -> tuple[float, float]:
@@ -137,8 +152,12 @@ def _opencv(found: Calibration, case: Case, method: int) -> Pose:
     flange = Pose.stack([case.poses[i] for i in found.views.frame.tolist()])
     target = found.adjusted.pose.inverse()
     turn, place = cv2.calibrateHandEye(  # type: ignore[attr-defined,unused-ignore]
-        list(flange.rotation), list(flange.position), list(target.rotation),
-        list(target.position), method=method)
+        list(flange.rotation),
+        list(flange.position),
+        list(target.rotation),
+        list(target.position),
+        method=method,
+    )
     return Pose(np.asarray(turn, dtype=float), np.asarray(place, dtype=float).ravel())
 
 
@@ -153,15 +172,26 @@ def _ray_error(found: Calibration, case: Case) -> float:
 
 def _named(case: Case, found: Calibration) -> tuple[list[str], list[str], bool]:
     """Return the causes in the lens without and with poses, and whether the robot was told."""
-    diagnoses = [diagnose(case.table, found.adjusted.lens, free_intrinsics=True, poses=poses,
-                          options=DiagnosisOptions(quick=True)) for poses in (None, case.poses)]
+    diagnoses = [
+        diagnose(
+            case.table,
+            found.adjusted.lens,
+            free_intrinsics=True,
+            poses=poses,
+            options=DiagnosisOptions(quick=True),
+        )
+        for poses in (None, case.poses)
+    ]
     alone, with_poses = map(_lens_causes, diagnoses)
     return alone, with_poses, diagnoses[1].hand_eye is not None
 
 
 def _lens_causes(found: Diagnosis) -> list[str]:
-    return [cause.effect for cause in found.causes
-            if cause.effect_class.stage not in ('target', 'pose', 'noise')]
+    return [
+        cause.effect
+        for cause in found.causes
+        if cause.effect_class.stage not in ('target', 'pose', 'noise')
+    ]
 
 
 def write_results(outcomes: Sequence[Outcome], path: Path = study.RESULTS / 'hand_eye.md') -> None:
@@ -170,29 +200,47 @@ def write_results(outcomes: Sequence[Outcome], path: Path = study.RESULTS / 'han
     z = np.array([one.z for one in clean])
     inside = (np.abs(z) < stats.norm.ppf(0.975)).mean()
     rows = [('ours', *_median([one.ours for one in clean]))]
-    rows += [(f'OpenCV, {name}', *_median([one.opencv[name] for one in clean]))
-             for name in _OPENCV]
+    rows += [
+        (f'OpenCV, {name}', *_median([one.opencv[name] for one in clean])) for name in _OPENCV
+    ]
     rays = np.array([one.rays for one in clean])
     noise = np.array([one.noise for one in clean])
     asked = [one for one in outcomes if one.named is not None]
-    study.write_wrapped(path, [
-        '# Cameras on robots', '',
-        'Written by `python -m benchmark.hand_eye` (`make hand-eye`). A robot turns a camera of '
-        f'1280 x 800 px ({_LENS.fx:.0f} px, Kannala-Brandt) before a board of {_COLUMNS} x '
-        f'{_ROWS} corners, {_FRAMES} photographs, {_NOISE_PX} px of noise. Its poses are those of '
-        'the flange, with noise of 0.1 to 0.4 mm and 0.02 to 0.08 deg an axis and a scale of '
-        '0.05 %. OpenCV solves from the poses of our calibrated lens.', '',
-        *study.table(f'{len(clean)} robots | place, mm | turn, deg', [
-            (name, f'{1e3 * place:.3f}', f'{np.degrees(turn):.4f}')
-            for name, place, turn in rows]),
-        '', 'Median errors of the camera in the flange.', '',
-        f'- Of the {z.size} numbers of the transforms, {100 * inside:.1f} % lie within 1.96 of '
-        'their standard errors; 95 % should.',
-        f'- The estimated noise of the robot is {np.median(noise[:, 0]):.2f} (m) and '
-        f'{np.median(noise[:, 1]):.2f} (rad) times the true one, median.',
-        f'- The rays of the calibrated lens are off by {1e3 * np.median(rays[:, 0]):.3f} mrad '
-        f'without the robot\'s poses, by {1e3 * np.median(rays[:, 1]):.3f} mrad with them '
-        '(median).', '', *(_diagnosed_lines(asked) if asked else ())])
+    study.write_wrapped(
+        path,
+        [
+            '# Cameras on robots',
+            '',
+            'Written by `python -m benchmark.hand_eye` (`make hand-eye`). A robot turns '
+            'a camera of '
+            f'1280 x 800 px ({_LENS.fx:.0f} px, Kannala-Brandt) before a board of {_COLUMNS} x '
+            f'{_ROWS} corners, {_FRAMES} photographs, {_NOISE_PX} px of noise. Its poses '
+            'are those of '
+            'the flange, with noise of 0.1 to 0.4 mm and 0.02 to 0.08 deg an axis and a scale of '
+            '0.05 %. OpenCV solves from the poses of our calibrated lens.',
+            '',
+            *study.table(
+                f'{len(clean)} robots | place, mm | turn, deg',
+                [
+                    (name, f'{1e3 * place:.3f}', f'{np.degrees(turn):.4f}')
+                    for name, place, turn in rows
+                ],
+            ),
+            '',
+            'Median errors of the camera in the flange.',
+            '',
+            f'- Of the {z.size} numbers of the transforms, {100 * inside:.1f} % lie '
+            'within 1.96 of '
+            'their standard errors; 95 % should.',
+            f'- The estimated noise of the robot is {np.median(noise[:, 0]):.2f} (m) and '
+            f'{np.median(noise[:, 1]):.2f} (rad) times the true one, median.',
+            f'- The rays of the calibrated lens are off by {1e3 * np.median(rays[:, 0]):.3f} mrad '
+            f"without the robot's poses, by {1e3 * np.median(rays[:, 1]):.3f} mrad with them "
+            '(median).',
+            '',
+            *(_diagnosed_lines(asked) if asked else ()),
+        ],
+    )
 
 
 def _median(errors: Sequence[tuple[float, float]]) -> Array:
@@ -205,12 +253,22 @@ def _diagnosed_lines(asked: Sequence[Outcome]) -> list[str]:
     return [
         f'`diagnose --quick`, {len(shown)} more robots, whose boards are bent by 0.1 to 0.3 mm, '
         f'with the poses and without; they are recognized as those of a robot in '
-        f'{sum(told for *_, told in shown)}:', '',
-        *study.table(' | robots | a cause in the lens, without poses | with poses', [
-            (hidden or 'no hidden error', len(mine), sum(bool(one[1]) for one in mine),
-             sum(bool(one[2]) for one in mine))
-            for hidden in ('', 'viewpoint_shift')
-            if (mine := [one for one in shown if one[0] == hidden])]), '',
+        f'{sum(told for *_, told in shown)}:',
+        '',
+        *study.table(
+            ' | robots | a cause in the lens, without poses | with poses',
+            [
+                (
+                    hidden or 'no hidden error',
+                    len(mine),
+                    sum(bool(one[1]) for one in mine),
+                    sum(bool(one[2]) for one in mine),
+                )
+                for hidden in ('', 'viewpoint_shift')
+                if (mine := [one for one in shown if one[0] == hidden])
+            ],
+        ),
+        '',
     ]
 
 

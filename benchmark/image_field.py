@@ -48,27 +48,57 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
         'warp of .14 to .4 px': [one for one in outcomes if one.size > 0.14],
         'all warps': [one for one in outcomes if one.size],
         'warps, field written': [one for one in outcomes if one.size and one.written],
-        'no warp': [one for one in outcomes if not one.size]}
+        'no warp': [one for one in outcomes if not one.size],
+    }
     rows = []
     for name, some in kinds.items():
         if some:
             given, without, with_field = np.log([one.errors for one in some]).T
-            ratios = np.exp([(without - given).mean(), (with_field - without).mean(),
-                             (with_field - without).max()])
-            rows.append([name, len(some), sum(one.written for one in some),
-                         *(f'{one:.3f}' for one in ratios)])
-    return '\n'.join([
-        '# The image field', '', *study.paragraph(__doc__), f'`{command}`', '',
-        'Geometric means of the ray error: without the field over that of `calibrate`,',
-        'with the field over that without it; the worst of the latter.', '',
-        *study.table('sets | number | field written | without / calibrate | with / without '
-                     '| worst', rows), ''])
+            ratios = np.exp(
+                [
+                    (without - given).mean(),
+                    (with_field - without).mean(),
+                    (with_field - without).max(),
+                ]
+            )
+            rows.append(
+                [
+                    name,
+                    len(some),
+                    sum(one.written for one in some),
+                    *(f'{one:.3f}' for one in ratios),
+                ]
+            )
+    return '\n'.join(
+        [
+            '# The image field',
+            '',
+            *study.paragraph(__doc__),
+            f'`{command}`',
+            '',
+            'Geometric means of the ray error: without the field over that of `calibrate`,',
+            'with the field over that without it; the worst of the latter.',
+            '',
+            *study.table(
+                'sets | number | field written | without / calibrate | with / without | worst',
+                rows,
+            ),
+            '',
+        ]
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Draw, diagnose and compare sets."""
-    study.run_sets('image_field', __doc__, trial, report, arguments,
-                   (30, 'with a warp, and as many without'), each=2)
+    study.run_sets(
+        'image_field',
+        __doc__,
+        trial,
+        report,
+        arguments,
+        (30, 'with a warp, and as many without'),
+        each=2,
+    )
 
 
 if __name__ == '__main__':

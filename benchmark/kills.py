@@ -39,15 +39,35 @@ COMMANDS = {
     'budget': ('budget', '--lens', 'fish180', '-o', '{out}'),
     'calibrate': ('calibrate', '{obs}', '--model', 'kannala_brandt', '-o', '{out}/lens.yaml'),
     'demo': ('demo', '--lenses', 'fish180', '--radii', '0.2', '-o', '{out}'),
-    'detect': ('detect', '{photographs}', '--board', _BOARD, '-o', '{out}/seen.csv',
-               '--overlays', '{out}/overlays'),
+    'detect': (
+        'detect',
+        '{photographs}',
+        '--board',
+        _BOARD,
+        '-o',
+        '{out}/seen.csv',
+        '--overlays',
+        '{out}/overlays',
+    ),
     'diagnose': ('diagnose', '{obs}', '--lens', '{lens}', '--quick', '-o', '{out}'),
     'example': ('example', '-o', '{out}'),
     'lens': ('lens', '{lens}', '--format', 'opencv', '-o', '{out}/opencv.yaml'),
     'localize': ('localize', '{obs}', '--lens', '{lens}', '-o', '{out}'),
     'paper': ('paper', '-o', '{out}'),
-    'plan': ('plan', '--lens', 'fish180', '--board', _BOARD, '--room', '0.1', '0.5', '--count',
-             '4', '-o', '{out}'),
+    'plan': (
+        'plan',
+        '--lens',
+        'fish180',
+        '--board',
+        _BOARD,
+        '--room',
+        '0.1',
+        '0.5',
+        '--count',
+        '4',
+        '-o',
+        '{out}',
+    ),
     'plot': ('plot', '{swept}', '-o', '{out}'),
     'render': ('render', '--lens', 'fish180', '--board', _BOARD, '--count', '6', '-o', '{out}'),
     'sweep': ('sweep', '{sweep}', '-o', '{out}', '--workers', '2', '--resume'),
@@ -56,11 +76,19 @@ COMMANDS = {
 NODES = {
     'record': ('record', '-o', '{out}/recording'),
     'watch': ('watch',),
-    **{f'run {node}': ('run', node) for node in (
-        'synthetic_camera', 'detector', 'rectifier', 'localizer', 'stereo_calibrator',
-        'stereo_depth', 'model_critic')},
-    'run measured_camera': ('run', 'measured_camera', '--ros-args', '-p',
-                            'observations:={obs}'),
+    **{
+        f'run {node}': ('run', node)
+        for node in (
+            'synthetic_camera',
+            'detector',
+            'rectifier',
+            'localizer',
+            'stereo_calibrator',
+            'stereo_depth',
+            'model_critic',
+        )
+    },
+    'run measured_camera': ('run', 'measured_camera', '--ros-args', '-p', 'observations:={obs}'),
 }
 _MEASURED = {'demo'}  # their tables hold times
 # What is made on the way, and is there whether or not the run came to its end.
@@ -91,11 +119,20 @@ class Outcome:
 def call(words: Sequence[str], before: Sequence[str] = ()) -> subprocess.Popen[str]:
     """Start `fisheye-svp WORDS` in a session of its own; before: what is to start it."""
     # One engine: another one, once it is compiled, gives other last digits.
-    environment = {**os.environ, 'OMP_NUM_THREADS': '1', 'ROS_DOMAIN_ID': '97',
-                   'FISHEYE_SVP_ENGINE': 'numpy'}
+    environment = {
+        **os.environ,
+        'OMP_NUM_THREADS': '1',
+        'ROS_DOMAIN_ID': '97',
+        'FISHEYE_SVP_ENGINE': 'numpy',
+    }
     return subprocess.Popen(
-        [*before, sys.executable, '-m', 'fisheye_svp_ros.cli', *words], env=environment,
-        start_new_session=True, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        [*before, sys.executable, '-m', 'fisheye_svp_ros.cli', *words],
+        env=environment,
+        start_new_session=True,
+        text=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
 
 
 def done(words: Sequence[str], before: Sequence[str] = ()) -> tuple[int, str]:
@@ -131,13 +168,25 @@ def left_running(session: int) -> list[int]:
 def prepare(folder: Path) -> dict[str, Path]:
     """Make the inputs of the commands."""
     given = {name: folder / name for name in ('photographs', 'swept', 'recording')}
-    given |= {'obs': folder / 'obs.csv', 'lens': folder / 'lens.yaml',
-              'sweep': folder / 'sweep.yaml'}
+    given |= {
+        'obs': folder / 'obs.csv',
+        'lens': folder / 'lens.yaml',
+        'sweep': folder / 'sweep.yaml',
+    }
     given['sweep'].write_text(_SWEEP)
     demonstration = folder / 'demonstration'
     for words in (
-        ('render', '--lens', 'fish180', '--board', _BOARD, '--count', '12', '-o',
-         str(given['photographs'])),
+        (
+            'render',
+            '--lens',
+            'fish180',
+            '--board',
+            _BOARD,
+            '--count',
+            '12',
+            '-o',
+            str(given['photographs']),
+        ),
         ('detect', str(given['photographs']), '--board', _BOARD, '-o', str(given['obs'])),
         ('calibrate', str(given['obs']), '--model', 'kannala_brandt', '-o', str(given['lens'])),
         ('sweep', str(given['sweep']), '-o', str(given['swept'])),
@@ -158,13 +207,12 @@ def moments(count: int, rng: random.Random) -> Iterator[float]:
 
 def tables(folder: Path) -> dict[str, bytes]:
     """Return the tables of a command's folder by name, as they are."""
-    return {name: (folder / name).read_bytes() for name in files(folder)[0]
-            if name.endswith('.csv')}
+    return {
+        name: (folder / name).read_bytes() for name in files(folder)[0] if name.endswith('.csv')
+    }
 
 
-def killed(
-    words: Sequence[str], folder: Path, count: int, rng: random.Random
-) -> Outcome:
+def killed(words: Sequence[str], folder: Path, count: int, rng: random.Random) -> Outcome:
     """Kill a command by each signal; words: with {out} for its folder.
 
     count: how often, one that takes long less often.
@@ -193,7 +241,11 @@ def killed(
 
 
 def kill(
-    words: Sequence[str], out: Path, how: signal.Signals, after: float, whole: dict[str, int],
+    words: Sequence[str],
+    out: Path,
+    how: signal.Signals,
+    after: float,
+    whole: dict[str, int],
     outcome: Outcome,
 ) -> None:
     """Kill a command after some seconds; whole: the sizes of its files in `out`, if it ends."""
@@ -231,7 +283,8 @@ def kill(
 def _same(found: dict[str, int], whole: dict[str, int]) -> bool:
     """Whether the files of a set are all there, and about as long as they ought to be."""
     return found.keys() == whole.keys() and all(
-        0.8 * whole[name] <= size <= 1.25 * whole[name] for name, size in found.items())
+        0.8 * whole[name] <= size <= 1.25 * whole[name] for name, size in found.items()
+    )
 
 
 def killed_node(words: Sequence[str], folder: Path, count: int, rng: random.Random) -> Outcome:
@@ -241,8 +294,9 @@ def killed_node(words: Sequence[str], folder: Path, count: int, rng: random.Rand
         how = signal.SIGTERM if number % 2 else signal.SIGKILL
         out = folder / str(number)
         out.mkdir()
-        kill([word.format(out=out) for word in words], out, how, rng.uniform(0.1, 6.0), {},
-             outcome)
+        kill(
+            [word.format(out=out) for word in words], out, how, rng.uniform(0.1, 6.0), {}, outcome
+        )
         shutil.rmtree(out)
     return outcome
 
@@ -251,8 +305,9 @@ def killed_node(words: Sequence[str], folder: Path, count: int, rng: random.Rand
 def disk(folder: Path, kilobytes: int) -> Iterator[Path]:
     """Mount a small disk."""
     folder.mkdir(exist_ok=True)
-    subprocess.run(['mount', '-t', 'tmpfs', '-o', f'size={kilobytes}k', 'tmpfs', folder],
-                   check=True)
+    subprocess.run(
+        ['mount', '-t', 'tmpfs', '-o', f'size={kilobytes}k', 'tmpfs', folder], check=True
+    )
     try:
         yield folder
     finally:
@@ -305,22 +360,46 @@ def section(
     kinds = ('part', 'temporary file', 'orphan', 'no end', 'rerun')
     tried = sum(sum(one.kills.values()) for one in disks.values())
     faults = sum((one.faults for one in disks.values()), Counter[str]())
-    return '\n'.join([
-        f'`{how}`:', '', *study.table(
-            'killed | SIGTERM | SIGKILL | all files | none | some | temporary files (SIGTERM) | '
-            'processes left | no end | rerun fails',
-            [[name, one.kills['SIGTERM'], one.kills['SIGKILL'], one.whole, one.nothing,
-              *(one.faults[kind] for kind in kinds)]
-             for name, one in {**commands, **nodes}.items()], numbers=True),
-        '', 'Disks that are full before, after 30 % or after 90 % of what the command writes, '
-        f'a read-only file system, and a folder of another user: {tried} runs of {len(disks)} '
-        f'commands; not one line and status 2: {faults["line"]}, files left: {faults["part"]}.'])
+    return '\n'.join(
+        [
+            f'`{how}`:',
+            '',
+            *study.table(
+                'killed | SIGTERM | SIGKILL | all files | none | some | temporary files '
+                '(SIGTERM) | '
+                'processes left | no end | rerun fails',
+                [
+                    [
+                        name,
+                        one.kills['SIGTERM'],
+                        one.kills['SIGKILL'],
+                        one.whole,
+                        one.nothing,
+                        *(one.faults[kind] for kind in kinds),
+                    ]
+                    for name, one in {**commands, **nodes}.items()
+                ],
+                numbers=True,
+            ),
+            '',
+            'Disks that are full before, after 30 % or after 90 % of what the command writes, '
+            f'a read-only file system, and a folder of another user: {tried} runs of {len(disks)} '
+            f'commands; not one line and status 2: {faults["line"]}, files left: '
+            f'{faults["part"]}.',
+        ]
+    )
 
 
 def main() -> int:
     """Kill everything, write the section; return 1 where anything is at fault."""
-    parser = study.parser('kills', __doc__, None, workers=False,
-                          kills=(20, 'of each command by each signal'), seed=(0, 'of the moments'))
+    parser = study.parser(
+        'kills',
+        __doc__,
+        None,
+        workers=False,
+        kills=(20, 'of each command by each signal'),
+        seed=(0, 'of the moments'),
+    )
     parser.add_argument('--without', nargs='*', default=[], choices=[*COMMANDS, *NODES])
     asked = parser.parse_args()
     ended: dict[str, Outcome] = {}
@@ -347,8 +426,12 @@ def main() -> int:
     said = ' '.join(['python -m benchmark.kills', *sys.argv[1:]])
     text = section(ended, stopped, kept_out, said)
     print(text)
-    told = [f'{name}: {line}' for group in (ended, stopped, kept_out)
-            for name, one in group.items() for line in one.told[:5]]
+    told = [
+        f'{name}: {line}'
+        for group in (ended, stopped, kept_out)
+        for name, one in group.items()
+        for line in one.told[:5]
+    ]
     print(*told, sep='\n')
     study.write_section(study.RELIABILITY, 'kills', text)
     return int(bool(told))

@@ -53,8 +53,16 @@ def draw_set(number: int) -> Taken:
     focal = rng.uniform(300.0, 420.0)
     centre = np.array(SIZE) / 2 + 10 * rng.normal(size=2)
     curve = KannalaBrandt(*(rng.normal(size=3) * [0.03, 0.004, 0.001] - [0.02, 0.0, 0.0]))
-    lens = Lens('true', *SIZE, focal, focal * (1 + 1e-4 * rng.normal()), *centre, curve, 1.5,
-                Gennery(e0=shift))
+    lens = Lens(
+        'true',
+        *SIZE,
+        focal,
+        focal * (1 + 1e-4 * rng.normal()),
+        *centre,
+        curve,
+        1.5,
+        Gennery(e0=shift),
+    )
     printed = Print(columns, rows, square)
     poses = board_views(lens, printed, int(rng.integers(15, 35)), (nearest, 0.7), rng)
     points = bent(printed.corners, bend, rng)
@@ -82,11 +90,22 @@ def own_errors(seen: Observations, centre: Array, rng: Rng) -> Array:
     at = (seen.uv - centre) / reach
     x, y = at.T
     radius = np.linalg.norm(at, axis=1, keepdims=True)
-    ripple = sum(0.08 * rng.normal() / j * np.sin(2 * np.pi * j * radius + rng.uniform(0, 6))
-                 for j in (1, 2, 3)) * at / np.maximum(radius, 1e-9)
+    ripple = (
+        sum(
+            0.08 * rng.normal() / j * np.sin(2 * np.pi * j * radius + rng.uniform(0, 6))
+            for j in (1, 2, 3)
+        )
+        * at
+        / np.maximum(radius, 1e-9)
+    )
     p = 3e-4 * reach * rng.normal(size=2)
-    decentering = np.stack([p[0] * (3 * x * x + y * y) + 2 * p[1] * x * y,
-                            p[1] * (3 * y * y + x * x) + 2 * p[0] * x * y], axis=-1)
+    decentering = np.stack(
+        [
+            p[0] * (3 * x * x + y * y) + 2 * p[1] * x * y,
+            p[1] * (3 * y * y + x * x) + 2 * p[0] * x * y,
+        ],
+        axis=-1,
+    )
     static = draw_waves(rng, 80.0, 0.04)(seen.uv)
     powers = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     framed = 0.03 * rng.normal(size=(int(seen.frame.max()) + 1, 2, 6))[seen.frame]
@@ -101,9 +120,14 @@ def trial(number: int) -> dict[str, Any]:
     found, asked = diagnosis.to_dict(), diagnose(table, lens, options=options).to_dict()
     e0 = next(c for c in asked['causes'] if c['effect'] == 'viewpoint_shift')['parameters']['e0']
     return {
-        'number': number, 'e0_mm': 1e3 * shift, 'bend_mm': 1e3 * bend, 'points': len(table),
-        'verdict': found['verdict'], 'causes': [c['effect'] for c in found['causes']],
-        'found_mm': 1e3 * e0['value'], 'stderr_mm': 1e3 * e0['stderr'],
+        'number': number,
+        'e0_mm': 1e3 * shift,
+        'bend_mm': 1e3 * bend,
+        'points': len(table),
+        'verdict': found['verdict'],
+        'causes': [c['effect'] for c in found['causes']],
+        'found_mm': 1e3 * e0['value'],
+        'stderr_mm': 1e3 * e0['stderr'],
         'heldout_rms_px': [found[m]['heldout_rms_px'] for m in ('base', 'named', 'extended')],
     }
 
@@ -116,19 +140,38 @@ def report(trials: Sequence[dict[str, Any]]) -> str:
     for shift, bend in product(SHIFTS, BENDS):
         mine = [t for t in trials if (t['e0_mm'], t['bend_mm']) == (1e3 * shift, 1e3 * bend)]
         if mine:
-            named = [sum(n in t['causes'] for t in mine)
-                     for n in ('viewpoint_shift', 'target_shape')]
+            named = [
+                sum(n in t['causes'] for t in mine) for n in ('viewpoint_shift', 'target_shape')
+            ]
             rms = np.array([t['heldout_rms_px'] for t in mine])
             ratios = np.median(rms[:, 1:] / rms[:, :1], axis=0)
-            rows.append([f'{1e3 * shift:g}', f'{1e3 * bend:g}', len(mine), *named,
-                         *(f'{ratio:.2f}' for ratio in ratios)])
-    return '\n'.join([
-        '# Sets like real ones', '', *study.paragraph(__doc__),
-        f'    python -m benchmark.local_errors --trials {len(trials)}', '',
-        f'The true e0 lies within one standard error in {within[0]:.1%} and within 1.96 in '
-        f'{within[1]:.1%} of {len(pulls)} sets.', '', *study.table(
-            'e0, mm | bend, mm | sets | `viewpoint_shift` named | `target_shape` named '
-            "| held-out rms over the calibration's, `named` | `extended`", rows), ''])
+            rows.append(
+                [
+                    f'{1e3 * shift:g}',
+                    f'{1e3 * bend:g}',
+                    len(mine),
+                    *named,
+                    *(f'{ratio:.2f}' for ratio in ratios),
+                ]
+            )
+    return '\n'.join(
+        [
+            '# Sets like real ones',
+            '',
+            *study.paragraph(__doc__),
+            f'    python -m benchmark.local_errors --trials {len(trials)}',
+            '',
+            f'The true e0 lies within one standard error in {within[0]:.1%} and within 1.96 in '
+            f'{within[1]:.1%} of {len(pulls)} sets.',
+            '',
+            *study.table(
+                'e0, mm | bend, mm | sets | `viewpoint_shift` named | `target_shape` named '
+                "| held-out rms over the calibration's, `named` | `extended`",
+                rows,
+            ),
+            '',
+        ]
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -38,18 +38,44 @@ from benchmark.mutation_reach import Reach, load, trace
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path('fisheye_svp_ros')
-ROOMS = ('optics', 'scene', 'effects', 'mixed_model', 'solve', 'rectify', 'diagnosis', 'planning',
-         'io', 'nodes')
+ROOMS = (
+    'optics',
+    'scene',
+    'effects',
+    'mixed_model',
+    'solve',
+    'rectify',
+    'diagnosis',
+    'planning',
+    'io',
+    'nodes',
+)
 # Compiled, or part of what is: tried uncompiled first, which spares a minute where that fails.
 COMPILED = {
-    'optics/formulas.py', 'optics/rays.py', *(f'optics/engines/{name}.py' for name in (
-        'kernels', 'adjustment', 'entries', 'marquardt')),
+    'optics/formulas.py',
+    'optics/rays.py',
+    *(f'optics/engines/{name}.py' for name in ('kernels', 'adjustment', 'entries', 'marquardt')),
 }
 FORK = get_context('fork')
 # What the tests import of others, loaded once for all mutants.
-PRELOADED = ('pytest', 'hypothesis', 'numpy', 'scipy.optimize', 'scipy.stats', 'scipy.spatial',
-             'scipy.sparse.linalg', 'numba', 'cv2', 'matplotlib.pyplot', 'rosbags.highlevel',
-             'yaml', 'pyarrow.parquet', 'rclpy.node', 'rich.console', 'jinja2')
+PRELOADED = (
+    'pytest',
+    'hypothesis',
+    'numpy',
+    'scipy.optimize',
+    'scipy.stats',
+    'scipy.spatial',
+    'scipy.sparse.linalg',
+    'numba',
+    'cv2',
+    'matplotlib.pyplot',
+    'rosbags.highlevel',
+    'yaml',
+    'pyarrow.parquet',
+    'rclpy.node',
+    'rich.console',
+    'jinja2',
+)
 BY_HAND = '\n<!-- what the survivors are: by hand -->\n'  # kept from here on
 KINDS = {
     'NumberReplacer': 'a number one off',
@@ -130,8 +156,9 @@ def sample(count: int, seed: int, tree: Path) -> list[Mutant]:
     return list(islice((one for one in drawn if changes_meaning(one, tree)), count))
 
 
-def verdict(tests: list[str], compiled: bool, tree: Path, budget: float, seconds: list[float],
-            log: Path) -> str:
+def verdict(
+    tests: list[str], compiled: bool, tree: Path, budget: float, seconds: list[float], log: Path
+) -> str:
     """Say what the tests, the quickest first, make of the fault in a copy of the tree.
 
     'survived', 'survived N s of tests' where that is not all that reach it, 'nothing reaches it',
@@ -146,12 +173,16 @@ def verdict(tests: list[str], compiled: bool, tree: Path, budget: float, seconds
         found = _failing(chosen, tree, environment, patience, log)
         if found and (found != 'hung' or environment['NUMBA_DISABLE_JIT'] == '0'):
             return found
-    return 'survived' if within == len(tests) else (
-        f'survived {budget:g} s of {sum(seconds):.0f} s of tests')
+    return (
+        'survived'
+        if within == len(tests)
+        else (f'survived {budget:g} s of {sum(seconds):.0f} s of tests')
+    )
 
 
-def _failing(tests: list[str], tree: Path, environment: dict[str, str], patience: float,
-             log: Path) -> str:
+def _failing(
+    tests: list[str], tree: Path, environment: dict[str, str], patience: float, log: Path
+) -> str:
     """Return the first test that fails, 'hung', or nothing, in a process that is forked."""
     child = FORK.Process(target=_run_tests, args=(tests, tree, environment, log))
     child.start()
@@ -183,6 +214,7 @@ def _run_tests(tests: list[str], tree: Path, environment: dict[str, str], log: P
     if (numba := sys.modules.get('numba')) is not None:
         numba.config.DISABLE_JIT = int(environment['NUMBA_DISABLE_JIT'])
     import pytest
+
     os._exit(int(pytest.main(['-x', '-q', '-p', 'no:cacheprovider', *tests])))
 
 
@@ -198,8 +230,14 @@ def attempt(mutant: Mutant, tree: Path, reach: Reach, budget: float) -> str:
         if compiled:
             os.environ['XDG_CACHE_HOME'] = folder
         try:
-            return verdict(tests, compiled, tree, budget, [reach.seconds[one] for one in tests],
-                           Path(folder, 'log'))
+            return verdict(
+                tests,
+                compiled,
+                tree,
+                budget,
+                [reach.seconds[one] for one in tests],
+                Path(folder, 'log'),
+            )
         finally:
             os.environ.pop('XDG_CACHE_HOME', None)
             target.write_text(source, encoding='utf-8')
@@ -209,8 +247,9 @@ def attempt(mutant: Mutant, tree: Path, reach: Reach, budget: float) -> str:
 def run(mutants: list[Mutant], folder: Path, budget: float) -> dict[str, str]:
     """Try every mutant that the folder does not know yet; return the verdicts by key."""
     state, tree = folder / 'verdicts.jsonl', folder.resolve() / 'tree'
-    known: dict[str, str] = dict(
-        json.loads(line) for line in state.read_text().splitlines()) if state.exists() else {}
+    known: dict[str, str] = (
+        dict(json.loads(line) for line in state.read_text().splitlines()) if state.exists() else {}
+    )
     open_ones = [mutant for mutant in mutants if _key(mutant) not in known]
     reach = load(tree, folder / 'reach')
     for name in PRELOADED:
@@ -249,20 +288,26 @@ def report(mutants: list[Mutant], verdicts: dict[str, str], command: str) -> str
             alive.setdefault(_kind(mutant.operator), []).append(mutant)
     total: Any = sum(rooms.values(), Counter())
     lines = [
-        '# Which faults the tests find', '',
+        '# Which faults the tests find',
+        '',
         f'`{command}` puts one small fault at a time into the package and runs the tests that '
         'reach it; tests that take several times as long as before are cut off, and do not count.',
-        '', '| room | mutants | found | share | cut off |', '|---|---|---|---|---|',
+        '',
+        '| room | mutants | found | share | cut off |',
+        '|---|---|---|---|---|',
     ]
     for room, count in [*rooms.items(), ('all', total)]:
         tried = count['found'] + count['alive']
         if tried:
-            lines.append(f'| {room} | {tried} | {count["found"]} | {count["found"] / tried:.0%} | '
-                         f'{count["cut off"]} |')
+            lines.append(
+                f'| {room} | {tried} | {count["found"]} | {count["found"] / tried:.0%} | '
+                f'{count["cut off"]} |'
+            )
     lines += ['', '| not found | faults | file and line |', '|---|---|---|']
     for kind, ones in sorted(alive.items()):
-        places = ', '.join(f'`{m.path.removeprefix("fisheye_svp_ros/")}` {m.line}'
-                           for m in sorted(ones))
+        places = ', '.join(
+            f'`{m.path.removeprefix("fisheye_svp_ros/")}` {m.line}' for m in sorted(ones)
+        )
         lines.append(f'| {kind} | {len(ones)} | {places} |')
     return '\n'.join(lines) + '\n'
 

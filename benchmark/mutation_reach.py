@@ -21,8 +21,20 @@ from coverage.exceptions import DataError
 
 # Traced one after the other, so that an interrupted trace goes on where it was.
 GROUPS = {
-    'numbers': ['optics', 'scene', 'io', 'effects', 'mixed_model', 'simulate', 'solve', 'rectify',
-                'study', 'test_pose.py', 'test_library.py', 'test_registry.py'],
+    'numbers': [
+        'optics',
+        'scene',
+        'io',
+        'effects',
+        'mixed_model',
+        'simulate',
+        'solve',
+        'rectify',
+        'study',
+        'test_pose.py',
+        'test_library.py',
+        'test_registry.py',
+    ],
     'uncompiled': ['optics', 'solve/test_least_squares.py', '-k', 'numba or engine or compiled'],
     'diagnosis': ['diagnosis', 'planning'],
     'nodes': ['nodes'],
@@ -52,8 +64,11 @@ class Reach(NamedTuple):
         The module's own tests come first, then the others; of both, the quickest first.
         """
         syntax = ast.parse((tree / path).read_text(encoding='utf-8'))
-        around = [one for one in ast.walk(syntax) if isinstance(one, ast.stmt)
-                  and _first_line(one) <= line <= (one.end_lineno or 0)]
+        around = [
+            one
+            for one in ast.walk(syntax)
+            if isinstance(one, ast.stmt) and _first_line(one) <= line <= (one.end_lineno or 0)
+        ]
         statement = around[-1] if around else syntax  # the innermost: `walk` goes by depth
         if any(isinstance(one, ast.FunctionDef) and line >= one.body[0].lineno for one in around):
             found = self._tests(path, _head(statement))
@@ -62,8 +77,10 @@ class Reach(NamedTuple):
         else:  # what runs once, when the module is imported, shows where its names are used
             found = self._uses(tree, _targets(statement)) or self._tests(path, _bodies(syntax))
         own = f'/test_{Path(path).stem}.py'
-        return sorted(found & self.seconds.keys(),
-                      key=lambda test: (own not in test, self.seconds[test], test))
+        return sorted(
+            found & self.seconds.keys(),
+            key=lambda test: (own not in test, self.seconds[test], test),
+        )
 
     def _tests(self, path: str, lines: Iterable[int]) -> set[str]:
         by_line = self.tests.get(path, {})
@@ -90,16 +107,32 @@ def trace(tree: Path, folder: Path) -> None:
             continue
         settings = folder / f'settings_{group}.ini'  # no name that coverage takes for data
         settings.write_text(_SETTINGS.format(tree=tree, folder=folder.resolve(), group=group))
-        paths = [f'test/{word}' if (tree / 'test' / word).exists() else word
-                 for word in arguments]
+        paths = [f'test/{word}' if (tree / 'test' / word).exists() else word for word in arguments]
         environment = os.environ | {'PYTHONPATH': str(tree), 'OMP_NUM_THREADS': '1'}
         if group == 'uncompiled':
             environment['NUMBA_DISABLE_JIT'] = '1'
         done = subprocess.run(
-            [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', '--cov',
-             f'--cov-config={settings.resolve()}', '--cov-context=test', '--cov-report=',
-             '--durations=0', '--durations-min=0', '-vv', *paths],
-            cwd=tree, env=environment, capture_output=True, text=True)
+            [
+                sys.executable,
+                '-m',
+                'pytest',
+                '-q',
+                '-p',
+                'no:cacheprovider',
+                '--cov',
+                f'--cov-config={settings.resolve()}',
+                '--cov-context=test',
+                '--cov-report=',
+                '--durations=0',
+                '--durations-min=0',
+                '-vv',
+                *paths,
+            ],
+            cwd=tree,
+            env=environment,
+            capture_output=True,
+            text=True,
+        )
         log.write_text(done.stdout, encoding='utf-8')
 
 
@@ -153,12 +186,19 @@ def _first_line(statement: ast.stmt) -> int:
 
 def _targets(statement: ast.AST) -> set[str]:
     targets = getattr(statement, 'targets', None) or [getattr(statement, 'target', None)]
-    return {one.id for target in targets if target is not None
-            for one in ast.walk(target) if isinstance(one, ast.Name)}
+    return {
+        one.id
+        for target in targets
+        if target is not None
+        for one in ast.walk(target)
+        if isinstance(one, ast.Name)
+    }
 
 
 def _mentions(function: ast.FunctionDef) -> set[str]:
     nodes = list(ast.walk(function))
-    return ({one.id for one in nodes if isinstance(one, ast.Name)}
-            | {one.attr for one in nodes if isinstance(one, ast.Attribute)}
-            | {one.arg for one in nodes if isinstance(one, ast.keyword) and one.arg})
+    return (
+        {one.id for one in nodes if isinstance(one, ast.Name)}
+        | {one.attr for one in nodes if isinstance(one, ast.Attribute)}
+        | {one.arg for one in nodes if isinstance(one, ast.keyword) and one.arg}
+    )

@@ -57,8 +57,14 @@ EFFECT = ViewpointShiftEffect(1)
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the study, write it, print what came of it."""
-    parser = study.parser('next_photographs', __doc__, study.RESULTS / 'next', workers=False,
-                          cameras=(100, 'simulated ones'), image_size=('1280x800', 'of --data'))
+    parser = study.parser(
+        'next_photographs',
+        __doc__,
+        study.RESULTS / 'next',
+        workers=False,
+        cameras=(100, 'simulated ones'),
+        image_size=('1280x800', 'of --data'),
+    )
     parser.add_argument('--data', type=Path, help='observations CSV: choose among its frames')
     asked = parser.parse_args(arguments)
     if asked.data:
@@ -92,10 +98,14 @@ def camera(number: int) -> dict[str, Any]:
     by_shift = design.choose(e0, 20)[0]
     by_image = greedy(design, wizard, 30)
     return {
-        'goal_m': goal, 'e0': needed(design, e0, lambda error: error <= goal, by_image, random),
+        'goal_m': goal,
+        'e0': needed(design, e0, lambda error: error <= goal, by_image, random),
         'named': needed(design, name, lambda sure: sure >= SURE, by_image, random),
-        'at_20_m': {'chosen': alone(by_shift[:20]), 'random': goal,
-                    'intrinsics': alone(by_image[:20])},
+        'at_20_m': {
+            'chosen': alone(by_shift[:20]),
+            'random': goal,
+            'intrinsics': alone(by_image[:20]),
+        },
         'pull': refitted(linear, design, by_shift[:8], rng) if number < 20 else None,
     }
 
@@ -105,8 +115,9 @@ def simulated(rng: np.random.Generator) -> tuple[Design, Linearization]:
     half = np.radians(rng.uniform(65, 95))
     curve = KannalaBrandt(rng.normal(scale=0.02), rng.normal(scale=0.004), 0.0, 0.0)
     f = 640 / float(curve.value_and_slope(np.array(half))[0])
-    lens = Lens('lens', 1280, 960, f, f, 640 + rng.normal(scale=9), 480 + rng.normal(scale=9),
-                curve, half)
+    lens = Lens(
+        'lens', 1280, 960, f, f, 640 + rng.normal(scale=9), 480 + rng.normal(scale=9), curve, half
+    )
     points = Print(9, 6, rng.uniform(0.02, 0.04)).corners
     board = FlatBoard(np.arange(len(points)), points, np.zeros(len(points), int), np.eye(3))
     room = ViewLimits(float(rng.uniform(0.15, 0.25)), float(rng.uniform(0.8, 1.5)))
@@ -121,8 +132,11 @@ def simulated(rng: np.random.Generator) -> tuple[Design, Linearization]:
 
 def without(design: Design, question: Criterion) -> Criterion:
     """Return the question with confounded effects left out of it: they are taken as absent."""
-    own = [i for i, name in enumerate(design.names)
-           if '.' not in name or name.startswith('viewpoint_shift')]
+    own = [
+        i
+        for i, name in enumerate(design.names)
+        if '.' not in name or name.startswith('viewpoint_shift')
+    ]
     return replace(question, nuisance=np.setdiff1d(own, question.interest))
 
 
@@ -137,7 +151,10 @@ def fewest(settled: Callable[[int], bool], counts: Iterable[int]) -> float:
 
 
 def needed(
-    design: Design, question: Criterion, settles: Callable[[float], bool], by_image: Index,
+    design: Design,
+    question: Criterion,
+    settles: Callable[[float], bool],
+    by_image: Index,
     random: Sequence[Index],
 ) -> dict[str, float]:
     """Return by method how many photographs settle a question.
@@ -151,15 +168,18 @@ def needed(
 
     return {
         'chosen': fewest(lambda n: settles(design.choose(question, n)[1][-1]), range(1, 21)),
-        'intrinsics': of(by_image), 'random': float(np.median([of(one) for one in random])),
+        'intrinsics': of(by_image),
+        'random': float(np.median([of(one) for one in random])),
     }
 
 
 def over_the_image(linear: Linearization, design: Design) -> Array:
     """Return W (K, K): trace(W cov) is the mean variance that the lens gives image points."""
     lens = linear.state.lens
-    angle, turn = np.meshgrid(np.linspace(0.05, 0.98, 16) * lens.max_incidence,
-                              np.linspace(0, 2 * np.pi, 24, endpoint=False))
+    angle, turn = np.meshgrid(
+        np.linspace(0.05, 0.98, 16) * lens.max_incidence,
+        np.linspace(0, 2 * np.pi, 24, endpoint=False),
+    )
     points = directions(angle, turn).reshape(-1, 3)
     columns = lens_columns(lens, project_with_jacobian(lens, points), list(linear.free))
     return np.asarray(np.einsum('mik,mil->kl', columns, columns) / len(points))
@@ -215,7 +235,9 @@ def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
     everything = error(np.arange(count))
     goal = 1.5 * everything
     return {
-        'frames': count, 'stderr_all_m': everything, 'goal_m': goal,
+        'frames': count,
+        'stderr_all_m': everything,
+        'goal_m': goal,
         'e0': needed(design, e0, lambda error: error <= goal, by_image, random),
         'named': needed(design, name, lambda sure: sure >= SURE, by_image, random),
         'diagnosed': {
@@ -223,20 +245,26 @@ def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
             'intrinsics': diagnosed(table, lens, lambda n: by_image[:n]),
             'random': [diagnosed(table, lens, lambda n, o=o: o[:n]) for o in random[:_ORDERS]],
         },
-        'stderr_m': {str(n): {'chosen': design.choose(e0, n)[1][-1],
-                              'intrinsics': error(by_image[:n]),
-                              'random': float(np.median([error(o[:n]) for o in random]))}
-                     for n in (3, 5, 10)},
+        'stderr_m': {
+            str(n): {
+                'chosen': design.choose(e0, n)[1][-1],
+                'intrinsics': error(by_image[:n]),
+                'random': float(np.median([error(o[:n]) for o in random])),
+            }
+            for n in (3, 5, 10)
+        },
     }
 
 
 def diagnosed(table: Observations, lens: Lens, chosen: Callable[[int], Index]) -> float:
     """Return how many frames of a table it takes for `diagnose` to name the viewpoint shift."""
+
     def named(count: int) -> bool:
         some = table.take(np.isin(table.frame, table.frames[chosen(count)]))
         try:
-            found = study.calibrated_and_diagnosed(some, (lens.width, lens.height),
-                                                   free_intrinsics=True)[1]
+            found = study.calibrated_and_diagnosed(
+                some, (lens.width, lens.height), free_intrinsics=True
+            )[1]
         except FisheyeSvpError:
             return False  # too few to tell anything
         return any(cause.effect == EFFECT.name for cause in found.causes)
@@ -250,8 +278,10 @@ class Taken(Design):
     def __init__(self, linear: Linearization, effects: Sequence[Effect], square: float) -> None:
         """Take a fit, effects that are not in it, and the mean square of whitened residuals."""
         terms = [*linear.state.terms, *((e, np.zeros(len(e.parameters))) for e in effects)]
-        self.names = (*linear.free, *(f'{e.name}.{p.name}' for e, _ in terms
-                                      for p in e.parameters))
+        self.names = (
+            *linear.free,
+            *(f'{e.name}.{p.name}' for e, _ in terms for p in e.parameters),
+        )
         self.values = np.concatenate([np.zeros(len(linear.free)), *(v for _, v in terms)])
         self.added = information(linear, effects) / square
         self.known = np.diag(1e-9 * np.diag(self.added.sum(axis=0)))
@@ -261,17 +291,25 @@ def summary(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return medians over the cameras, and in how many choosing needs at most half."""
     found: dict[str, Any] = {'cameras': len(cameras)}
     for what in ('e0', 'named'):
-        table = {m: np.array([one[what][m] for one in cameras])
-                 for m in ('chosen', 'intrinsics', 'random')}
+        table = {
+            m: np.array([one[what][m] for one in cameras])
+            for m in ('chosen', 'intrinsics', 'random')
+        }
         found[what] = {
             **{method: float(np.median(values)) for method, values in table.items()},
-            **{f'at_most_half_of_{m}': float(np.mean(2 * table['chosen'] <= table[m]))
-               for m in ('random', 'intrinsics')},
-            **{f'ratio_to_{m}': float(np.median(table['chosen'] / table[m]))
-               for m in ('random', 'intrinsics')},
+            **{
+                f'at_most_half_of_{m}': float(np.mean(2 * table['chosen'] <= table[m]))
+                for m in ('random', 'intrinsics')
+            },
+            **{
+                f'ratio_to_{m}': float(np.median(table['chosen'] / table[m]))
+                for m in ('random', 'intrinsics')
+            },
         }
-    found['at_20_mm'] = {m: 1e3 * float(np.median([one['at_20_m'][m] for one in cameras]))
-                         for m in ('chosen', 'intrinsics', 'random')}
+    found['at_20_mm'] = {
+        m: 1e3 * float(np.median([one['at_20_m'][m] for one in cameras]))
+        for m in ('chosen', 'intrinsics', 'random')
+    }
     pulls = np.array([one['pull'] for one in cameras if one['pull'] is not None])
     found['error_over_predicted_rms'] = float(np.sqrt(np.mean(pulls**2)))
     return found

@@ -37,7 +37,8 @@ class Trial:
         self.counts: dict[str, str] = {}
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(
-            DiagnosticArray, 'localizer/result', lambda m: self.results.append(stamp_of(m)), ALL)
+            DiagnosticArray, 'localizer/result', lambda m: self.results.append(stamp_of(m)), ALL
+        )
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._hear, 10)
         self.landmarks = self.node.create_publisher(PointCloud2, 'landmarks', latched)
         self.points = self.node.create_publisher(PointCloud2, 'image_points', ALL)
@@ -61,14 +62,19 @@ class Trial:
     def tell(self) -> None:
         """Tell one more set."""
         self.sent += 1
-        self.points.publish(messages.image_points_message(
-            self.seen.landmark, self.seen.uv, self.sent, 'camera'))
+        self.points.publish(
+            messages.image_points_message(self.seen.landmark, self.seen.uv, self.sent, 'camera')
+        )
 
     def fates(self) -> dict[str, int]:
         """Return what became of the sets, once none waits."""
         self.counts = {}
-        self.until(lambda: self.counts.get('sets: waiting') == '0'
-                   and int(self.counts['sets: taken']) >= self.sent)
+        self.until(
+            lambda: (
+                self.counts.get('sets: waiting') == '0'
+                and int(self.counts['sets: taken']) >= self.sent
+            )
+        )
         return {name: int(self.counts[f'sets: {name}']) for name in ('taken', *FATES)}
 
     def row(self, rate: int, seconds: float) -> list[str]:
@@ -87,19 +93,32 @@ class Trial:
         heard = self.results[results:]
         total = sum(became[name] for name in FATES)
         exact = total == became['taken'] == self.sent - sent and len(set(heard)) == answered
-        return [str(rate), f'{reached:.0f}', *(str(became[name]) for name in ('taken', *FATES)),
-                str(len(heard)), 'yes' if exact else 'no']
+        return [
+            str(rate),
+            f'{reached:.0f}',
+            *(str(became[name]) for name in ('taken', *FATES)),
+            str(len(heard)),
+            'yes' if exact else 'no',
+        ]
 
 
 def main() -> None:
     """Measure, and print a table."""
-    seconds = study.parser('overload', __doc__, None, workers=False,
-                           seconds=(10.0, 'at each rate')).parse_args().seconds
+    seconds = (
+        study.parser('overload', __doc__, None, workers=False, seconds=(10.0, 'at each rate'))
+        .parse_args()
+        .seconds
+    )
     study.stay_on_this_machine()
     rclpy.init(args=[])
-    localizer = subprocess.Popen(study.node_command(
-        'localizer', 'lens:=fish214', 'svp:=true',
-        'qos_overrides./image_points.subscription.history:=keep_all'))
+    localizer = subprocess.Popen(
+        study.node_command(
+            'localizer',
+            'lens:=fish214',
+            'svp:=true',
+            'qos_overrides./image_points.subscription.history:=keep_all',
+        )
+    )
     try:
         trial = Trial()
         trial.until(lambda: trial.points.get_subscription_count() > 0)

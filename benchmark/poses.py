@@ -121,9 +121,14 @@ def tried(case: str, kind: str, count: int, rng: np.random.Generator) -> Outcome
     passed = found.converged & np.array([not reason for reason in checked.reasons])
     cleaned = found.converged & checked.gross.any(axis=1)
     return Outcome(
-        count, int((~seen).sum()), int((~found.converged).sum()),
-        int((found.converged & ~passed).sum()), int(passed.sum()), int((wrong & passed).sum()),
-        int(cleaned.sum()), int((cleaned & ~wrong).sum()),
+        count,
+        int((~seen).sum()),
+        int((~found.converged).sum()),
+        int((found.converged & ~passed).sum()),
+        int(passed.sum()),
+        int((wrong & passed).sum()),
+        int(cleaned.sum()),
+        int((cleaned & ~wrong).sum()),
     )
 
 
@@ -135,8 +140,9 @@ def lost_minima(points: int, cone: float, count: int, rng: np.random.Generator) 
     landmarks, pose = _around(cone, 1.0, 1.5, count, points, rng)
     model = ForwardModel(load_lens(lens_path(_LENS)))
     uv = model.predict(pose, views_of(landmarks, np.zeros((count, points, 2)))).uv
-    views = views_of(landmarks, uv + SIGMA * rng.normal(size=uv.shape),
-                     np.full(uv.shape[:2], 1 / SIGMA))
+    views = views_of(
+        landmarks, uv + SIGMA * rng.normal(size=uv.shape), np.full(uv.shape[:2], 1 / SIGMA)
+    )
     best = np.full(count, np.inf)
     for start in range(12):
         change = rng.normal(size=(count, 6)) * [0.5, 0.5, 0.5, 2, 2, 2] * (start > 0)
@@ -155,34 +161,50 @@ def section(outcomes: dict[tuple[str, str], Outcome], lost: dict[int, tuple[int,
         f'a pose is wrong when it is more than {FAR_OFF:.0f} of its stated standard errors off.',
         f'Wrong poses that pass: {sum(o.wrong for o in told)}, those left out that one view '
         'cannot tell (below). Clean views that do not pass: '
-        f'{sum(o.views - o.passed for o in clean)} of {sum(o.views for o in clean)}.', '',
+        f'{sum(o.views - o.passed for o in clean)} of {sum(o.views for o in clean)}.',
+        '',
         *study.table(
             'spoilt by | scene | views | refused | no pose | warned | passed | wrong and passed | '
             'outliers rejected | of these right',
-            [[CASES[case] + ' (cannot be told)' * ((case, kind) in UNTESTABLE), kind, *o]
-             for (case, kind), o in outcomes.items()], numbers=True),
-        '', 'Views of few points have several minima: the best of twelve starts, the true '
-        'pose among them, against `localize` without a start.', '',
-        *study.table('points | views | minima missed', [
-            (points, count, missed) for points, (missed, count) in lost.items()], numbers=True),
+            [
+                [CASES[case] + ' (cannot be told)' * ((case, kind) in UNTESTABLE), kind, *o]
+                for (case, kind), o in outcomes.items()
+            ],
+            numbers=True,
+        ),
+        '',
+        'Views of few points have several minima: the best of twelve starts, the true '
+        'pose among them, against `localize` without a start.',
+        '',
+        *study.table(
+            'points | views | minima missed',
+            [(points, count, missed) for points, (missed, count) in lost.items()],
+            numbers=True,
+        ),
     ]
     return '\n'.join(lines)
 
 
 def main() -> None:
     """Run the study and write its section."""
-    count = study.parser('poses', __doc__, None, workers=False,
-                         views=(720, 'of each case and scene')).parse_args().views
+    count = (
+        study.parser('poses', __doc__, None, workers=False, views=(720, 'of each case and scene'))
+        .parse_args()
+        .views
+    )
     engines.settle(1e9)
     outcomes = {
         (case, kind): tried(case, kind, count, np.random.default_rng([i, j]))
-        for i, case in enumerate(CASES) for j, kind in enumerate(SCENES)
+        for i, case in enumerate(CASES)
+        for j, kind in enumerate(SCENES)
     }
     lost = {}
     for points in (4, 5):
         cones = np.radians([15, 30, 60, 85])
-        missed = [lost_minima(points, cone, count, np.random.default_rng(i))
-                  for i, cone in enumerate(cones)]
+        missed = [
+            lost_minima(points, cone, count, np.random.default_rng(i))
+            for i, cone in enumerate(cones)
+        ]
         lost[points] = sum(missed), count * len(cones)
     text = section(outcomes, lost)
     study.write_section(study.RELIABILITY, 'poses', text)

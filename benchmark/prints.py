@@ -15,10 +15,15 @@ _RADIUS = 0.3  # of a circle, over the distance of the nearest other
 
 def printed(pattern: Pattern) -> Print:
     """Return the print of a pattern; its points are in the pattern's order, its y down."""
-    drawing = {'charuco': _charuco, 'aprilgrid': _aprilgrid, 'circles': _circles,
-               'asymmetric_circles': _circles}.get(pattern.kind)
-    return Print(pattern.columns, pattern.rows, pattern.size,
-                 drawing=drawing(pattern) if drawing else None)
+    drawing = {
+        'charuco': _charuco,
+        'aprilgrid': _aprilgrid,
+        'circles': _circles,
+        'asymmetric_circles': _circles,
+    }.get(pattern.kind)
+    return Print(
+        pattern.columns, pattern.rows, pattern.size, drawing=drawing(pattern) if drawing else None
+    )
 
 
 def _circles(pattern: Pattern) -> Drawing:
@@ -41,7 +46,7 @@ def _circles(pattern: Pattern) -> Drawing:
 
 def _charuco(pattern: Pattern) -> Drawing:
     bits = _bits(pattern, 1, pattern.columns * pattern.rows // 2)
-    y, x = np.mgrid[:pattern.rows, :pattern.columns]
+    y, x = np.mgrid[: pattern.rows, : pattern.columns]
     white = (x + y) % 2 == 1
     number = np.where(white, np.cumsum(white).reshape(white.shape) - 1, 0)
     side = pattern.marker / pattern.size
@@ -56,8 +61,12 @@ def _charuco(pattern: Pattern) -> Drawing:
         tag = _tags(bits, here[0], (places - own + 1 - (1 - side) / 2) / side, width / side)
         return np.asarray(squares + here[1] * tag)
 
-    return Drawing(chess.corners[:, :2], np.array([-1.0, -1.0]),
-                   np.array([chess.columns, chess.rows], dtype=float), ink)
+    return Drawing(
+        chess.corners[:, :2],
+        np.array([-1.0, -1.0]),
+        np.array([chess.columns, chess.rows], dtype=float),
+        ink,
+    )
 
 
 def _aprilgrid(pattern: Pattern) -> Drawing:
@@ -87,8 +96,10 @@ def _bits(pattern: Pattern, border: int, count: int) -> Array:
     """Return sums (K, n + 1, n + 1) of the ink of tags of n x n cells."""
     dictionary = dictionary_of(pattern)
     cells = dictionary.markerSize + 2 * border
-    tags = [cv2.aruco.generateImageMarker(dictionary, tag, cells, borderBits=border)
-            for tag in range(count)]
+    tags = [
+        cv2.aruco.generateImageMarker(dictionary, tag, cells, borderBits=border)
+        for tag in range(count)
+    ]
     sums = (np.stack(tags) < 128).astype(float).cumsum(axis=1).cumsum(axis=2)
     return np.pad(sums, ((0, 0), (1, 0), (1, 0)))
 
@@ -101,8 +112,12 @@ def _tags(sums: Array, tag: Index, places: Array, width: Array) -> Array:
     def total(x: Array, y: Array) -> Array:
         i, j = (np.minimum(np.floor(one).astype(int), cells - 1) for one in (y, x))
         b, a = y - i, x - j
-        return np.asarray((1 - b) * (1 - a) * sums[tag, i, j] + (1 - b) * a * sums[tag, i, j + 1]
-                          + b * (1 - a) * sums[tag, i + 1, j] + b * a * sums[tag, i + 1, j + 1])
+        return np.asarray(
+            (1 - b) * (1 - a) * sums[tag, i, j]
+            + (1 - b) * a * sums[tag, i, j + 1]
+            + b * (1 - a) * sums[tag, i + 1, j]
+            + b * a * sums[tag, i + 1, j + 1]
+        )
 
     (x0, y0), (x1, y1) = np.moveaxis(low, -1, 0), np.moveaxis(high, -1, 0)
     area = (cells * width).prod(axis=-1)

@@ -54,42 +54,68 @@ def trial(number: int) -> Outcome:
     stated = found.conclusion.ray_error_mrad()
     value, low, high = (
         np.array([[one[name] for one in stated[lens]] for lens in ('given', 'extended')])
-        for name in ('value', 'low', 'high'))
+        for name in ('value', 'low', 'high')
+    )
     offered = found.conclusion.decision['lens'].say in ('use_extended', 'recalibrate')
     return Outcome(bool(few), bool(size), offered, np.array(true), value, low, high)
 
 
 def report(outcomes: Sequence[Outcome], command: str) -> str:
     """Return the page."""
-    kinds = {f'{"5 to 8" if few else "14 to 18"} frames{", warp" * warped}':
-             [one for one in outcomes if (one.few, one.warped) == (few, warped)]
-             for few, warped in product((False, True), repeat=2)} | {'all': list(outcomes)}
+    kinds = {
+        f'{"5 to 8" if few else "14 to 18"} frames{", warp" * warped}': [
+            one for one in outcomes if (one.few, one.warped) == (few, warped)
+        ]
+        for few, warped in product((False, True), repeat=2)
+    } | {'all': list(outcomes)}
     rows = []
     for name, some in kinds.items():
         if some:
             sides = np.mean([one.outside for one in some], axis=(0, 3))
             ratio = np.exp(np.mean([np.log(one.true / one.value) for one in some], axis=(0, 2)))
             gain = np.exp(np.mean([np.log(one.true[1] / one.true[0]) for one in some]))
-            cells = [cell for (below, above), size in zip(sides, ratio, strict=True) for cell in (
-                f'{100 * below:.0f} %', f'{100 * (1 - below - above):.0f} %',
-                f'{100 * above:.0f} %', f'{size:.2f}')]
+            cells = [
+                cell
+                for (below, above), size in zip(sides, ratio, strict=True)
+                for cell in (
+                    f'{100 * below:.0f} %',
+                    f'{100 * (1 - below - above):.0f} %',
+                    f'{100 * above:.0f} %',
+                    f'{size:.2f}',
+                )
+            ]
             rows.append([name, len(some), *cells, f'{gain:.2f}'])
-    lines = ['# Coverage of ray errors', '', *study.paragraph(__doc__), f'`{command}`', '',
-             *study.table('sets | number | given: below | within | above | true / stated '
-                          '| extended: below | within | above | true / stated '
-                          '| extended / given', rows)]
-    for name, some in {'all': list(outcomes),
-                       'those offered': [one for one in outcomes if one.offered]}.items():
+    lines = [
+        '# Coverage of ray errors',
+        '',
+        *study.paragraph(__doc__),
+        f'`{command}`',
+        '',
+        *study.table(
+            'sets | number | given: below | within | above | true / stated '
+            '| extended: below | within | above | true / stated '
+            '| extended / given',
+            rows,
+        ),
+    ]
+    for name, some in {
+        'all': list(outcomes),
+        'those offered': [one for one in outcomes if one.offered],
+    }.items():
         rms = np.sqrt([(one.true**2).mean(axis=1) for one in some]).reshape(-1, 2)
-        lines += ['', f'More than 10 % worse than the lens as calibrated, of {name}: '
-                  f'{int((rms[:, 1] > 1.1 * rms[:, 0]).sum())} of {len(some)}.']
+        lines += [
+            '',
+            f'More than 10 % worse than the lens as calibrated, of {name}: '
+            f'{int((rms[:, 1] > 1.1 * rms[:, 0]).sum())} of {len(some)}.',
+        ]
     return '\n'.join([*lines, ''])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Draw, diagnose and compare sets."""
-    study.run_sets('ray_coverage', __doc__, trial, report, arguments,
-                   (30, 'of each of four kinds'), each=4)
+    study.run_sets(
+        'ray_coverage', __doc__, trial, report, arguments, (30, 'of each of four kinds'), each=4
+    )
 
 
 if __name__ == '__main__':

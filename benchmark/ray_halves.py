@@ -23,8 +23,13 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.ray_errors import RayError, typical_points
 
 RANGE = 1.0  # m
-PARTS = {'even frames': slice(0, None, 2), 'odd frames': slice(1, None, 2),
-         'first half': 0, 'last half': 1, 'all frames': slice(None)}
+PARTS = {
+    'even frames': slice(0, None, 2),
+    'odd frames': slice(1, None, 2),
+    'first half': 0,
+    'last half': 1,
+    'all frames': slice(None),
+}
 
 Part = tuple[Path, tuple[int, int], str]
 Found = tuple[Lens, Lens, list[RayError]]
@@ -35,8 +40,11 @@ def diagnosed(part: Part) -> Found:
     path, size, name = part
     table = read_observations(path)
     chosen = PARTS[name]
-    frames = (table.frames[chosen] if isinstance(chosen, slice)
-              else np.array_split(table.frames, 2)[chosen])
+    frames = (
+        table.frames[chosen]
+        if isinstance(chosen, slice)
+        else np.array_split(table.frames, 2)[chosen]
+    )
     given, found = study.calibrated_and_diagnosed(table.take(np.isin(table.frame, frames)), size)
     stated = found.conclusion.ray_error['']
     at = [one.range_m for one in stated['given']].index(RANGE)
@@ -51,8 +59,9 @@ def lines(name: str, table: Observations, parts: dict[str, Found]) -> list[str]:
         cells = []
         for lens, one in zip((given, extended), stated, strict=True):
             off = '-' if lens is truth else f'{study.ray_error(lens, truth, uv, (RANGE,)):.2f}'
-            cells.append(f'{1e3 * one.value:.2f} ({1e3 * one.low:.2f} to {1e3 * one.high:.2f}) '
-                         f'| {off}')
+            cells.append(
+                f'{1e3 * one.value:.2f} ({1e3 * one.low:.2f} to {1e3 * one.high:.2f}) | {off}'
+            )
         rows.append(f'| {name} | {part} | {" | ".join(cells)} |')
     return rows
 
@@ -70,11 +79,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows += lines(path.parent.name, read_observations(path), parts)
     width, height = asked.image_size
     command = ' '.join([*map(str, asked.sets), '--image-size', f'{width}x{height}'])
-    study.write_lines(asked.output / 'ray_halves.md', [
-        '# Are rays as far off as is stated?', '', *study.paragraph(__doc__),
-        f'    python -m benchmark.ray_halves {command}', '', *study.table(
-            'set | part | calibrated: stated, mrad | found | extended: stated, mrad | found', []),
-        *rows])
+    study.write_lines(
+        asked.output / 'ray_halves.md',
+        [
+            '# Are rays as far off as is stated?',
+            '',
+            *study.paragraph(__doc__),
+            f'    python -m benchmark.ray_halves {command}',
+            '',
+            *study.table(
+                'set | part | calibrated: stated, mrad | found | extended: stated, mrad | found',
+                [],
+            ),
+            *rows,
+        ],
+    )
 
 
 if __name__ == '__main__':

@@ -75,14 +75,28 @@ def ours(range_m: float) -> Sides:
 
 def opencv(_: float) -> Sides:
     """Return OpenCV's maps, of the lens without its shift."""
-    k, d = zip(*((np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]]), np.zeros(4))
-                 for lens in (LEFT, RIGHT)), strict=True)
+    k, d = zip(
+        *(
+            (np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]]), np.zeros(4))
+            for lens in (LEFT, RIGHT)
+        ),
+        strict=True,
+    )
     r1, r2, _, p2, _ = cv2.fisheye.stereoRectify(
-        k[0], d[0], k[1], d[1], (LEFT.width, LEFT.height), RIG.rotation, RIG.position[:, None],
-        1024)
+        k[0],
+        d[0],
+        k[1],
+        d[1],
+        (LEFT.width, LEFT.height),
+        RIG.rotation,
+        RIG.position[:, None],
+        1024,
+    )
     new = ours(1.0).k  # OpenCV's own choice of it loses most of such an image
-    maps = tuple(np.stack(cv2.fisheye.initUndistortRectifyMap(
-        k[i], d[i], r, new, _SIZE, cv2.CV_32FC1)) for i, r in enumerate((r1, r2)))
+    maps = tuple(
+        np.stack(cv2.fisheye.initUndistortRectifyMap(k[i], d[i], r, new, _SIZE, cv2.CV_32FC1))
+        for i, r in enumerate((r1, r2))
+    )
     return Sides(maps, new, r1, -float(p2[0, 3] / p2[0, 0]))
 
 
@@ -104,11 +118,19 @@ def mrcal_stereo(_: float) -> Sides:
             models.append(model)
     per_degree = _SIZE[0] / 2 / np.tan(_FIELD / 2) * np.pi / 180
     rectified = mrcal.rectified_system(
-        models, az_fov_deg=119.0, el_fov_deg=107.0, az0_deg=0.0, el0_deg=0.0,
-        pixels_per_deg_az=per_degree, pixels_per_deg_el=per_degree,
-        rectification_model='LENSMODEL_PINHOLE')
-    maps = tuple(np.ascontiguousarray(np.moveaxis(one, -1, 0))
-                 for one in mrcal.rectification_maps(models, rectified))
+        models,
+        az_fov_deg=119.0,
+        el_fov_deg=107.0,
+        az0_deg=0.0,
+        el0_deg=0.0,
+        pixels_per_deg_az=per_degree,
+        pixels_per_deg_el=per_degree,
+        rectification_model='LENSMODEL_PINHOLE',
+    )
+    maps = tuple(
+        np.ascontiguousarray(np.moveaxis(one, -1, 0))
+        for one in mrcal.rectification_maps(models, rectified)
+    )
     fx, fy, cx, cy = rectified[0].intrinsics()[1]
     turn = mrcal.compose_Rt(rectified[0].Rt_cam_ref(), models[0].Rt_ref_cam())[:3]
     apart = mrcal.compose_rt(rectified[1].rt_cam_ref(), rectified[0].rt_ref_cam())[3:]
@@ -131,9 +153,12 @@ def scene(range_m: float) -> tuple[Array, list[NDArray[np.uint8]]]:
     turn = facing(ahead)
     place = Pose(turn, middle - turn @ board.corners.mean(axis=0))
     camera = place.inverse()
-    images = [render(lens, board, pose, Exposure(noise=0.5), np.random.default_rng(number))
-              for number, (lens, pose) in enumerate(
-                  ((LEFT, camera), (RIGHT, camera.compose(RIG.inverse()))))]
+    images = [
+        render(lens, board, pose, Exposure(noise=0.5), np.random.default_rng(number))
+        for number, (lens, pose) in enumerate(
+            ((LEFT, camera), (RIGHT, camera.compose(RIG.inverse())))
+        )
+    ]
     return place.transform(board.corners), images
 
 
@@ -145,9 +170,13 @@ def errors(sides: Sides, points: Array, images: list[NDArray[np.uint8]]) -> tupl
     ):
         about = np.array([_inverse(maps, uv) for uv in fsvp.project(lens, local).uv])
         rectified = cv2.remap(image, maps[0], maps[1], cv2.INTER_CUBIC)
-        found.append(cv2.cornerSubPix(
-            rectified, about[:, None].astype(np.float32), (7, 7), (-1, -1),
-            (3, 100, 1e-4)).reshape(-1, 2).astype(float))
+        found.append(
+            cv2.cornerSubPix(
+                rectified, about[:, None].astype(np.float32), (7, 7), (-1, -1), (3, 100, 1e-4)
+            )
+            .reshape(-1, 2)
+            .astype(float)
+        )
     directions = [(uv - sides.k[:2, 2]) / np.diag(sides.k)[:2] for uv in found]
     slopes = [xy[:, 0] / np.hypot(xy[:, 1], 1.0) for xy in directions]
     depth = sides.baseline / (slopes[0] - slopes[1])
@@ -159,10 +188,19 @@ def errors(sides: Sides, points: Array, images: list[NDArray[np.uint8]]) -> tupl
 def _inverse(maps: NDArray[np.float32], uv: Array) -> Array:
     """Return the rectified pixel (2,) that maps (2, H, W) send to uv (2,), to some tenths."""
     row, column = np.unravel_index(
-        np.argmin(np.square(maps - uv[:, None, None]).sum(axis=0)), maps.shape[1:])
+        np.argmin(np.square(maps - uv[:, None, None]).sum(axis=0)), maps.shape[1:]
+    )
     row, column = np.clip(row, 1, maps.shape[1] - 2), np.clip(column, 1, maps.shape[2] - 2)
-    slope = np.stack([maps[:, row, column + 1] - maps[:, row, column - 1],
-                      maps[:, row + 1, column] - maps[:, row - 1, column]], axis=1) / 2
+    slope = (
+        np.stack(
+            [
+                maps[:, row, column + 1] - maps[:, row, column - 1],
+                maps[:, row + 1, column] - maps[:, row - 1, column],
+            ],
+            axis=1,
+        )
+        / 2
+    )
     return np.asarray(np.array([column, row]) + np.linalg.solve(slope, uv - maps[:, row, column]))
 
 
@@ -171,26 +209,36 @@ def lines() -> list[str]:
     scenes, rows = [scene(range_m) for range_m in RANGES], []
     for name, make in WHO.items():
         try:
-            found = [errors(make(range_m), *one)
-                     for range_m, one in zip(RANGES, scenes, strict=True)]
+            found = [
+                errors(make(range_m), *one) for range_m, one in zip(RANGES, scenes, strict=True)
+            ]
         except ImportError as cause:
             rows.append([name, f'not measured: {cause}', *[''] * (2 * len(RANGES) - 1)])
             continue
         rows.append([name, *(f'{row:.3f} | {1e3 * depth:.2f}' for row, depth in found)])
-    return study.table('maps | ' + ' | '.join(
-        f'{range_text(range_m)}: row, px | depth, mm' for range_m in RANGES), rows, numbers=True)
+    return study.table(
+        'maps | '
+        + ' | '.join(f'{range_text(range_m)}: row, px | depth, mm' for range_m in RANGES),
+        rows,
+        numbers=True,
+    )
 
 
 def main() -> None:
     """Measure and write."""
+
     def known(package: str) -> Any:
         try:
             return version(package)
         except PackageNotFoundError:
             return '(not installed)'
 
-    head = _HEAD.format(baseline=1e3 * np.linalg.norm(RIG.position), e0=1e3 * _SHIFT.e0,
-                        mrcal=known('mrcal'), opencv=cv2.__version__)
+    head = _HEAD.format(
+        baseline=1e3 * np.linalg.norm(RIG.position),
+        e0=1e3 * _SHIFT.e0,
+        mrcal=known('mrcal'),
+        opencv=cv2.__version__,
+    )
     path = study.RESULTS / 'rectification.md'
     write_text(path, head + '\n'.join(lines()) + '\n')
     print(path)

@@ -31,8 +31,18 @@ from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.rigs import rig
 
-LENS = Lens('wide', 1280, 800, 420.0, 421.0, 633.3, 404.4,
-            KannalaBrandt(-0.02, 0.003, -0.001, 0.0001), np.radians(95.0), Gennery(e0=0.004))
+LENS = Lens(
+    'wide',
+    1280,
+    800,
+    420.0,
+    421.0,
+    633.3,
+    404.4,
+    KannalaBrandt(-0.02, 0.003, -0.001, 0.0001),
+    np.radians(95.0),
+    Gennery(e0=0.004),
+)
 PROFILE = Path(__file__).parents[1] / 'config' / 'fastdds' / 'images.xml'
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -45,10 +55,14 @@ def rate(channels: int, cameras: tuple[str, ...], pace: float, seconds: float) -
         for name in cameras:
             save_lens(LENS, Path(folder) / f'{name or "camera"}.yaml')
         save_rig(rig('parallel'), Path(folder) / 'rig.yaml')
-        process = psutil.Process(subprocess.Popen(
-            study.node_command('rectifier', f'lens:={folder}/',
-                               f'stereo:={str(len(cameras) > 1).lower()}'),
-            preexec_fn=lambda: os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})).pid)
+        process = psutil.Process(
+            subprocess.Popen(
+                study.node_command(
+                    'rectifier', f'lens:={folder}/', f'stereo:={str(len(cameras) > 1).lower()}'
+                ),
+                preexec_fn=lambda: os.sched_setaffinity(0, {max(os.sched_getaffinity(0))}),
+            ).pid
+        )
         try:
             return _measured(message, cameras, pace, seconds, process)
         finally:
@@ -89,16 +103,23 @@ def _measured(
     took = (sum(process.cpu_times()[:2]) - before) / max(len(back), 1)
     node.destroy_node()
     kind = message.encoding + (', a pair' if len(cameras) > 1 else '')
-    return (f'{kind}: {len(back) / len(cameras) / seconds:.1f} Hz of {sent / seconds:.1f} Hz came '
-            f'back; {1e3 * took:.1f} ms of a core for an image')
+    return (
+        f'{kind}: {len(back) / len(cameras) / seconds:.1f} Hz of {sent / seconds:.1f} Hz came '
+        f'back; {1e3 * took:.1f} ms of a core for an image'
+    )
 
 
 def main() -> None:
     """Measure and print."""
     args = study.parser(
-        'rectifier_rate', __doc__, None, workers=False, pace=(30.0, 'images a second (30)'),
+        'rectifier_rate',
+        __doc__,
+        None,
+        workers=False,
+        pace=(30.0, 'images a second (30)'),
         seconds=(10.0, 'for each line (10)'),
-        defaults=(False, 'the transports of Fast DDS')).parse_args()
+        defaults=(False, 'the transports of Fast DDS'),
+    ).parse_args()
     study.stay_on_this_machine()
     if not args.defaults:
         os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', str(PROFILE))

@@ -28,8 +28,13 @@ def by_pycolmap(problem: dict[str, Any]) -> Any:
     scene, uv = pycolmap.Reconstruction(), problem['uv']
     rig = pycolmap.Rig(rig_id=1)
     for i, lens in enumerate(problem['lenses'], 1):
-        camera = pycolmap.Camera(camera_id=i, model='OPENCV_FISHEYE', params=lens,
-                                 width=problem['size'][0], height=problem['size'][1])
+        camera = pycolmap.Camera(
+            camera_id=i,
+            model='OPENCV_FISHEYE',
+            params=lens,
+            width=problem['size'][0],
+            height=problem['size'][1],
+        )
         scene.add_camera(camera)
         if i == 1:
             rig.add_ref_sensor(camera.sensor_id)
@@ -57,14 +62,14 @@ def by_pycolmap(problem: dict[str, Any]) -> Any:
                 scene.add_observation(point, pycolmap.TrackElement(image, i))
     for point in points:
         config.add_constant_point(point)
-    options = pycolmap.BundleAdjustmentOptions(
-        refine_principal_point=True, print_summary=False)
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
     options.ceres.solver_options.num_threads = 1
     pycolmap.create_default_bundle_adjuster(options, config, scene).solve()
     found = [np.eye(4)]
     for i in range(2, len(uv) + 1):
-        found.append(np.linalg.inv(square(
-            scene.rig(1).sensor_from_rig(scene.camera(i).sensor_id).matrix())))
+        found.append(
+            np.linalg.inv(square(scene.rig(1).sensor_from_rig(scene.camera(i).sensor_id).matrix()))
+        )
     return np.array(found)
 
 
@@ -94,8 +99,13 @@ def by_multical(problem: dict[str, Any]) -> Any:
     uv = problem['uv']
     cameras = []
     for fx, fy, cx, cy, *k in problem['lenses']:
-        cameras.append(CameraFisheye(tuple(problem['size'].tolist()), np.array(
-            [[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.array(k).reshape(4, 1)))
+        cameras.append(
+            CameraFisheye(
+                tuple(problem['size'].tolist()),
+                np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
+                np.array(k).reshape(4, 1),
+            )
+        )
     valid = np.isfinite(uv).all(axis=-1)[:, :, None]
     points = Table.create(points=np.nan_to_num(uv)[:, :, None], valid=valid)
     board = known_board(problem['board'])
@@ -103,11 +113,16 @@ def by_multical(problem: dict[str, Any]) -> Any:
     start = tables.initialise_poses(pose_table)
     names = [str(i) for i in range(len(uv))]
     calibration = Calibration(
-        ParamList(cameras, names), ParamList([board], ['board']), points,
-        PoseSet(start.camera, names), PoseSet(start.board, ['board']),
-        StaticFrames.init(start.times, [str(i) for i in range(uv.shape[1])]))
+        ParamList(cameras, names),
+        ParamList([board], ['board']),
+        points,
+        PoseSet(start.camera, names),
+        PoseSet(start.board, ['board']),
+        StaticFrames.init(start.times, [str(i) for i in range(uv.shape[1])]),
+    )
     calibration = calibration.enable(cameras=True, boards=False).adjust_outliers(
-        num_adjustments=3, select_outliers=select_threshold(0.75, 5.0))
+        num_adjustments=3, select_outliers=select_threshold(0.75, 5.0)
+    )
     poses = calibration.with_master(0).camera_poses.poses
     return np.linalg.inv(poses)
 
@@ -128,15 +143,21 @@ def known_board(points: Any) -> Any:
     """Return a board as multical asks of it: of points in place of a printed pattern."""
     from multical.board.common import estimate_pose_points
 
-    board = SimpleNamespace(points=points, adjusted_points=points, num_points=len(points),
-                            param_vec=points.ravel(),
-                            has_min_detections=lambda found: len(found.ids) > 8)
+    board = SimpleNamespace(
+        points=points,
+        adjusted_points=points,
+        num_points=len(points),
+        param_vec=points.ravel(),
+        has_min_detections=lambda found: len(found.ids) > 8,
+    )
     board.estimate_pose_points = lambda camera, found: estimate_pose_points(board, camera, found)
     return board
 
 
 PEERS: dict[str, Callable[[dict[str, Any]], Any]] = {
-    'multical': by_multical, 'pycolmap': by_pycolmap}
+    'multical': by_multical,
+    'pycolmap': by_pycolmap,
+}
 
 
 def main() -> None:

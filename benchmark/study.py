@@ -34,20 +34,31 @@ R = TypeVar('R')
 
 
 def parser(
-    study: str, doc: str | None, output: Path | None = RESULTS, workers: bool = True,
+    study: str,
+    doc: str | None,
+    output: Path | None = RESULTS,
+    workers: bool = True,
     **options: tuple[Any, str],
 ) -> argparse.ArgumentParser:
     """Return the parser of `python -m benchmark.STUDY`; options: default and help by name."""
     found = argparse.ArgumentParser(description=doc, prog=f'python -m benchmark.{study}')
     for name, (default, text) in options.items():
-        kind: dict[str, Any] = {'action': 'store_true'} if default is False else {
-            'type': type(default), 'default': default}
+        kind: dict[str, Any] = (
+            {'action': 'store_true'}
+            if default is False
+            else {'type': type(default), 'default': default}
+        )
         found.add_argument(f'--{name.replace("_", "-")}', help=text, **kind)
     if workers:
         found.add_argument('--workers', type=int, default=os.cpu_count(), help='processes')
     if output is not None:
-        found.add_argument('-o', '--output', type=Path, default=output,
-                           help='file' if output.suffix else 'directory')
+        found.add_argument(
+            '-o',
+            '--output',
+            type=Path,
+            default=output,
+            help='file' if output.suffix else 'directory',
+        )
     return found
 
 
@@ -63,9 +74,7 @@ def add_sets(found: argparse.ArgumentParser) -> None:
     found.add_argument('--image-size', type=image_size, required=True, metavar='WxH')
 
 
-def in_processes(
-    label: str, trial: Callable[[T], R], todo: Sequence[T], workers: int
-) -> list[R]:
+def in_processes(label: str, trial: Callable[[T], R], todo: Sequence[T], workers: int) -> list[R]:
     """Return what a trial makes of each item, in their order; Ctrl-C keeps those that are done."""
     os.environ['OMP_NUM_THREADS'] = os.environ['OPENBLAS_NUM_THREADS'] = '1'
     context = multiprocessing.get_context('spawn')  # the number of threads is read at the start
@@ -83,8 +92,12 @@ def in_processes(
     return outcomes
 
 
-def in_turn(label: str, trial: Callable[[T], R], todo: Sequence[T],
-            keep: Callable[[list[R]], None] = lambda outcomes: None) -> list[R]:
+def in_turn(
+    label: str,
+    trial: Callable[[T], R],
+    todo: Sequence[T],
+    keep: Callable[[list[R]], None] = lambda outcomes: None,
+) -> list[R]:
     """Return what a trial makes of each item; keep: told after each what there is so far."""
     outcomes: list[R] = []
     with progress(label, len(todo)) as advance:
@@ -96,9 +109,13 @@ def in_turn(label: str, trial: Callable[[T], R], todo: Sequence[T],
 
 
 def run_sets(
-    name: str, doc: str | None, trial: Callable[[int], R],
-    report: Callable[[Sequence[R], str], str], arguments: Sequence[str] | None,
-    sets: tuple[int, str], each: int = 1,
+    name: str,
+    doc: str | None,
+    trial: Callable[[int], R],
+    report: Callable[[Sequence[R], str], str],
+    arguments: Sequence[str] | None,
+    sets: tuple[int, str],
+    each: int = 1,
 ) -> tuple[list[R], Path]:
     """Run a study of sets that are told by number, write and print its page.
 
@@ -115,9 +132,11 @@ def run_sets(
 def table(header: str, rows: Iterable[Iterable[object]], numbers: bool = False) -> list[str]:
     """Return the lines of a table; header: names between ` | `; numbers: in all but the first."""
     count = header.count(' | ')
-    return [f'| {header} |', '| ---' + ' | ---:' * count + ' |' if numbers else
-            '|---' * (count + 1) + '|',
-            *(f'| {" | ".join(map(str, row))} |' for row in rows)]
+    return [
+        f'| {header} |',
+        '| ---' + ' | ---:' * count + ' |' if numbers else '|---' * (count + 1) + '|',
+        *(f'| {" | ".join(map(str, row))} |' for row in rows),
+    ]
 
 
 def paragraph(doc: str | None) -> list[str]:
@@ -145,10 +164,20 @@ def write_figures(path: Path, lines: Iterable[str]) -> None:
 
 def write_wrapped(path: Path, lines: Iterable[str]) -> None:
     """Write a page whose lines are broken, those of tables left as they are."""
-    write_text(path, '\n'.join(
-        line if line.startswith('|') else textwrap.fill(
-            line, 100, break_on_hyphens=False,
-            subsequent_indent='  ' if line.startswith('- ') else '') for line in lines))
+    write_text(
+        path,
+        '\n'.join(
+            line
+            if line.startswith('|')
+            else textwrap.fill(
+                line,
+                100,
+                break_on_hyphens=False,
+                subsequent_indent='  ' if line.startswith('- ') else '',
+            )
+            for line in lines
+        ),
+    )
 
 
 def node_command(node: str, *parameters: str) -> list[str]:
@@ -216,9 +245,7 @@ def calibrated_and_diagnosed(
     return lens, diagnose(observations, lens, **options)
 
 
-def ray_errors(
-    lens: Lens, truth: Lens, uv: Array, ranges: Sequence[float] = RANGES
-) -> Array:
+def ray_errors(lens: Lens, truth: Lens, uv: Array, ranges: Sequence[float] = RANGES) -> Array:
     """Return rms angles (R,), mrad, between rays of two lenses at ranges, m.
 
     uv (G, 2): image points, px; a motion that is common to all ranges is taken out.

@@ -41,8 +41,9 @@ class Part(NamedTuple):
 
 def diagnosed(table: Observations, size: tuple[int, int], causes: tuple[str, ...]) -> Diagnosis:
     """Calibrate and diagnose a table, some causes taken in without a test."""
-    return study.calibrated_and_diagnosed(
-        table, size, options=DiagnosisOptions(included=causes))[1]
+    return study.calibrated_and_diagnosed(table, size, options=DiagnosisOptions(included=causes))[
+        1
+    ]
 
 
 def estimates(part: Part) -> Array:
@@ -66,12 +67,29 @@ def agreement(parts: Array) -> Array:
 
 def report(rows: dict[str, Array], deals: int, command: str) -> str:
     """Return the page; rows: chi^2 (deals, 9) by set and causes."""
-    cells = [[label, *(f'{one[np.isfinite(one)].mean():.1f}' if np.isfinite(one).any() else '-'
-                       for one in values.T)] for label, values in rows.items()]
-    return '\n'.join([
-        '# Do thirds of the frames agree?', '', *study.paragraph(__doc__), f'    {command}', '',
-        f'Means over {deals} deals; - where a part always leaves the number open.', '',
-        *study.table(f'set | causes | {" | ".join(NAMES)}', cells), ''])
+    cells = [
+        [
+            label,
+            *(
+                f'{one[np.isfinite(one)].mean():.1f}' if np.isfinite(one).any() else '-'
+                for one in values.T
+            ),
+        ]
+        for label, values in rows.items()
+    ]
+    return '\n'.join(
+        [
+            '# Do thirds of the frames agree?',
+            '',
+            *study.paragraph(__doc__),
+            f'    {command}',
+            '',
+            f'Means over {deals} deals; - where a part always leaves the number open.',
+            '',
+            *study.table(f'set | causes | {" | ".join(NAMES)}', cells),
+            '',
+        ]
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -85,14 +103,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
         named = tuple(one.effect for one in whole if can_be_included(one.effect))
         for label, causes in (('its own', (SHIFT,)), ('of the whole set', named)):
             labels.append(f'{path.parent.name} | {label}')
-            todo += [Part(path, asked.image_size, deal, third, causes)
-                     for deal in range(asked.deals) for third in range(3)]
+            todo += [
+                Part(path, asked.image_size, deal, third, causes)
+                for deal in range(asked.deals)
+                for third in range(3)
+            ]
     found = np.array(study.in_processes('thirds', estimates, todo, asked.workers))
     values = agreement(found.reshape(len(labels), asked.deals, 3, len(NAMES), 2))
     sets = ' '.join(f'{path.parent.name}/{path.name}' for path in asked.sets)
     width, height = asked.image_size
-    command = (f'python -m benchmark.thirds {sets} --image-size {width}x{height} '
-               f'--deals {asked.deals}')
+    command = (
+        f'python -m benchmark.thirds {sets} --image-size {width}x{height} --deals {asked.deals}'
+    )
     page = report(dict(zip(labels, values, strict=True)), asked.deals, command)
     write_text(asked.output / 'thirds.md', page)
     sys.stdout.write(page)

@@ -76,8 +76,10 @@ def lenses() -> tuple[Lens, Lens]:
 
 def hidden_lenses(hidden: Hidden) -> list[Lens]:
     """Return the lenses that take the pictures."""
-    return [replace(lens, viewpoint_shift=Gennery(0.0, shift))
-            for lens, shift in zip(lenses(), hidden.shift, strict=True)]
+    return [
+        replace(lens, viewpoint_shift=Gennery(0.0, shift))
+        for lens, shift in zip(lenses(), hidden.shift, strict=True)
+    ]
 
 
 class Pair(NamedTuple):
@@ -104,31 +106,47 @@ def pair(hidden: Hidden, seed: int) -> Pair:
     left = _views(lenses(), printed, rig, hidden.frames, rng)
     right = left.compose(rig.broadcast_to(hidden.frames))
     if hidden.late:
-        right = right.retract(hidden.late * rng.normal(size=(hidden.frames, 6))
-                              * [1, 1, 1, 3, 3, 3])
+        right = right.retract(
+            hidden.late * rng.normal(size=(hidden.frames, 6)) * [1, 1, 1, 3, 3, 3]
+        )
     poses = (left, right)
     wrong: Any = []
     if hidden.rendered:
         photographs = _photographs(seen, printed, boards, poses, rng)
         pattern = parse_pattern(
-            f'chessboard:{hidden.columns}x{hidden.rows}:{1000 * printed.size}mm')
+            f'chessboard:{hidden.columns}x{hidden.rows}:{1000 * printed.size}mm'
+        )
         table = detect(photographs, pattern).observations
     else:
-        table = joined([
-            _seen(lens, printed, board, pose, hidden, rng, camera)
-            for camera, (lens, board, pose) in enumerate(zip(seen, boards, poses, strict=True))])
+        table = joined(
+            [
+                _seen(lens, printed, board, pose, hidden, rng, camera)
+                for camera, (lens, board, pose) in enumerate(zip(seen, boards, poses, strict=True))
+            ]
+        )
         wrong = rng.choice(hidden.frames, hidden.reversed_frames, replace=False)
         turn = np.isin(table.frame, wrong) & (table.camera == 1)
         last = len(printed.corners) - 1
         landmark = np.where(turn, last - table.landmark, table.landmark)
         table = replace(table, landmark=landmark, xyz=printed.corners[landmark])
-    found = {name: study.calibrated(
-        replace(table.take(table.camera == i), cameras=(name,),
-                camera=np.zeros(int((table.camera == i).sum()), dtype=int)),
-        (one.width, one.height)) for i, (name, one) in enumerate(zip(STEREO, seen, strict=True))}
+    found = {
+        name: study.calibrated(
+            replace(
+                table.take(table.camera == i),
+                cameras=(name,),
+                camera=np.zeros(int((table.camera == i).sum()), dtype=int),
+            ),
+            (one.width, one.height),
+        )
+        for i, (name, one) in enumerate(zip(STEREO, seen, strict=True))
+    }
     both = np.intersect1d(*(table.frame[table.camera == i] for i in (0, 1)))
-    return Pair(table, found, true.true_corners() - printed.corners,
-                sorted(set(wrong) & set(both.tolist())))
+    return Pair(
+        table,
+        found,
+        true.true_corners() - printed.corners,
+        sorted(set(wrong) & set(both.tolist())),
+    )
 
 
 def _bent(printed: Print, hidden: Hidden, rng: Rng) -> Print:
@@ -148,8 +166,12 @@ def _bent(printed: Print, hidden: Hidden, rng: Rng) -> Print:
 
     def of_corner(place: Array) -> Array:
         column, row = np.moveaxis(np.round(place / size).astype(int), -1, 0)
-        return np.asarray(single[np.clip(row, 0, printed.rows - 1) * printed.columns
-                                 + np.clip(column, 0, printed.columns - 1)])
+        return np.asarray(
+            single[
+                np.clip(row, 0, printed.rows - 1) * printed.columns
+                + np.clip(column, 0, printed.columns - 1)
+            ]
+        )
 
     most = max(float(np.ptp(shape(flat[:, :2]))), 1e-9)
 
@@ -169,16 +191,23 @@ def _photographs(
 ) -> Iterator[Photograph]:
     """Render the frames that show a camera the whole board."""
     for name, lens, board, pose in zip(STEREO, seen, boards, poses, strict=True):
-        _, whole = _image(lens, pose.into_body(np.broadcast_to(
-            board.true_corners(), (len(pose.position), *printed.corners.shape))))
+        _, whole = _image(
+            lens,
+            pose.into_body(
+                np.broadcast_to(board.true_corners(), (len(pose.position), *printed.corners.shape))
+            ),
+        )
         for frame in np.flatnonzero(whole).tolist():
-            yield Photograph(f'{name}{frame:03d}', f'{frame:03d}', name, np.nan,
-                             render(lens, board, pose.take(frame), Exposure(), rng))
+            yield Photograph(
+                f'{name}{frame:03d}',
+                f'{frame:03d}',
+                name,
+                np.nan,
+                render(lens, board, pose.take(frame), Exposure(), rng),
+            )
 
 
-def _views(
-    given: Sequence[Lens], printed: Print, rig: Pose, frames: int, rng: Rng
-) -> Pose:
+def _views(given: Sequence[Lens], printed: Print, rig: Pose, frames: int, rng: Rng) -> Pose:
     """Return poses of the left camera; every camera sees the board as a whole in most of them."""
     own = board_views(given[0], printed, frames - frames // 3, (0.25, 0.8), rng)
     other = board_views(given[1], printed, frames // 3, (0.25, 0.8), rng)
@@ -201,8 +230,14 @@ def _seen(
     uv = uv + (far * 10 ** rng.uniform(0.0, 1.5, far.shape))[..., None] * rng.normal(size=uv.shape)
     frame, landmark = np.nonzero(whole[:, None] & np.ones(count, dtype=bool))
     return make_observations(
-        frame, landmark, uv[frame, landmark], printed.corners[landmark],
-        camera=np.full(len(frame), camera), cameras=STEREO, source='pair')
+        frame,
+        landmark,
+        uv[frame, landmark],
+        printed.corners[landmark],
+        camera=np.full(len(frame), camera),
+        cameras=STEREO,
+        source='pair',
+    )
 
 
 def _image(lens: Lens, points: Array) -> tuple[Array, Mask]:
@@ -216,14 +251,18 @@ KINDS = {
     'bent board, shifts of 3 and 1.5 mm': Hidden((0.003, 0.0015), 1e-3),
     'bent by 0.3 mm, shifts of 2 and 1 mm': Hidden((0.002, 0.001), 3e-4),
     'bent by 0.5 mm, background as large as the noise': Hidden(
-        (0.003, 0.001), 5e-4, 1e-4, 0.1, 0.1, 0.12, 0.01, 3, 25),
+        (0.003, 0.001), 5e-4, 1e-4, 0.1, 0.1, 0.12, 0.01, 3, 25
+    ),
     'bent by 2 mm, background as large as the noise': Hidden(
-        (0.003, 0.001), 2e-3, 1e-4, 0.1, 0.1, 0.12, 0.01, 3, 25),
+        (0.003, 0.001), 2e-3, 1e-4, 0.1, 0.1, 0.12, 0.01, 3, 25
+    ),
     'bent board, the right camera later, by when the board moved 2 mm': Hidden(
-        (0.003, 0.0015), 1e-3, late=0.002),
+        (0.003, 0.0015), 1e-3, late=0.002
+    ),
     'two boards': Hidden((0.003, 0.0015), 1e-3, apart=True),
     'photographs, rendered, of a board bent by 1 mm, shifts of 3 and 1.5 mm': Hidden(
-        (0.003, 0.0015), 1e-3, frames=20, rows=6, rendered=True),
+        (0.003, 0.0015), 1e-3, frames=20, rows=6, rendered=True
+    ),
 }
 
 
@@ -242,8 +281,11 @@ def reachable(seen: Pair, hidden: Hidden) -> dict[str, float]:
         for _ in range(_ROUNDS):
             off = np.linalg.norm(views.uv - model.linearise(pose, views).uv, axis=-1)
             limit = _FAR * np.nanmedian(np.where(views.used, off, np.nan), axis=1, keepdims=True)
-            pose = localize(model, views._replace(
-                weight=np.where(views.used & (off < limit), views.weight, 0.0)), pose).pose
+            pose = localize(
+                model,
+                views._replace(weight=np.where(views.used & (off < limit), views.weight, 0.0)),
+                pose,
+            ).pose
         poses.append((views.frame, pose))
     _, *both = np.intersect1d(poses[0][0], poses[1][0], return_indices=True)
     left, right = (pose.take(rows) for (_, pose), rows in zip(poses, both, strict=True))
@@ -258,11 +300,16 @@ def tried(kind: str, seed: int) -> dict[str, Any]:
     found = diagnose(seen.table, seen.lenses)
     said = found.cameras[0]
     return {
-        'kind': kind, 'seed': seed, 'seconds': round(process_time() - began, 1),
-        'causes': [cause.form for cause in found.causes], 'verdict': found.verdict,
-        'heldout_rms_px': [quality.heldout_rms_px for quality in (
-            found.figures.base, found.figures.extended)],
-        'external': said.to_dict(), 'reachable': reachable(seen, KINDS[kind]),
+        'kind': kind,
+        'seed': seed,
+        'seconds': round(process_time() - began, 1),
+        'causes': [cause.form for cause in found.causes],
+        'verdict': found.verdict,
+        'heldout_rms_px': [
+            quality.heldout_rms_px for quality in (found.figures.base, found.figures.extended)
+        ],
+        'external': said.to_dict(),
+        'reachable': reachable(seen, KINDS[kind]),
     }
 
 
@@ -277,16 +324,33 @@ def section(found: Sequence[dict[str, Any]]) -> str:
         counts = [verdicts.count(name) for name in ('agree', 'undecided', 'contradict')]
         maps = [one['maps']['correlation'] for one in said if one['maps']]
         carried = [one for each in said for one in each['target']]
-        less = [[100 * one['rig'][name]['gain'] for one in said if one['rig']]
-                for name in ('translation_m', 'rotation_rad')]
-        px = ' → '.join(spread([one[name] for one in carried], '.3f')
-                        for name in ('without_px', 'with_px'))
-        rows.append([f'{len(said)}: {kind}', ', '.join(map(str, counts)), spread(maps, '.3f'), px,
-                     *(f'{spread(one, ".0f")} %' for one in less), *_bound(found, kind)])
-    return '\n'.join(study.table(
-        'pairs | agree, undecided, contradict | correlation of the maps | rms of the one that did '
-        'not find it, px | less scatter of the rig: translation | rotation | by the truth | '
-        'of what can be had', rows, numbers=True))
+        less = [
+            [100 * one['rig'][name]['gain'] for one in said if one['rig']]
+            for name in ('translation_m', 'rotation_rad')
+        ]
+        px = ' → '.join(
+            spread([one[name] for one in carried], '.3f') for name in ('without_px', 'with_px')
+        )
+        rows.append(
+            [
+                f'{len(said)}: {kind}',
+                ', '.join(map(str, counts)),
+                spread(maps, '.3f'),
+                px,
+                *(f'{spread(one, ".0f")} %' for one in less),
+                *_bound(found, kind),
+            ]
+        )
+    return '\n'.join(
+        study.table(
+            'pairs | agree, undecided, contradict | correlation of the maps | rms of the '
+            'one that did '
+            'not find it, px | less scatter of the rig: translation | rotation | by the truth | '
+            'of what can be had',
+            rows,
+            numbers=True,
+        )
+    )
 
 
 def _bound(found: Sequence[dict[str, Any]], kind: str) -> tuple[str, str]:
@@ -299,9 +363,13 @@ def _bound(found: Sequence[dict[str, Any]], kind: str) -> tuple[str, str]:
         return '-', '-'
     told, near = [], []
     for name in ('translation_m', 'rotation_rad'):
-        base, extended, truth = np.array([
-            [one['external']['rig'][name][key] for key in ('base', 'extended')]
-            + [one['reachable'][name]] for one in mine]).T
+        base, extended, truth = np.array(
+            [
+                [one['external']['rig'][name][key] for key in ('base', 'extended')]
+                + [one['reachable'][name]]
+                for one in mine
+            ]
+        ).T
         told.append(f'{100 * np.median(1 - truth / base):.0f} %')
         near.append(f'{100 * (base - extended).sum() / (base - truth).sum():.0f} %')
     return ', '.join(told), ', '.join(near)
@@ -311,15 +379,21 @@ def spread(values: Sequence[float], form: str) -> str:
     """Return the median of some values and, in brackets, the least and the largest."""
     if not values:
         return '-'
-    middle, least, most = (format(float(value), form) for value in (
-        np.median(values), np.min(values), np.max(values)))
+    middle, least, most = (
+        format(float(value), form) for value in (np.median(values), np.min(values), np.max(values))
+    )
     return f'{middle} ({least} to {most})'
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the pairs, write those that are done and print a line for each."""
-    asked = study.parser('two_cameras', __doc__, study.RESULTS / 'two_cameras.json', workers=False,
-                         pairs=(10, 'of each kind')).parse_args(arguments)
+    asked = study.parser(
+        'two_cameras',
+        __doc__,
+        study.RESULTS / 'two_cameras.json',
+        workers=False,
+        pairs=(10, 'of each kind'),
+    ).parse_args(arguments)
     found = json.loads(asked.output.read_text()) if asked.output.is_file() else []
     done = {(one['kind'], one['seed']) for one in found}
     for seed, kind in product(range(asked.pairs), KINDS):

@@ -59,13 +59,20 @@ class Outcome:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the trials, write them, print what came of them."""
     asked = study.parser(
-        'water', __doc__, study.RESULTS / 'water' / 'trials.json', trials=(120, 'of all kinds'),
+        'water',
+        __doc__,
+        study.RESULTS / 'water' / 'trials.json',
+        trials=(120, 'of all kinds'),
         rough=(False, 'with errors of board and frames'),
-        air=(False, 'lenses calibrated in air')).parse_args(arguments)
+        air=(False, 'lenses calibrated in air'),
+    ).parse_args(arguments)
     run = partial(run_trial, rough=asked.rough, air=asked.air)
     outcomes = study.in_processes('trials', run, range(asked.trials), asked.workers)
-    command = (f'python -m benchmark.water --trials {asked.trials}' + ' --rough' * asked.rough
-               + ' --air' * asked.air)
+    command = (
+        f'python -m benchmark.water --trials {asked.trials}'
+        + ' --rough' * asked.rough
+        + ' --air' * asked.air
+    )
     write_text(asked.output, study.json_lines(map(asdict, outcomes), command))
     sys.stdout.write(summary(outcomes))
 
@@ -113,8 +120,12 @@ def run_trial(number: int, rough: bool = False, air: bool = False) -> Outcome:
     if kind == 'focal':
         true = replace(lens, fx=1.33 * lens.fx, fy=1.33 * lens.fy)
     elif kind == 'curve':
-        true = replace(lens, image_height=IMAGE_HEIGHTS['stereographic'](), fx=1.15 * lens.fx,
-                       fy=1.15 * lens.fy)
+        true = replace(
+            lens,
+            image_height=IMAGE_HEIGHTS['stereographic'](),
+            fx=1.15 * lens.fx,
+            fy=1.15 * lens.fy,
+        )
     refracted = kind in ('water', 'plate')
 
     def see(points: Array) -> Array:
@@ -129,22 +140,45 @@ def run_trial(number: int, rough: bool = False, air: bool = False) -> Outcome:
         given = _calibrated_in_air(table, (lens.width, lens.height))
     found = diagnose(seen, given, free_intrinsics=free)
     port = next((c for c in found.causes if c.form == 'flat_port(medium)'), None)
-    values = {} if port is None else {
-        name: [entry['value'], entry['stderr']] for name, entry in port.parameters.items()
-    }
-    return Outcome(number, kind, free, index, float(distance), float(np.hypot(*tilt)),
-                   float(thickness), noise, rough, air, [c.effect for c in found.causes], values,
-                   found.figures.named.rms_px, found.figures.named.heldout_rms_px)
+    values = (
+        {}
+        if port is None
+        else {name: [entry['value'], entry['stderr']] for name, entry in port.parameters.items()}
+    )
+    return Outcome(
+        number,
+        kind,
+        free,
+        index,
+        float(distance),
+        float(np.hypot(*tilt)),
+        float(thickness),
+        noise,
+        rough,
+        air,
+        [c.effect for c in found.causes],
+        values,
+        found.figures.named.rms_px,
+        found.figures.named.heldout_rms_px,
+    )
 
 
 def _lens(rng: np.random.Generator) -> Lens:
     """Return a fisheye lens: half a field of 60 to 85 degrees on 1280 x 960 px."""
     half = np.radians(rng.uniform(60, 85))
-    curve = KannalaBrandt(rng.normal(scale=0.02), rng.normal(scale=0.004),
-                          rng.normal(scale=0.001))
+    curve = KannalaBrandt(rng.normal(scale=0.02), rng.normal(scale=0.004), rng.normal(scale=0.001))
     f = 800 / float(curve.value_and_slope(np.array(half))[0])
-    return Lens('lens', 1280, 960, f, f * (1 + rng.normal(scale=1e-3)),
-                640 + rng.normal(scale=8), 480 + rng.normal(scale=8), curve, half)
+    return Lens(
+        'lens',
+        1280,
+        960,
+        f,
+        f * (1 + rng.normal(scale=1e-3)),
+        640 + rng.normal(scale=8),
+        480 + rng.normal(scale=8),
+        curve,
+        half,
+    )
 
 
 def _calibrated(lens: Lens, rng: np.random.Generator, free: bool, rough: bool) -> Lens:
@@ -152,15 +186,21 @@ def _calibrated(lens: Lens, rng: np.random.Generator, free: bool, rough: bool) -
     worse = 5.0 if rough else 1.0
     off = 1 + worse * rng.normal(scale=2e-4)
     block = {'rms_px': 0.2} if free else None
-    return replace(lens, fx=lens.fx * off, fy=lens.fy * off, calibration=block,
-                   cx=lens.cx + worse * rng.normal(scale=0.1),
-                   cy=lens.cy + worse * rng.normal(scale=0.1))
+    return replace(
+        lens,
+        fx=lens.fx * off,
+        fy=lens.fy * off,
+        calibration=block,
+        cx=lens.cx + worse * rng.normal(scale=0.1),
+        cy=lens.cy + worse * rng.normal(scale=0.1),
+    )
 
 
 def _calibrated_in_air(table: Observations, size: tuple[int, int]) -> Lens:
     """Return the lens file that `calibrate` writes of photographs in air."""
     result, kept, _ = calibrate_without_outliers(
-        table, lambda rows: calibrate(rows, 'kannala_brandt', size))
+        table, lambda rows: calibrate(rows, 'kannala_brandt', size)
+    )
     found = result.adjusted
     return with_covariance(found.lens, assess_lens(kept, found.lens, found.names))
 
@@ -190,7 +230,10 @@ def _through(
 
 
 def _photographs(
-    lens: Lens, see: Callable[[Array], Array], noise: float, rough: bool,
+    lens: Lens,
+    see: Callable[[Array], Array],
+    noise: float,
+    rough: bool,
     rng: np.random.Generator,
 ) -> Observations:
     """Return 10 to 24 photographs of a board, 70 % of it in the image at least.

@@ -27,8 +27,9 @@ autodoc_member_order = 'bysource'
 autodoc_typehints = 'signature'
 autodoc_typehints_format = 'short'
 autodoc_preserve_defaults = True
-autodoc_type_aliases = {name: name for name in ('Array', 'Index', 'Mask', 'AnyLens',
-                                                 'AnyObservations')}
+autodoc_type_aliases = {
+    name: name for name in ('Array', 'Index', 'Mask', 'AnyLens', 'AnyObservations')
+}
 
 html_theme = 'furo'
 html_title = f'{project} {version}'

@@ -47,15 +47,22 @@ def node_section(table: list[Row], common: list[Row]) -> str:
     """Return what nodes.md says of the parameters of one node."""
     own = [row for row in table if row not in common]
     names = ', '.join(f'`{row.name}`' for row in table if row in common)
-    shared = textwrap.fill(f'[Common parameters](#common-parameters): {names}.', 100,
-                           break_long_words=False, break_on_hyphens=False)
+    shared = textwrap.fill(
+        f'[Common parameters](#common-parameters): {names}.',
+        100,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
     return '\n'.join([*([markdown(own)] if own else []), *([shared + '\n'] if names else [])])
 
 
 def parameter_file(node: str, table: list[Row]) -> str:
     """Return a commented parameter file that holds the defaults."""
-    lines = [f'# Parameters of {node}, with their defaults; see docs/reference/nodes.md.',
-             '/**:', '  ros__parameters:']
+    lines = [
+        f'# Parameters of {node}, with their defaults; see docs/reference/nodes.md.',
+        '/**:',
+        '  ros__parameters:',
+    ]
     for row in table:
         unit = f' [{row.unit}]' if row.unit else ''
         allowed = f' ({row.constraint()})' if row.constraint() else ''
@@ -69,8 +76,11 @@ def documents() -> dict[Path, str]:
     """Return what the files should hold."""
     page = ROOT / 'docs' / 'reference' / 'nodes.md'
     text = page.read_text(encoding='utf-8')
-    tables = {node: executables.parameters(node) for node in NODES
-              if (ROOT / 'fisheye_svp_ros' / 'nodes' / f'{node}.py').exists()}
+    tables = {
+        node: executables.parameters(node)
+        for node in NODES
+        if (ROOT / 'fisheye_svp_ros' / 'nodes' / f'{node}.py').exists()
+    }
     common = common_rows(tables.values())
     sections = {node: node_section(table, common) for node, table in tables.items()}
     for node, section in {_COMMON: markdown(common), **sections}.items():
@@ -79,8 +89,13 @@ def documents() -> dict[Path, str]:
         text, found = re.subn(pattern, lambda _, new=new: new, text, flags=re.DOTALL)
         if not found:
             raise SystemExit(f'docs/reference/nodes.md has no place for the parameters of {node}')
-    return {page: text, **{ROOT / 'config' / f'{node}.yaml': parameter_file(node, table)
-                           for node, table in tables.items()}}
+    return {
+        page: text,
+        **{
+            ROOT / 'config' / f'{node}.yaml': parameter_file(node, table)
+            for node, table in tables.items()
+        },
+    }
 
 
 def _yaml(value: Any) -> str:

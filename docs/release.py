@@ -20,10 +20,17 @@ PACKAGE = 'fisheye_svp_ros'
 # By module that is imported, the key that brings it, where that is not the module's own name; ''
 # where rosdistro has none (read on 2026-11-22).
 KEYS = {
-    'cv2': 'python3-opencv', 'jinja2': 'python3-jinja2', 'matplotlib': 'python3-matplotlib',
-    'numpy': 'python3-numpy', 'rich': 'python3-rich', 'rosbags': 'python3-rosbags-pip',
-    'scipy': 'python3-scipy', 'yaml': 'python3-yaml', 'mcap': '',
-    'lz4': '', 'zstandard': '',
+    'cv2': 'python3-opencv',
+    'jinja2': 'python3-jinja2',
+    'matplotlib': 'python3-matplotlib',
+    'numpy': 'python3-numpy',
+    'rich': 'python3-rich',
+    'rosbags': 'python3-rosbags-pip',
+    'scipy': 'python3-scipy',
+    'yaml': 'python3-yaml',
+    'mcap': '',
+    'lz4': '',
+    'zstandard': '',
 }
 # Extras, which the package does without where they are not installed; and what else is no package
 OPTIONAL = {'apriltag_msgs', 'distributed', 'numba', 'pyarrow', 'threadpoolctl'}
@@ -34,8 +41,14 @@ def findings() -> list[str]:
     root = ElementTree.parse(ROOT / 'package.xml').getroot()
     text = {child.tag: str(child.text).strip() for child in root}
     keys = {str(child.text) for child in root if child.tag in ('exec_depend', 'depend')}
-    return [*_description(root, text), *_versions(text['version']), *_changelog(text['version']),
-            *_imports(keys), *_keys(keys), *_installed()]
+    return [
+        *_description(root, text),
+        *_versions(text['version']),
+        *_changelog(text['version']),
+        *_imports(keys),
+        *_keys(keys),
+        *_installed(),
+    ]
 
 
 def _description(root: ElementTree.Element, text: dict[str, str]) -> list[str]:
@@ -67,8 +80,11 @@ def _versions(version: str) -> list[str]:
 def _changelog(version: str) -> list[str]:
     lines = (ROOT / 'CHANGELOG.rst').read_text().splitlines()
     title = f'Changelog for package {PACKAGE}'
-    heads = [line for line, under in pairwise(lines)
-             if under and set(under) == {'-'} and len(under) == len(line)]
+    heads = [
+        line
+        for line, under in pairwise(lines)
+        if under and set(under) == {'-'} and len(under) == len(line)
+    ]
     if title not in lines or not heads:
         return ['CHANGELOG.rst: not as catkin_generate_changelog writes it']
     dated = rf'{version} \(\d{{4}}-\d\d-\d\d\)'
@@ -101,22 +117,35 @@ def _imports(keys: set[str]) -> list[str]:
 
 
 def _keys(keys: set[str]) -> list[str]:
-    return [f'{key}: of pip, which a Debian package cannot depend on'
-            for key in sorted(keys) if key.endswith('-pip')]
+    return [
+        f'{key}: of pip, which a Debian package cannot depend on'
+        for key in sorted(keys)
+        if key.endswith('-pip')
+    ]
 
 
 def _installed() -> list[str]:
     """Return what ament needs to find an installed package, where it is missing."""
     with contextlib.chdir(ROOT):
         setup = import_module('distutils.core').run_setup('setup.py', stop_after='init')
-    places = {Path(folder, Path(file).name).as_posix()
-              for folder, files in setup.data_files for file in files}
-    wanted = [f'share/ament_index/resource_index/packages/{PACKAGE}',
-              f'share/{PACKAGE}/package.xml']
+    places = {
+        Path(folder, Path(file).name).as_posix()
+        for folder, files in setup.data_files
+        for file in files
+    }
+    wanted = [
+        f'share/ament_index/resource_index/packages/{PACKAGE}',
+        f'share/{PACKAGE}/package.xml',
+    ]
     config = (ROOT / 'setup.cfg').read_text()
-    return [*(f'setup.py: {place} is not installed' for place in wanted if place not in places),
-            *([] if f'install_scripts=$base/lib/{PACKAGE}' in config else
-              ['setup.cfg: scripts are not installed below lib/'])]
+    return [
+        *(f'setup.py: {place} is not installed' for place in wanted if place not in places),
+        *(
+            []
+            if f'install_scripts=$base/lib/{PACKAGE}' in config
+            else ['setup.cfg: scripts are not installed below lib/']
+        ),
+    ]
 
 
 if __name__ == '__main__':

@@ -20,22 +20,31 @@ def commands() -> str:
     for name, purpose in COMMANDS.items():
         parser = argparse.ArgumentParser(name)
         import_module(f'fisheye_svp_ros.commands.{name}').add_arguments(parser)
-        parts += [f'## {name}', '', f'{purpose[0].upper()}{purpose[1:]}.', '',
-                  '| argument | meaning |', '|---|---|',
-                  *(_row(action) for action in parser._actions if action.dest != 'help'), '']
+        parts += [
+            f'## {name}',
+            '',
+            f'{purpose[0].upper()}{purpose[1:]}.',
+            '',
+            '| argument | meaning |',
+            '|---|---|',
+            *(_row(action) for action in parser._actions if action.dest != 'help'),
+            '',
+        ]
     return '\n'.join(parts)
 
 
 def _row(action: argparse.Action) -> str:
     """Return the row of an argument, with its default where the help does not state it."""
-    value = action.metavar or (','.join(map(str, action.choices)) if action.choices
-                               else action.dest.upper())
+    value = action.metavar or (
+        ','.join(map(str, action.choices)) if action.choices else action.dest.upper()
+    )
     value = ' '.join(value) if isinstance(value, tuple) else value
     names = ', '.join(action.option_strings)
     name = f'{names} {"" if action.nargs == 0 else value}'.strip()
     text = (action.help or '') % {**vars(action), 'prog': 'fisheye-svp'}
     told = action.default in (None, '', 0, False, argparse.SUPPRESS) or (
-        'default' in text or f'({action.default})' in text)
+        'default' in text or f'({action.default})' in text
+    )
     if not told:
         text += f'; default: {action.default}'
     return f'| `{name}` | {text} |'
@@ -50,8 +59,9 @@ def diagnosis_keys() -> str:
 
 def _keys(node: Any, schema: Any, path: str) -> Iterator[tuple[str, str, str]]:
     """Yield path, type and description of what a node of the schema holds."""
-    parts = [(f'{path}.{name}'.lstrip('.'), part)
-             for name, part in node.get('properties', {}).items()]
+    parts = [
+        (f'{path}.{name}'.lstrip('.'), part) for name, part in node.get('properties', {}).items()
+    ]
     if 'items' in node:
         yield from _keys(_resolved(node['items'], schema), schema, f'{path}[]')
     if isinstance(node.get('additionalProperties'), dict):

@@ -17,8 +17,9 @@ import fisheye_svp_ros as fsvp
 
 def simulated(seed: int) -> Any:
     """Return ten views of a lens with a viewpoint shift, 0.2 px of noise."""
-    return fsvp.simulate_scenario(lens='fish214', radius=0.5, noise_px=0.2, seed=seed,
-                                  poses_file='calibration')
+    return fsvp.simulate_scenario(
+        lens='fish214', radius=0.5, noise_px=0.2, seed=seed, poses_file='calibration'
+    )
 
 
 def position_error(lens: fsvp.Lens) -> float:

@@ -23,8 +23,9 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 def detect() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Return landmark numbers (N,), image points (N, 2), px, and landmarks (N, 3), m, by view."""
-    table = fsvp.simulate_scenario(lens='fish214', radius=0.5, noise_px=0.2,
-                                   poses_file='calibration').observations
+    table = fsvp.simulate_scenario(
+        lens='fish214', radius=0.5, noise_px=0.2, poses_file='calibration'
+    ).observations
     views = [table.frame == frame for frame in np.unique(table.frame)]
     return [(table.landmark[view], table.uv[view], table.xyz[view]) for view in views]
 
@@ -37,10 +38,24 @@ def cloud(landmark: np.ndarray, **columns: np.ndarray) -> PointCloud2:
     for name, values in columns.items():
         points[name] = values
     kinds = {'landmark': PointField.UINT32}
-    fields = [PointField(name=name, offset=dtype.fields[name][1], count=1,
-                         datatype=kinds.get(name, PointField.FLOAT64)) for name in dtype.names]
-    return PointCloud2(height=1, width=len(points), fields=fields, is_dense=True,
-                       point_step=dtype.itemsize, row_step=points.nbytes, data=points.tobytes())
+    fields = [
+        PointField(
+            name=name,
+            offset=dtype.fields[name][1],
+            count=1,
+            datatype=kinds.get(name, PointField.FLOAT64),
+        )
+        for name in dtype.names
+    ]
+    return PointCloud2(
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_dense=True,
+        point_step=dtype.itemsize,
+        row_step=points.nbytes,
+        data=points.tobytes(),
+    )
 
 
 class Detector(Node):
@@ -54,8 +69,7 @@ class Detector(Node):
         self.landmarks = self.create_publisher(PointCloud2, 'landmarks', LATCHED)
         self.points = self.create_publisher(PointCloud2, 'image_points', 10)
         self.create_subscription(PoseWithCovarianceStamped, 'localizer/pose', self.on_pose, 10)
-        number, first = np.unique(np.concatenate([n for n, _, _ in self.views]),
-                                  return_index=True)
+        number, first = np.unique(np.concatenate([n for n, _, _ in self.views]), return_index=True)
         xyz = np.concatenate([xyz for _, _, xyz in self.views])[first]
         landmarks = cloud(number, x=xyz[:, 0], y=xyz[:, 1], z=xyz[:, 2])
         landmarks.header.frame_id = 'world'
@@ -76,8 +90,11 @@ class Detector(Node):
             return  # of an earlier attempt
         p = message.pose.pose.position
         sigma = 1e3 * np.sqrt(message.pose.covariance[0::7][:3])
-        print(f'x = {p.x:.4f} m, y = {p.y:.4f} m, z = {p.z:.4f} m; '
-              f'standard errors {sigma.round(2)} mm', flush=True)
+        print(
+            f'x = {p.x:.4f} m, y = {p.y:.4f} m, z = {p.z:.4f} m; '
+            f'standard errors {sigma.round(2)} mm',
+            flush=True,
+        )
         del self.views[0]
         if not self.views:
             raise SystemExit

@@ -35,14 +35,15 @@ def main() -> None:
     args = parser.parse_args()
 
     lens = fsvp.load_lens(args.lens)
-    scenario = {'lens': args.lens, 'style': 'parallel', 'baseline': args.baseline,
-                'noise_px': 0.2}
+    scenario = {'lens': args.lens, 'style': 'parallel', 'baseline': args.baseline, 'noise_px': 0.2}
     views = fsvp.simulate_scenario(**scenario, radius=0.5, poses_file='calibration')
     for name, model in (('full lens', lens), ('SVP', lens.svp())):
         found = fsvp.calibrate_stereo(views.observations, model, model)
         sigma = np.sqrt(np.diag(found.covariance))[0]
-        print(f'{name}: baseline {1e3 * np.linalg.norm(found.rig.position):.2f} '
-              f'± {1e3 * sigma:.2f} mm, rms {found.rms_px:.2f} px')
+        print(
+            f'{name}: baseline {1e3 * np.linalg.norm(found.rig.position):.2f} '
+            f'± {1e3 * sigma:.2f} mm, rms {found.rms_px:.2f} px'
+        )
         for distance in RANGES:
             scene = fsvp.simulate_scenario(**scenario, radius=distance)
             error = depth_error(model, scene, found.rig)

@@ -22,7 +22,8 @@ def position_errors(lens: str, svp: bool) -> np.ndarray:
     """Return the median position error at each range, m."""
     table = fsvp.sweep(
         {'radius': RANGES, 'seed': range(DRAWS)},
-        synthetic_camera={'lens': lens, 'noise_px': 0.3}, localizer={'svp': svp},
+        synthetic_camera={'lens': lens, 'noise_px': 0.3},
+        localizer={'svp': svp},
     ).table()
     error = np.array(table['localizer.position_error_m'])
     return np.median(error.reshape(len(RANGES), DRAWS), axis=1)

@@ -41,8 +41,10 @@ class Batch:
 
     def take(self, index: Any) -> Self:
         """Return what stands at `index` of the leading axes."""
-        return self._from_fields(part.take(index) if isinstance(part, Batch) else part[index]
-                          for part in self._fields_tuple())
+        return self._from_fields(
+            part.take(index) if isinstance(part, Batch) else part[index]
+            for part in self._fields_tuple()
+        )
 
     def put(self, index: Any, other: Self) -> None:
         """Write `other` to the places `index` of the leading axes."""

@@ -34,7 +34,7 @@ COMMANDS = {
     'plot': 'plot a recording, a table or a sweep',
     'record': 'record the topics of the nodes into a rosbag2 recording (MCAP)',
     'render': 'render photographs of a chessboard through a lens, with their true corners and '
-              'poses',
+    'poses',
     'run': 'run one node, as `ros2 run` does, or several in one process',
     'sweep': 'run a sweep of simulated scenarios offline; write one row per scenario',
     'table': 'turn a recording into a table with one row per stamp of the input',
@@ -68,20 +68,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if str(error.name).startswith('fisheye_svp_ros'):
             raise
-        print(f'fisheye-svp: this needs the Python package {error.name}, which is not installed',
-              file=sys.stderr)
+        print(
+            f'fisheye-svp: this needs the Python package {error.name}, which is not installed',
+            file=sys.stderr,
+        )
         return _BAD_INPUT
     except UnicodeEncodeError as error:
-        print(f'fisheye-svp: {error.object!r:.200} cannot be printed here; set a UTF-8 locale',
-              file=sys.stderr)
+        print(
+            f'fisheye-svp: {error.object!r:.200} cannot be printed here; set a UTF-8 locale',
+            file=sys.stderr,
+        )
         return _BAD_INPUT
     except BrokenPipeError:
         # Nobody reads on; give the interpreter's own last flush somewhere to go.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
     except OSError as error:  # of a path that no check has asked for
-        print(f'fisheye-svp: {error.filename or "a file"!r:.200}: {error.strerror or error}',
-              file=sys.stderr)
+        print(
+            f'fisheye-svp: {error.filename or "a file"!r:.200}: {error.strerror or error}',
+            file=sys.stderr,
+        )
         return _BAD_INPUT
     except KeyboardInterrupt:
         return _EXIT_SIGINT
@@ -92,7 +98,7 @@ def _run(arguments: Sequence[str]) -> None:
     parser = _Parser(
         prog='fisheye-svp',
         description='Measure what the single-viewpoint (SVP) approximation of a fisheye lens '
-                    'costs, and find the model errors in calibration data.',
+        'costs, and find the model errors in calibration data.',
     )
     parser.add_argument('--version', action='version', version=f'%(prog)s {__version__}')
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
@@ -107,10 +113,12 @@ def _run(arguments: Sequence[str]) -> None:
         commands.choices[named].set_defaults(run=module.run)
     if named in _SOLVING:
         commands.choices[named].add_argument(
-            '--engine', choices=('auto', 'numpy', 'numba'),
+            '--engine',
+            choices=('auto', 'numpy', 'numba'),
             help='numpy, or numba (extra `fast`), which compiles for about a minute at its first '
             'use on a machine; auto: numba for long work, numpy otherwise; default: '
-            'FISHEYE_SVP_ENGINE, or auto')
+            'FISHEYE_SVP_ENGINE, or auto',
+        )
     parsed, unknown = parser.parse_known_args(arguments)
     if unknown:
         _refuse(commands.choices[named], unknown[0])

@@ -12,7 +12,7 @@ class FisheyeSvpError(Exception):
     def __init__(self, text: object = '') -> None:
         text = str(text)
         if len(text) > _MAX_LENGTH:
-            text = f'{text[:_MAX_LENGTH // 2]} ... {text[-_MAX_LENGTH // 2:]}'
+            text = f'{text[: _MAX_LENGTH // 2]} ... {text[-_MAX_LENGTH // 2 :]}'
         super().__init__(_CONTROL_CHARACTERS.sub(' ', text))
 
 

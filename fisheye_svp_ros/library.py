@@ -134,16 +134,27 @@ def localize(
     residual = np.full((len(table), 2), np.nan)
     residual[views.row[views.used]] = fitted[views.used]
     return Localized(
-        views.frame, result.pose, result.covariance, np.array([*map(rms_px, fitted)]), residual,
-        measured.sigma, measured.left_out, measured.reasons,
+        views.frame,
+        result.pose,
+        result.covariance,
+        np.array([*map(rms_px, fitted)]),
+        residual,
+        measured.sigma,
+        measured.left_out,
+        measured.reasons,
     )
 
 
 @limit_threads
 def calibrate(
-    observations: AnyObservations, model: str, image_size: tuple[int, int],
-    free: Sequence[str] | None = None, name: str = 'lens', *,
-    poses: AnyPoses | None = None, progress: Progress = _silent,
+    observations: AnyObservations,
+    model: str,
+    image_size: tuple[int, int],
+    free: Sequence[str] | None = None,
+    name: str = 'lens',
+    *,
+    poses: AnyPoses | None = None,
+    progress: Progress = _silent,
 ) -> Calibrated:
     """Fit a lens to image points of known targets, see `solve.lens_calibration.calibrate`.
 
@@ -167,14 +178,21 @@ def calibrate(
         check_size_given(str(observations), {}, {'': size}, 'image_size')
     progress('fitting the lens', 0.0)
     found, kept, _ = calibrate_without_outliers(
-        table, lambda rows: lens_calibration.calibrate(rows, model, size, free, name))
+        table, lambda rows: lens_calibration.calibrate(rows, model, size, free, name)
+    )
     if poses is not None:
         found, _ = lens_calibration.calibrate_hand_eye(found, kept, _by_frame(poses))
     adjusted = found.adjusted
     progress('estimating standard errors', 0.3)
     trusted = assess_lens(kept, adjusted.lens, adjusted.names)
-    return Calibrated(with_covariance(adjusted.lens, trusted), tuple(adjusted.names),
-                      trusted.covariance, found.sigma, found.left_out, bool(adjusted.converged))
+    return Calibrated(
+        with_covariance(adjusted.lens, trusted),
+        tuple(adjusted.names),
+        trusted.covariance,
+        found.sigma,
+        found.left_out,
+        bool(adjusted.converged),
+    )
 
 
 @limit_threads
@@ -189,17 +207,30 @@ def calibrate_stereo(
     views = stereo_views(table)
     found = stereo_calibration.calibrate_stereo(*models, *views)
     residual = np.concatenate([found.left_residual, found.right_residual])
-    sigma = 1.0 if sigma_known(table) else noise_sigma(
-        float(found.cost[0]), int(np.isfinite(residual).sum()), 6 * (len(views[0].frame) + 1))
+    sigma = (
+        1.0
+        if sigma_known(table)
+        else noise_sigma(
+            float(found.cost[0]), int(np.isfinite(residual).sum()), 6 * (len(views[0].frame) + 1)
+        )
+    )
     return CalibratedRig(
-        found.rig.take(0), sigma**2 * found.rig_covariance[0], views[0].frame, found.pose.take(0),
-        rms_px(residual), bool(found.converged[0]),
+        found.rig.take(0),
+        sigma**2 * found.rig_covariance[0],
+        views[0].frame,
+        found.pose.take(0),
+        rms_px(residual),
+        bool(found.converged[0]),
     )
 
 
 @limit_threads
 def stereo_depth(
-    observations: AnyObservations, left: AnyLens, right: AnyLens, rig: AnyRig, *,
+    observations: AnyObservations,
+    left: AnyLens,
+    right: AnyLens,
+    rig: AnyRig,
+    *,
     model_error: bool = False,
 ) -> StereoDepth:
     """Measure every landmark that both cameras of a rig (left in right) see, with SVP or not.
@@ -223,8 +254,14 @@ def stereo_depth(
 
         errors = [LensErrors.from_lens(load_lens(lens)) for lens in (left, right)]
         covariance = depth_errors(errors[0], errors[1], rig, solved.points).total
-    return StereoDepth(frame[both], one.landmark[both], solved.points, solved.gap,
-                       epipolar_offset(*known).distance, covariance)
+    return StereoDepth(
+        frame[both],
+        one.landmark[both],
+        solved.points,
+        solved.gap,
+        epipolar_offset(*known).distance,
+        covariance,
+    )
 
 
 def simulate_scenario(**scenario: Any) -> Simulated:
@@ -238,8 +275,10 @@ def simulate_scenario(**scenario: Any) -> Simulated:
     lens = scenario.pop('lens', None)
     named = {} if lens is None or isinstance(lens, Lens) else {'lens': str(lens)}
     given = {**check_parameters(scenario, 'scenario'), **named}
-    seen = scenarios.simulate_scenario(with_values(sweeps.TABLES[sweeps.CAMERA](), given),
-                                       lens=lens if isinstance(lens, Lens) else None)
+    seen = scenarios.simulate_scenario(
+        with_values(sweeps.TABLES[sweeps.CAMERA](), given),
+        lens=lens if isinstance(lens, Lens) else None,
+    )
     return Simulated(seen.lens, seen.observations, seen.poses[-1], seen.rig)
 
 
@@ -251,8 +290,10 @@ def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swep
     stereo_depth.
     Raises ParameterError for an unknown parameter or a value that is not allowed.
     """
-    swept = {f'{SWEEP}{name}': check_list(values, f'over[{name!r}]')
-             for name, values in check_type(over, Mapping, 'over', 'a mapping of lists').items()}
+    swept = {
+        f'{SWEEP}{name}': check_list(values, f'over[{name!r}]')
+        for name, values in check_type(over, Mapping, 'over', 'a mapping of lists').items()
+    }
     parameters = {node: check_parameters(values, node) for node, values in nodes.items()}
     parameters[sweeps.CAMERA] = {**parameters.get(sweeps.CAMERA, {}), **swept}
     for node, values in parameters.items():
@@ -265,8 +306,12 @@ def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swep
 
 @limit_threads
 def diagnose(
-    observations: AnyObservations, lens: AnyLens, *, free_intrinsics: bool | None = None,
-    held_out: AnyObservations | None = None, poses: AnyPoses | None = None,
+    observations: AnyObservations,
+    lens: AnyLens,
+    *,
+    free_intrinsics: bool | None = None,
+    held_out: AnyObservations | None = None,
+    poses: AnyPoses | None = None,
     progress: Progress = _silent,
 ) -> Diagnosed:
     """Find what a lens's simulation gets wrong about observations, and extend it.
@@ -282,11 +327,16 @@ def diagnose(
 
     table, known = table_and_lens(observations, lens)
     table, _ = posable_observations(table, known)
-    test = None if held_out is None else posable_observations(
-        *table_and_lens(held_out, known))[0]
+    test = None if held_out is None else posable_observations(*table_and_lens(held_out, known))[0]
     given = None if poses is None else poses_by_frame(table, _by_frame(poses), 'poses')
-    found = find_causes(table, known, free_intrinsics=free_intrinsics, held_out=test,
-                        poses=given, progress=progress)
+    found = find_causes(
+        table,
+        known,
+        free_intrinsics=free_intrinsics,
+        held_out=test,
+        poses=given,
+        progress=progress,
+    )
     return Diagnosed(found.verdict, found.to_dict(), found.lens)
 
 
@@ -304,8 +354,12 @@ def budget(
 
 
 def undistort_maps(
-    lens: AnyLens, projection: str = 'pinhole', *, size: tuple[int, int] | None = None,
-    field_of_view: float | None = None, range_m: float = RANGE,
+    lens: AnyLens,
+    projection: str = 'pinhole',
+    *,
+    size: tuple[int, int] | None = None,
+    field_of_view: float | None = None,
+    range_m: float = RANGE,
 ) -> Rectification:
     """Return what maps photographs to an ideal camera: `maps` for cv2.remap, `k`, `p`, `remap`.
 
@@ -320,8 +374,13 @@ def undistort_maps(
 
 
 def rectify_maps(
-    left: AnyLens, right: AnyLens, rig: AnyRig, projection: str = 'pinhole', *,
-    size: tuple[int, int] | None = None, field_of_view: float | None = None,
+    left: AnyLens,
+    right: AnyLens,
+    rig: AnyRig,
+    projection: str = 'pinhole',
+    *,
+    size: tuple[int, int] | None = None,
+    field_of_view: float | None = None,
     range_m: float = RANGE,
 ) -> RectifiedPair:
     """Return what maps both photographs of a rig (the left camera in the right one) to rows.
@@ -354,20 +413,23 @@ def _check_view(
 
 def _check_names(node: str, values: Mapping[str, Any]) -> None:
     if node not in sweeps.TABLES:
-        raise ParameterError(f'{node!r} is not a node of a sweep; known are '
-                             f'{", ".join(sweeps.TABLES)}')
+        raise ParameterError(
+            f'{node!r} is not a node of a sweep; known are {", ".join(sweeps.TABLES)}'
+        )
     known = [row.name for row in rows(sweeps.TABLES[node])]
     for name in (given.removeprefix(SWEEP) for given in values):
         if name not in known:
-            raise ParameterError(f'{name!r} is not a parameter of {node}; known are '
-                                 f'{", ".join(known)}')
+            raise ParameterError(
+                f'{name!r} is not a parameter of {node}; known are {", ".join(known)}'
+            )
 
 
 def table_of(given: AnyObservations) -> Observations:
     """Return a table, read where a path is given; raise ParameterError for what is neither."""
     if not isinstance(given, Observations | str | Path):
-        raise ParameterError(f'observations are of type {type(given).__name__}; a table or a path '
-                             'is needed')
+        raise ParameterError(
+            f'observations are of type {type(given).__name__}; a table or a path is needed'
+        )
     return given if isinstance(given, Observations) else read_observations(given)
 
 

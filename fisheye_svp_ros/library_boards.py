@@ -55,24 +55,32 @@ def observations(
     Raises ParameterError for arrays of different lengths, image points that are not finite, and
     landmarks that are not there or twice in a frame.
     """
-    places = parse_pattern(board).points if isinstance(board, str) else (
-        check_numbers(board, 'board', '(L, 3)'))
-    image = [np.atleast_1d(check_numbers(values, name, '(N,)'))
-             for name, values in (('u', u), ('v', v))]
+    places = (
+        parse_pattern(board).points
+        if isinstance(board, str)
+        else (check_numbers(board, 'board', '(L, 3)'))
+    )
+    image = [
+        np.atleast_1d(check_numbers(values, name, '(N,)')) for name, values in (('u', u), ('v', v))
+    ]
     number = np.atleast_1d(check_whole_numbers(landmark, 'landmark'))
     if {column.shape for column in (*image, number)} != {(len(number),)} or (
-            places.shape[1:] != (3,)):
+        places.shape[1:] != (3,)
+    ):
         raise ParameterError('u, v and landmark must have one length, places the shape (L, 3)')
     frames = check_whole_numbers(frame, 'frame')
     if frames.shape not in ((), (1,), number.shape):
-        raise ParameterError(f'frame has the shape {frames.shape}; one number, or one for each of '
-                             f'the {len(number)} points, is needed')
+        raise ParameterError(
+            f'frame has the shape {frames.shape}; one number, or one for each of '
+            f'the {len(number)} points, is needed'
+        )
     frames = np.broadcast_to(frames, number.shape).copy()
     if not np.isfinite(image).all():
         raise ParameterError('u and v must be finite; leave out what was not seen')
     if not np.isfinite(places).all():
-        raise ParameterError('board has places that are not finite; number only landmarks whose '
-                             'place is known')
+        raise ParameterError(
+            'board has places that are not finite; number only landmarks whose place is known'
+        )
     if len(np.unique(np.stack([frames, number]), axis=1).T) < len(number):
         raise ParameterError('a landmark is twice in a frame; frame (N,) says which photograph')
     outside = number[(number < 0) | (number >= len(places))]
@@ -99,13 +107,19 @@ def render(
     if not noise >= 0:
         raise ParameterError(f'noise is {noise!r}; 0 or more grey levels are needed')
     printed = Print(pattern.columns, pattern.rows, pattern.size)
-    return expose(load_lens(lens), printed, pose, Exposure(noise=noise),
-                  np.random.default_rng(seed))
+    return expose(
+        load_lens(lens), printed, pose, Exposure(noise=noise), np.random.default_rng(seed)
+    )
 
 
 def plan(
-    lens: AnyLens, board: str, room: tuple[float, float], *, count: int = 12,
-    number: str | None = None, noise_px: float = 0.1,
+    lens: AnyLens,
+    board: str,
+    room: tuple[float, float],
+    *,
+    count: int = 12,
+    number: str | None = None,
+    noise_px: float = 0.1,
 ) -> PhotographPlan:
     """Return which photographs to take of a board, as the command does.
 
@@ -118,13 +132,20 @@ def plan(
 
     near, far = check_pair(room, 'room', '(nearest, furthest) in m')
     if not 0 < near < far < np.inf:
-        raise ParameterError(f'room is {room!r}; two distances above 0, m, are needed, the nearer '
-                             'first')
+        raise ParameterError(
+            f'room is {room!r}; two distances above 0, m, are needed, the nearer first'
+        )
     count = check_count(count, MAX_VIEWS, 'count')
     if not is_at_most(noise_px, np.finfo(float).max) or not noise_px > 0:
         raise ParameterError(f'noise_px is {noise_px!r}; a number above 0 px is needed')
-    return choose(load_lens(lens), parse_pattern(board).points, ViewLimits(near, far), count,
-                  number, noise_px)
+    return choose(
+        load_lens(lens),
+        parse_pattern(board).points,
+        ViewLimits(near, far),
+        count,
+        number,
+        noise_px,
+    )
 
 
 def write_lens(lens: AnyLens, path: str | Path, form: str = '') -> None:
@@ -139,9 +160,7 @@ def write_lens(lens: AnyLens, path: str | Path, form: str = '') -> None:
 
 
 @limit_threads
-def calibrate_rig(
-    observations: AnyObservations, lenses: Mapping[str, AnyLens]
-) -> RigCalibration:
+def calibrate_rig(observations: AnyObservations, lenses: Mapping[str, AnyLens]) -> RigCalibration:
     """Fit where the cameras of a table stand, in the first of them; lenses by camera.
 
     A lens that states its standard errors (`calibrate`) is fitted, too, with these as its prior;
@@ -155,14 +174,17 @@ def calibrate_rig(
     table, _ = posable_observations(table, known)
     group, *others = rig_calibration.connected_cameras(table)
     if others:
-        raise ObservationError(f'{table.source}: {" and ".join(others[0])} cannot be related to '
-                               f'{", ".join(group)}: no frame shows the target to both at once')
+        raise ObservationError(
+            f'{table.source}: {" and ".join(others[0])} cannot be related to '
+            f'{", ".join(group)}: no frame shows the target to both at once'
+        )
     return rig_calibration.calibrate_rig(table, known, table.cameras)
 
 
 @limit_threads
 def localize_rig(
-    observations: AnyObservations, lenses: Mapping[str, AnyLens],
+    observations: AnyObservations,
+    lenses: Mapping[str, AnyLens],
     rig: RigCalibration | str | Path,
 ) -> RigLocalization:
     """Pose every frame from all cameras of a rig at once: its first camera in the world.

@@ -39,8 +39,9 @@ def plot_lens(*lenses: AnyLens) -> Figure:
     for lens in map(load_lens, lenses):
         theta = np.linspace(0, lens.max_incidence, _ANGLES)
         degrees = np.degrees(theta)
-        height.plot(degrees, lens.fx * lens.image_height.value_and_slope(theta)[0],
-                    label=lens.name)
+        height.plot(
+            degrees, lens.fx * lens.image_height.value_and_slope(theta)[0], label=lens.name
+        )
         shift.plot(degrees, 1e3 * lens.shift_at(theta), label=lens.name)
     height.set(xlabel='incidence angle / degree', ylabel='image height / px')
     shift.set(xlabel='incidence angle / degree', ylabel='viewpoint shift / mm')
@@ -74,14 +75,16 @@ def plot_budget(budget: Budgeted, quantity: str = 'position') -> Figure:
     """
     check_type(budget, Budgeted, 'budget', 'the result of fsvp.budget')
     if quantity not in budget.error:
-        raise ParameterError(f'{quantity!r} is no quantity of a budget; known are '
-                             f'{", ".join(budget.error)}')
+        raise ParameterError(
+            f'{quantity!r} is no quantity of a budget; known are {", ".join(budget.error)}'
+        )
     unit, factor = DISPLAY_UNITS[UNITS[quantity]]
     figure = Figure(figsize=(8, 5), layout='constrained')
     axis = figure.subplots()
-    for spread, error, noise in zip(np.degrees(budget.spreads), budget.error[quantity],
-                                    budget.noise[quantity], strict=True):
-        line, = axis.loglog(budget.ranges, factor * error, label=f'{spread:.0f}°')
+    for spread, error, noise in zip(
+        np.degrees(budget.spreads), budget.error[quantity], budget.noise[quantity], strict=True
+    ):
+        (line,) = axis.loglog(budget.ranges, factor * error, label=f'{spread:.0f}°')
         axis.loglog(budget.ranges, factor * noise, '--', color=line.get_color())
     axis.set(xlabel='range / m', ylabel=f'{quantity} error / {unit}')
     axis.legend(title='spread; dashed: noise', ncols=2)

@@ -27,8 +27,14 @@ class Columns(dict[str, list[Any]]):
     """Rows by column, of plain Python values; pandas.DataFrame and pyarrow.table take it."""
 
     def __init__(self, columns: Mapping[str, Any]) -> None:
-        super().__init__({name: np.asarray(values).tolist() if isinstance(values, np.ndarray)
-                          else list(values) for name, values in columns.items()})
+        super().__init__(
+            {
+                name: np.asarray(values).tolist()
+                if isinstance(values, np.ndarray)
+                else list(values)
+                for name, values in columns.items()
+            }
+        )
 
     def rows(self) -> Iterator[tuple[Any, ...]]:
         """Yield the rows."""
@@ -41,8 +47,13 @@ class Columns(dict[str, list[Any]]):
         return write_columns(Path(path), self)
 
     def __str__(self) -> str:
-        cells = [list(self), *([f'{cell:.6g}' if isinstance(cell, float) else str(cell)
-                                for cell in row] for row in self.rows())]
+        cells = [
+            list(self),
+            *(
+                [f'{cell:.6g}' if isinstance(cell, float) else str(cell) for cell in row]
+                for row in self.rows()
+            ),
+        ]
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         return '\n'.join(
             '  '.join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
@@ -121,8 +132,12 @@ def _from_json(value: Any, hint: Any) -> Any:
         return Pose(*(np.array(value[name], dtype=float) for name in Pose._fields))
     if isinstance(hint, type) and is_dataclass(hint):
         hints = get_type_hints(hint)
-        return hint(**{field.name: _from_json(value[field.name], hints[field.name])
-                       for field in fields(hint)})
+        return hint(
+            **{
+                field.name: _from_json(value[field.name], hints[field.name])
+                for field in fields(hint)
+            }
+        )
     if get_origin(hint) is dict:
         return {key: _from_json(item, kinds[1]) for key, item in value.items()}
     if get_origin(hint) is tuple:
@@ -173,11 +188,13 @@ class Calibrated(Result):
 
     def table(self) -> Columns:
         """Return one row a parameter that was fitted."""
-        return Columns({
-            'parameter': self.names,
-            'value': parameter_values(self.lens, self.names),
-            'standard_error': np.sqrt(np.diag(self.covariance)),
-        })
+        return Columns(
+            {
+                'parameter': self.names,
+                'value': parameter_values(self.lens, self.names),
+                'standard_error': np.sqrt(np.diag(self.covariance)),
+            }
+        )
 
 
 @dataclass(frozen=True)
@@ -219,8 +236,17 @@ class StereoDepth(Result):
     def table(self) -> Columns:
         """Return one row a point."""
         x, y, z = self.points.T
-        return Columns({'frame': self.frame, 'landmark': self.landmark, 'x': x, 'y': y, 'z': z,
-                        'gap': self.gap, 'epipolar_px': self.epipolar_px})
+        return Columns(
+            {
+                'frame': self.frame,
+                'landmark': self.landmark,
+                'x': x,
+                'y': y,
+                'z': z,
+                'gap': self.gap,
+                'epipolar_px': self.epipolar_px,
+            }
+        )
 
 
 @dataclass(frozen=True)
@@ -239,11 +265,18 @@ class Simulated(Result):
     def table(self) -> Columns:
         """Return one row an image point."""
         o = self.observations
-        return Columns({
-            'frame': o.frame, 'camera': [o.cameras[i] for i in o.camera], 'landmark': o.landmark,
-            'u': o.uv[:, 0], 'v': o.uv[:, 1], 'x': o.xyz[:, 0], 'y': o.xyz[:, 1],
-            'z': o.xyz[:, 2],
-        })
+        return Columns(
+            {
+                'frame': o.frame,
+                'camera': [o.cameras[i] for i in o.camera],
+                'landmark': o.landmark,
+                'u': o.uv[:, 0],
+                'v': o.uv[:, 1],
+                'x': o.xyz[:, 0],
+                'y': o.xyz[:, 1],
+                'z': o.xyz[:, 2],
+            }
+        )
 
 
 @dataclass(frozen=True)
@@ -268,8 +301,9 @@ class Diagnosed(Result):
     def table(self) -> Columns:
         """Return one row a cause."""
         causes = self.document['causes']
-        return Columns({name: [cause[name] for cause in causes]
-                        for name in ('effect', 'p_value', 'gain')})
+        return Columns(
+            {name: [cause[name] for cause in causes] for name in ('effect', 'p_value', 'gain')}
+        )
 
 
 @dataclass(frozen=True)
@@ -289,10 +323,16 @@ class Budgeted(Result):
     def table(self) -> Columns:
         """Return one row a spread and range."""
         spread, distance = np.meshgrid(self.spreads, self.ranges, indexing='ij')
-        return Columns({
-            'spread': spread.ravel(), 'range': distance.ravel(),
-            **{name: np.ravel(values) for name, values in self.error.items()},
-            **{f'{name}_noise': np.ravel(values) for name, values in self.noise.items()},
-            **{f'{name}_{part}': np.ravel(values) for part, by in self.own.items()
-               for name, values in by.items()},
-        })
+        return Columns(
+            {
+                'spread': spread.ravel(),
+                'range': distance.ravel(),
+                **{name: np.ravel(values) for name, values in self.error.items()},
+                **{f'{name}_noise': np.ravel(values) for name, values in self.noise.items()},
+                **{
+                    f'{name}_{part}': np.ravel(values)
+                    for part, by in self.own.items()
+                    for name, values in by.items()
+                },
+            }
+        )

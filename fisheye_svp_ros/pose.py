@@ -19,9 +19,13 @@ PAPER_FROM_OPTICAL: Array = np.diag([1.0, -1.0, -1.0])
 
 _IDENTITY: Array = np.eye(3)
 # [v]x, row by row, of the unit vectors
-_CROSS: Array = np.array([
-    [0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0.0, 0, 1, 0, 0, 0, -1, 0, 0], [0.0, -1, 0, 1, 0, 0, 0, 0, 0],
-])
+_CROSS: Array = np.array(
+    [
+        [0.0, 0, 0, 0, 0, -1, 0, 1, 0],
+        [0.0, 0, 1, 0, 0, 0, -1, 0, 0],
+        [0.0, -1, 0, 1, 0, 0, 0, 0, 0],
+    ]
+)
 
 
 class _Pose(NamedTuple):
@@ -79,13 +83,17 @@ class Pose(_Pose, Batch):
 
     def broadcast_to(self, *shape: int) -> Pose:
         """Return the poses repeated along leading axes; not to be written to."""
-        return Pose(np.broadcast_to(self.rotation, (*shape, 3, 3)),
-                    np.broadcast_to(self.position, (*shape, 3)))
+        return Pose(
+            np.broadcast_to(self.rotation, (*shape, 3, 3)),
+            np.broadcast_to(self.position, (*shape, 3)),
+        )
 
     def where(self, chosen: Mask, other: Pose) -> Pose:
         """Return these poses where chosen (...), and others where not."""
-        return Pose(np.where(chosen[..., None, None], self.rotation, other.rotation),
-                    np.where(chosen[..., None], self.position, other.position))
+        return Pose(
+            np.where(chosen[..., None, None], self.rotation, other.rotation),
+            np.where(chosen[..., None], self.position, other.position),
+        )
 
 
 def identity(*shape: int) -> Pose:

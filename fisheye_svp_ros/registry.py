@@ -57,11 +57,13 @@ class Registry(Mapping[str, T]):
             kind = entry.load()
         except Exception as cause:  # whatever somebody else's module raises
             raise ParameterError(
-                f'{whose} cannot be loaded ({cause}); fix or uninstall it') from cause
+                f'{whose} cannot be loaded ({cause}); fix or uninstall it'
+            ) from cause
         own = {*self.unlisted, *self._own}
         if entry.name in own or getattr(kind, 'name', entry.name) != entry.name:
             raise ParameterError(
-                f'{whose}: the name is taken, or is not that of its class; rename it')
+                f'{whose}: the name is taken, or is not that of its class; rename it'
+            )
         if not issubclass(kind if isinstance(kind, type) else type(kind), self._base):
             raise ParameterError(f'{whose} is not derived from {self._base.__name__}')
         return kind

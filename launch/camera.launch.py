@@ -27,8 +27,10 @@ def nodes(context):
     beside = image.rpartition('/')
     topics = [('image', image), ('camera_info', info or f'{beside[0]}{beside[1]}camera_info')]
     given = {'detector': {'board': value(context, 'board')}, 'localizer': {}, 'model_critic': {}}
-    for name, word, frame in (('detector', 'board_frame', 'world_frame'),
-                              ('localizer', 'camera_frame', 'camera_frame')):
+    for name, word, frame in (
+        ('detector', 'board_frame', 'world_frame'),
+        ('localizer', 'camera_frame', 'camera_frame'),
+    ):
         if value(context, frame):
             given[name][word] = value(context, frame)
     if value(context, 'composed') == 'true':
@@ -38,12 +40,20 @@ def nodes(context):
 
 def generate_launch_description():
     """Return arguments and nodes."""
-    return LaunchDescription([
-        *arguments(name for name in COMMON if name not in ARGUMENTS),
-        *(DeclareLaunchArgument(name, default_value=default, description=text)
-          for name, (default, text) in ARGUMENTS.items()),
-        DeclareLaunchArgument('composed', default_value='false', choices=['true', 'false'],
-                              description='all nodes in one process'),
-        *file_arguments(NODES),
-        OpaqueFunction(function=nodes),
-    ])
+    return LaunchDescription(
+        [
+            *arguments(name for name in COMMON if name not in ARGUMENTS),
+            *(
+                DeclareLaunchArgument(name, default_value=default, description=text)
+                for name, (default, text) in ARGUMENTS.items()
+            ),
+            DeclareLaunchArgument(
+                'composed',
+                default_value='false',
+                choices=['true', 'false'],
+                description='all nodes in one process',
+            ),
+            *file_arguments(NODES),
+            OpaqueFunction(function=nodes),
+        ]
+    )

@@ -21,15 +21,20 @@ def nodes(context):
     rig = {'style': value(context, 'style'), 'poses_file': 'calibration'}
     # tf2 has to know where the rig is: the right camera, which points and left camera hang on.
     right = ['localizer'] if value(context, 'publish_tf') == 'true' else []
-    return [node(context, 'synthetic_camera', rig),
-            *(node(context, name, {}, RIG) for name in SOLVERS),
-            *(node(context, name, {}, RIGHT) for name in right)]
+    return [
+        node(context, 'synthetic_camera', rig),
+        *(node(context, name, {}, RIG) for name in SOLVERS),
+        *(node(context, name, {}, RIGHT) for name in right),
+    ]
 
 
 def generate_launch_description():
     """Return arguments and nodes."""
-    return LaunchDescription([
-        *arguments(), style_argument(),
-        *file_arguments(['synthetic_camera', *SOLVERS, 'localizer']),
-        OpaqueFunction(function=nodes),
-    ])
+    return LaunchDescription(
+        [
+            *arguments(),
+            style_argument(),
+            *file_arguments(['synthetic_camera', *SOLVERS, 'localizer']),
+            OpaqueFunction(function=nodes),
+        ]
+    )

@@ -27,28 +27,56 @@ def nodes(context):
     solvers = list(plan.solvers)
     return [
         # A recording is to be whole, however busy the machine is.
-        Node(package=PACKAGE, executable='fisheye-svp', output='screen', on_exit=fail,
-             sigterm_timeout='60', arguments=['record', '-o', value(context, 'bag')]),
+        Node(
+            package=PACKAGE,
+            executable='fisheye-svp',
+            output='screen',
+            on_exit=fail,
+            sigterm_timeout='60',
+            arguments=['record', '-o', value(context, 'bag')],
+        ),
         *(
-            Node(package=PACKAGE, executable=name, output='screen', on_exit=fail, parameters=[
-                str(path), {'wait_for_subscribers': 2, 'patience': PATIENCE,
-                            'folder': lens_folder(plan)}])
+            Node(
+                package=PACKAGE,
+                executable=name,
+                output='screen',
+                on_exit=fail,
+                parameters=[
+                    str(path),
+                    {'wait_for_subscribers': 2, 'patience': PATIENCE, 'folder': lens_folder(plan)},
+                ],
+            )
             for name in solvers
         ),
-        Node(package=PACKAGE, executable='synthetic_camera', output='screen', on_exit=ended,
-             parameters=[
-                 str(path),
-                 {'wait_for_subscribers': len(solvers) + 1, 'repeat': False,
-                  'lock_step': ' '.join(f'{name}/result' for name in solvers)},
-             ]),
+        Node(
+            package=PACKAGE,
+            executable='synthetic_camera',
+            output='screen',
+            on_exit=ended,
+            parameters=[
+                str(path),
+                {
+                    'wait_for_subscribers': len(solvers) + 1,
+                    'repeat': False,
+                    'lock_step': ' '.join(f'{name}/result' for name in solvers),
+                },
+            ],
+        ),
     ]
 
 
 def generate_launch_description():
     """Return arguments and nodes."""
-    return LaunchDescription([
-        DeclareLaunchArgument('sweep', description='sweep file, or name of one in config/sweeps'),
-        DeclareLaunchArgument('bag', default_value='sweep_recording',
-                              description='folder of the recording; it must not exist'),
-        OpaqueFunction(function=nodes),
-    ])
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument(
+                'sweep', description='sweep file, or name of one in config/sweeps'
+            ),
+            DeclareLaunchArgument(
+                'bag',
+                default_value='sweep_recording',
+                description='folder of the recording; it must not exist',
+            ),
+            OpaqueFunction(function=nodes),
+        ]
+    )

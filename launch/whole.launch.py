@@ -18,8 +18,11 @@ def include(name, shared, part):
 
 def generate_launch_description():
     """Return arguments and both graphs."""
-    return LaunchDescription([
-        *arguments(), style_argument(),
-        include('mono.launch.py', COMMON, 'mono'),
-        include('stereo.launch.py', [*COMMON, 'style'], 'stereo'),
-    ])
+    return LaunchDescription(
+        [
+            *arguments(),
+            style_argument(),
+            include('mono.launch.py', COMMON, 'mono'),
+            include('stereo.launch.py', [*COMMON, 'style'], 'stereo'),
+        ]
+    )

@@ -126,9 +126,7 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
 
 
 @pytest.fixture
-def start_process(
-    ros_domain: int
-) -> Iterator[Callable[[list[str], dict[str, str]], NodeProcess]]:
+def start_process(ros_domain: int) -> Iterator[Callable[[list[str], dict[str, str]], NodeProcess]]:
     """Return a function that starts a command; what runs when the test ends is ended."""
     started: list[NodeProcess] = []
 

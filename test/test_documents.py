@@ -23,11 +23,14 @@ _LINK = re.compile(r'\[[^\]]*\]\(([^)\s]+)\)')
 @cache
 def anchors(page: Path) -> set[str]:
     """Return the anchors of a page's headings, as GitHub and MyST make them."""
-    text = re.sub(r'^```.*?^```', '', page.read_text(encoding='utf-8'),
-                  flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(
+        r'^```.*?^```', '', page.read_text(encoding='utf-8'), flags=re.DOTALL | re.MULTILINE
+    )
     headings = re.findall(r'^#+ (.*)$', text, re.MULTILINE)
-    plain = [re.sub(r'[^\w\- ]', '', re.sub(r'\[([^\]]*)\]\([^)]*\)', r'\1', heading)).lower()
-             for heading in headings]
+    plain = [
+        re.sub(r'[^\w\- ]', '', re.sub(r'\[([^\]]*)\]\([^)]*\)', r'\1', heading)).lower()
+        for heading in headings
+    ]
     return {heading.strip().replace(' ', '-') for heading in plain}
 
 
@@ -48,8 +51,20 @@ def test_links_have_targets(page: Path) -> None:
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     for module in ('sphinx', 'myst_parser', 'furo'):
         pytest.importorskip(module, reason='needs the extra `docs`')
-    done = subprocess.run([sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-q',
-                           str(ROOT / 'docs'), str(tmp_path)], capture_output=True, text=True)
+    done = subprocess.run(
+        [
+            sys.executable,
+            '-m',
+            'sphinx',
+            '-W',
+            '--keep-going',
+            '-q',
+            str(ROOT / 'docs'),
+            str(tmp_path),
+        ],
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
     for page in (ROOT / 'docs').rglob('*.md'):
         assert (tmp_path / page.relative_to(ROOT / 'docs')).with_suffix('.html').is_file()
@@ -64,8 +79,9 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
 def test_a_diagnosis_is_what_its_schema_says() -> None:
     jsonschema = pytest.importorskip('jsonschema', reason='needs the extra `test`')
     path = ROOT / 'docs' / 'reference' / 'diagnosis.schema.json'
-    scene = fsvp.simulate_scenario(lens='fish214', radius=0.5, noise_px=0.2,
-                                   poses_file='calibration')
+    scene = fsvp.simulate_scenario(
+        lens='fish214', radius=0.5, noise_px=0.2, poses_file='calibration'
+    )
     document = fsvp.diagnose(scene.observations, scene.lens.svp()).document
     validator = jsonschema.Draft202012Validator(json.loads(path.read_text(encoding='utf-8')))
     assert document['causes']

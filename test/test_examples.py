@@ -37,8 +37,12 @@ def test_every_example_is_tested() -> None:
 def test_a_script_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv('PYTHONPATH', str(ROOT), prepend=':')
     monkeypatch.setenv('MPLBACKEND', 'agg')
-    done = subprocess.run([sys.executable, str(EXAMPLES / f'{name}.py')], cwd=tmp_path,
-                          capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / f'{name}.py')],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
     line, files = SCRIPTS[name]
     assert done.returncode == 0, done.stderr
     assert line in done.stdout
@@ -51,10 +55,24 @@ def test_poses_come_for_published_points(
     pytest.importorskip('rclpy', reason='needs ROS 2 (rclpy)')
     monkeypatch.setenv('PYTHONPATH', str(ROOT), prepend=':')
     localizer = start_process(
-        [sys.executable, '-m', 'fisheye_svp_ros.cli', 'run', 'localizer', '--ros-args',
-         '-p', 'lens:=fish214'], {**os.environ})
-    done = subprocess.run([sys.executable, str(EXAMPLES / 'publish_image_points.py')],
-                          capture_output=True, text=True, timeout=TIMEOUT)
+        [
+            sys.executable,
+            '-m',
+            'fisheye_svp_ros.cli',
+            'run',
+            'localizer',
+            '--ros-args',
+            '-p',
+            'lens:=fish214',
+        ],
+        {**os.environ},
+    )
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / 'publish_image_points.py')],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT,
+    )
     assert done.returncode == 0, (done.stderr, localizer.lines)
     poses = [line for line in done.stdout.splitlines() if line.startswith('x = ')]
     assert len(poses) == 10
@@ -63,16 +81,21 @@ def test_poses_come_for_published_points(
 def test_nodes_are_composed(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip('rclpy', reason='needs ROS 2 (rclpy)')
     monkeypatch.setenv('PYTHONPATH', str(ROOT), prepend=':')
-    done = subprocess.run([sys.executable, str(EXAMPLES / 'compose_nodes.py')],
-                          capture_output=True, text=True, timeout=TIMEOUT)
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / 'compose_nodes.py')],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT,
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == 5 * [done.stdout.splitlines()[0]]
     assert done.stdout.startswith('x -0.0') or done.stdout.startswith('x 0.0')
 
 
 @pytest.mark.parametrize('name', NOTEBOOKS)
-def test_a_notebook_prints_what_it_shows(name: str, tmp_path: Path,
-                                         monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_prints_what_it_shows(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     notebook = json.loads((EXAMPLES / f'{name}.ipynb').read_text(encoding='utf-8'))
     names: dict[str, Any] = {}
@@ -85,5 +108,7 @@ def test_a_notebook_prints_what_it_shows(name: str, tmp_path: Path,
                 exec(''.join(cell['source']), names)
             plt.close('all')
             assert printed.getvalue() == ''.join(
-                ''.join(output['text']) for output in cell['outputs']
-                if output['output_type'] == 'stream')
+                ''.join(output['text'])
+                for output in cell['outputs']
+                if output['output_type'] == 'stream'
+            )

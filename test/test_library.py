@@ -28,30 +28,37 @@ _BLOCK = re.compile(r'```python\n(.*?)```(?:\n\n```text\n(.*?)```)?', re.DOTALL)
 def seen() -> Simulated:
     """Return ten views of a lens with a shift."""
     return fsvp.simulate_scenario(
-        lens='fish214', radius=0.5, noise_px=0.2, poses_file='calibration')
+        lens='fish214', radius=0.5, noise_px=0.2, poses_file='calibration'
+    )
 
 
 @pytest.fixture(scope='module')
 def pair() -> Simulated:
     """Return ten views of a rig."""
     return fsvp.simulate_scenario(
-        lens='fish214', radius=0.5, style='vergent', noise_px=0.2, poses_file='calibration')
+        lens='fish214', radius=0.5, style='vergent', noise_px=0.2, poses_file='calibration'
+    )
 
 
 RECORDINGS = ('rosbags', 'mcap', 'apsw', 'zstandard')
 
 
-@pytest.mark.parametrize(('statement', 'heavy'), [
-    ('import fisheye_svp_ros as f; dir(f); f.__version__',
-     ('numpy', 'scipy', 'matplotlib', 'numba', 'pyarrow', 'yaml', 'cv2', *RECORDINGS)),
-    ('import fisheye_svp_ros.commands.paper', ('numpy',)),
-    ('import fisheye_svp_ros.library, fisheye_svp_ros.commands.sweep', RECORDINGS),
-])
+@pytest.mark.parametrize(
+    ('statement', 'heavy'),
+    [
+        (
+            'import fisheye_svp_ros as f; dir(f); f.__version__',
+            ('numpy', 'scipy', 'matplotlib', 'numba', 'pyarrow', 'yaml', 'cv2', *RECORDINGS),
+        ),
+        ('import fisheye_svp_ros.commands.paper', ('numpy',)),
+        ('import fisheye_svp_ros.library, fisheye_svp_ros.commands.sweep', RECORDINGS),
+    ],
+)
 def test_what_is_not_needed_is_not_loaded(statement: str, heavy: tuple[str, ...]) -> None:
-    code = (f'import sys; {statement}; '
-            'print(sorted({m.partition(".")[0] for m in sys.modules}))')
-    loaded = subprocess.run([sys.executable, '-c', code], cwd=ROOT, check=True, text=True,
-                            capture_output=True).stdout
+    code = f'import sys; {statement}; print(sorted({{m.partition(".")[0] for m in sys.modules}}))'
+    loaded = subprocess.run(
+        [sys.executable, '-c', code], cwd=ROOT, check=True, text=True, capture_output=True
+    ).stdout
     for name in heavy:
         assert f"'{name}'" not in loaded
 
@@ -69,8 +76,9 @@ def test_names_are_there_and_typed_and_no_modules() -> None:
         _ = fsvp.nonsense
 
 
-@pytest.mark.parametrize(('page', 'blocks'), [
-    ('reference/library.md', 6), ('how_to/undistort.md', 1)])
+@pytest.mark.parametrize(
+    ('page', 'blocks'), [('reference/library.md', 6), ('how_to/undistort.md', 1)]
+)
 def test_a_page_runs_as_printed(
     page: str, blocks: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -93,8 +101,9 @@ def test_axes_viewpoint_rig_and_poses_are_those_of_the_conventions() -> None:
     rays = fsvp.back_project(lens, np.array([[u[0], v[0]], [lens.cx, lens.cy]]))
     assert rays.origin[0, 2] > rays.origin[1, 2]  # the viewpoint moves towards the scene
     np.testing.assert_array_equal(fsvp.rig('parallel', 0.15).position, [-0.15, 0.0, 0.0])
-    seen = fsvp.simulate_scenario(lens='fish214', radius=2.0,
-                                  poses=(0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0))
+    seen = fsvp.simulate_scenario(
+        lens='fish214', radius=2.0, poses=(0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0)
+    )
     np.testing.assert_array_equal(seen.pose.position[0], [0.0, 0.0, 0.1])
     np.testing.assert_array_equal(seen.pose.rotation[0] @ [0, 0, 1], [0.0, 0.0, -1.0])
     found = fsvp.localize(seen.observations, lens)  # in the world, not its inverse
@@ -106,7 +115,8 @@ def test_a_rig_is_as_uncertain_as_its_residuals_say(pair: Simulated) -> None:
     assert pair.rig is not None
     found, known = (
         fsvp.calibrate_stereo(replace(table, sigma=np.full(len(table), sigma)), lens, lens)
-        for sigma in (np.nan, 0.2))
+        for sigma in (np.nan, 0.2)
+    )
     np.testing.assert_allclose(found.covariance, known.covariance, rtol=0.1)
     off = found.rig.difference(pair.rig)
     assert 1 < off @ np.linalg.solve(found.covariance, off) < 20  # chi-square of 6
@@ -117,18 +127,19 @@ def _results(seen: Simulated, pair: Simulated) -> list[Result]:
     rig = pair.rig
     assert rig is not None
     return [
-        seen, pair, fsvp.localize(seen.observations, svp),
+        seen,
+        pair,
+        fsvp.localize(seen.observations, svp),
         fsvp.calibrate(seen.observations, 'equidistant', (1536, 1536)),
         fsvp.calibrate_stereo(pair.observations, svp, svp),
         fsvp.stereo_depth(pair.observations, svp, svp, rig),
-        fsvp.sweep({'radius': [0.5, 2.0]}), fsvp.budget('fish180'),
+        fsvp.sweep({'radius': [0.5, 2.0]}),
+        fsvp.budget('fish180'),
         fsvp.diagnose(seen.observations, seen.lens),
     ]
 
 
-def test_results_come_back(
-    seen: Simulated, pair: Simulated, tmp_path: Path
-) -> None:
+def test_results_come_back(seen: Simulated, pair: Simulated, tmp_path: Path) -> None:
     results = _results(seen, pair)
     kinds = {kind for kind in Result.__subclasses__() if kind.__module__ == Simulated.__module__}
     assert {type(one) for one in results} == kinds
@@ -163,9 +174,7 @@ def test_localize_says_what_the_command_says(seen: Simulated, tmp_path: Path) ->
     assert np.nanmax(np.abs(found.residual)) < 1.0
 
 
-def test_calibrate_writes_the_lens_of_the_command(
-    seen: Simulated, tmp_path: Path
-) -> None:
+def test_calibrate_writes_the_lens_of_the_command(seen: Simulated, tmp_path: Path) -> None:
     table = tmp_path / 'observations.csv'
     fsvp.write_observations(table, seen.observations)
     said = ['--model', 'equidistant', '--image-size', '1536x1536', '-o', str(tmp_path / 'a.yaml')]

@@ -47,11 +47,16 @@ def test_pictures_are_figures_with_units() -> None:
     assert np.interp(88, degrees, moved) - moved[0] == pytest.approx(12.7, abs=0.1)
     u, v = true_corners(poses(4).take(0)).T
     table = fsvp.observations(u, v + 0.1 * (-1) ** np.arange(30), np.arange(30), BOARD)
-    axis, = fsvp.plot_residuals(table, LENS).axes
+    (axis,) = fsvp.plot_residuals(table, LENS).axes
     assert axis.get_title(loc='left') == f'{LENS.name}: 0.0977 px rms'
-    budget = Budgeted(np.radians([30, 80]), np.array([0.5, 1, 2]),
-                           {'position': np.ones((2, 3))}, {'position': np.ones((2, 3))}, {})
-    axis, = fsvp.plot_budget(budget).axes
+    budget = Budgeted(
+        np.radians([30, 80]),
+        np.array([0.5, 1, 2]),
+        {'position': np.ones((2, 3))},
+        {'position': np.ones((2, 3))},
+        {},
+    )
+    (axis,) = fsvp.plot_budget(budget).axes
     assert axis.get_ylabel() == 'position error / mm' and len(axis.lines) == 4
     with pytest.raises(fsvp.FisheyeSvpError, match='known are position'):
         fsvp.plot_budget(budget, 'depht')
@@ -60,11 +65,14 @@ def test_pictures_are_figures_with_units() -> None:
 def test_what_is_printed_is_short() -> None:
     assert repr(poses(4)) == 'Pose(4,)'
     assert repr(fsvp.Pose(np.eye(3), np.array([0.1, 0, 2]))) == (
-        'Pose(0.1, 0, 2 m; rotation vector 0, 0, 0 degree)')
+        'Pose(0.1, 0, 2 m; rotation vector 0, 0, 0 degree)'
+    )
     assert repr(fsvp.undistort_maps('fish214')) == (
-        "Rectification('fish214' to pinhole 1536x1536 px, at 2 m)")
+        "Rectification('fish214' to pinhole 1536x1536 px, at 2 m)"
+    )
     assert repr(fsvp.plan('fish180', BOARD, (0.1, 0.3), count=1)).startswith(
-        'PhotographPlan(1 views; fx ')
+        'PhotographPlan(1 views; fx '
+    )
 
 
 def test_render_plan_and_lens_files(tmp_path: Path) -> None:
@@ -80,7 +88,8 @@ def test_a_scenario_of_a_lens() -> None:
     seen = fsvp.simulate_scenario(lens=LENS, radius=0.5)
     assert seen.lens == LENS
     assert fsvp.simulate_scenario(lens=LENS, shift_scale=0.0).lens == replace(
-        LENS, viewpoint_shift=None)
+        LENS, viewpoint_shift=None
+    )
 
 
 def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
@@ -95,8 +104,19 @@ def test_lenses_of_a_rig_do_not_go_into_a_folder_called_yaml(
 ) -> None:
     seen = fsvp.simulate_scenario(lens=LENS, radius=0.5, style='parallel')
     fsvp.write_observations(tmp_path / 'o.csv', seen.observations)
-    assert cli.main(['calibrate', str(tmp_path / 'o.csv'), '--image-size', '424x400', '-o',
-                     str(tmp_path / 'lens.yaml')]) == 2
+    assert (
+        cli.main(
+            [
+                'calibrate',
+                str(tmp_path / 'o.csv'),
+                '--image-size',
+                '424x400',
+                '-o',
+                str(tmp_path / 'lens.yaml'),
+            ]
+        )
+        == 2
+    )
     assert 'left, right and their rig are written to a folder' in capsys.readouterr().err
     assert not (tmp_path / 'lens.yaml').exists()
 

@@ -34,10 +34,14 @@ def test_poses_of_a_robot(tmp_path: Path) -> None:
     table, _, poses = robot(1)
     flange = Pose.stack(list(poses.values()))
     write_poses(tmp_path / 'flange.csv', np.arange(len(poses)), flange)
-    found = [fsvp.calibrate(table, 'kannala_brandt', (1280, 960), ['f', 'cx', 'cy', 'k1'],
-                            poses=given).lens.calibration
-             for given in (tmp_path / 'flange.csv', FramePoses(np.arange(len(poses)), flange))]
+    found = [
+        fsvp.calibrate(
+            table, 'kannala_brandt', (1280, 960), ['f', 'cx', 'cy', 'k1'], poses=given
+        ).lens.calibration
+        for given in (tmp_path / 'flange.csv', FramePoses(np.arange(len(poses)), flange))
+    ]
     place = found[0]['hand_eye']['camera_in_flange']['position']
     np.testing.assert_allclose(place, TRUTH.camera.position, atol=1.5e-3)
-    np.testing.assert_allclose(found[1]['hand_eye']['camera_in_flange']['position'], place,
-                               atol=1e-7)
+    np.testing.assert_allclose(
+        found[1]['hand_eye']['camera_in_flange']['position'], place, atol=1e-7
+    )

@@ -20,15 +20,27 @@ from fisheye_svp_ros import __version__
 
 # By package on PyPI, its key in rosdistro's rosdep/python.yaml; None: there is no key.
 ROSDEP = {
-    'numpy': 'python3-numpy', 'scipy': 'python3-scipy', 'PyYAML': 'python3-yaml',
-    'matplotlib': 'python3-matplotlib', 'rich': 'python3-rich', 'Jinja2': 'python3-jinja2',
-    'opencv-python-headless': 'python3-opencv', 'rosbags': 'python3-rosbags-pip',
-    'setuptools': 'python3-setuptools', 'pyarrow': None, 'mcap': None,
+    'numpy': 'python3-numpy',
+    'scipy': 'python3-scipy',
+    'PyYAML': 'python3-yaml',
+    'matplotlib': 'python3-matplotlib',
+    'rich': 'python3-rich',
+    'Jinja2': 'python3-jinja2',
+    'opencv-python-headless': 'python3-opencv',
+    'rosbags': 'python3-rosbags-pip',
+    'setuptools': 'python3-setuptools',
+    'pyarrow': None,
+    'mcap': None,
     'threadpoolctl': None,
-    'pytest': 'python3-pytest', 'pytest-xdist': 'python3-pytest-xdist',
-    'pytest-cov': 'python3-pytest-cov', 'jsonschema': 'python3-jsonschema',
-    'hypothesis': 'python3-hypothesis', 'psutil': 'python3-psutil', 'mpmath': None,
-    'statsmodels': None, 'pytest-rerunfailures': None,
+    'pytest': 'python3-pytest',
+    'pytest-xdist': 'python3-pytest-xdist',
+    'pytest-cov': 'python3-pytest-cov',
+    'jsonschema': 'python3-jsonschema',
+    'hypothesis': 'python3-hypothesis',
+    'psutil': 'python3-psutil',
+    'mpmath': None,
+    'statsmodels': None,
+    'pytest-rerunfailures': None,
 }
 
 
@@ -71,8 +83,12 @@ def test_versions_agree(distribution: Any) -> None:
 
 def test_every_dependency_has_its_line(distribution: Any) -> None:
     page = (ROOT / 'docs' / 'reference' / 'dependencies.md').read_text()
-    cells = {cell for line in page.splitlines() if line.startswith('|')
-             for cell in re.split(r'[|,]\s*|`', line)}
+    cells = {
+        cell
+        for line in page.splitlines()
+        if line.startswith('|')
+        for cell in re.split(r'[|,]\s*|`', line)
+    }
     cells = {cell.strip() for cell in cells}
     extras = distribution.extras_require
     required = _names([*distribution.install_requires, *(r for e in extras.values() for r in e)])
@@ -107,17 +123,28 @@ def installation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
             (tmp_path / name).chmod(0o755)
         env = {**os.environ, 'PATH': f'{tmp_path}{os.pathsep}{os.environ["PATH"]}'}
         env.pop('PYTHON', None)
-        return subprocess.run(['make', '-n', 'VENV=venv', 'venv/ready'], cwd=ROOT, env=env,
-                              capture_output=True, text=True, check=True).stdout
+        return subprocess.run(
+            ['make', '-n', 'VENV=venv', 'venv/ready'],
+            cwd=ROOT,
+            env=env,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
 
     for name in ('MAKEFLAGS', 'MAKELEVEL', 'PYTHONPATH'):
         monkeypatch.delenv(name, raising=False)
     return commands
 
 
-@pytest.mark.parametrize(('pythons', 'taken'), [
-    (['python3', 'python3.12'], 'python3'), (['python3.12', 'python3.11'], 'python3.12'),
-    ([], 'python3')])
+@pytest.mark.parametrize(
+    ('pythons', 'taken'),
+    [
+        (['python3', 'python3.12'], 'python3'),
+        (['python3.12', 'python3.11'], 'python3.12'),
+        ([], 'python3'),
+    ],
+)
 def test_make_takes_another_python_where_the_first_is_not_supported(
     installation: Any, pythons: list[str], taken: str
 ) -> None:

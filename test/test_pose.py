@@ -18,13 +18,15 @@ from fisheye_svp_ros.pose import (
 )
 
 rng = np.random.default_rng(21)
-VECTORS = np.concatenate([
-    rng.normal(size=(40, 3)),
-    rng.normal(size=(20, 3)) * 10.0 ** rng.uniform(-12, -4, (20, 1)),
-    np.zeros((1, 3)),
-    np.pi * np.eye(3),
-    (np.pi - 1e-7) * np.eye(3),
-])
+VECTORS = np.concatenate(
+    [
+        rng.normal(size=(40, 3)),
+        rng.normal(size=(20, 3)) * 10.0 ** rng.uniform(-12, -4, (20, 1)),
+        np.zeros((1, 3)),
+        np.pi * np.eye(3),
+        (np.pi - 1e-7) * np.eye(3),
+    ]
+)
 
 
 def random_poses(*shape):

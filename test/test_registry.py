@@ -147,8 +147,14 @@ print('done')
 def run(folder, *arguments):
     path = os.pathsep.join(map(str, (folder, ROOT, ROOT / 'test')))
     environment = {**os.environ, 'PYTHONPATH': path}
-    return subprocess.run([sys.executable, *arguments], cwd=folder, env=environment, text=True,
-                          capture_output=True, timeout=300)
+    return subprocess.run(
+        [sys.executable, *arguments],
+        cwd=folder,
+        env=environment,
+        text=True,
+        capture_output=True,
+        timeout=300,
+    )
 
 
 @pytest.fixture
@@ -172,11 +178,18 @@ def test_what_a_users_package_adds_is_used_like_the_packages_own(engine, distrib
     assert done.stdout.splitlines()[-1:] == ['done'], done.stderr
 
 
-@pytest.mark.parametrize(('old', 'new', 'reason'), [
-    ('my_optics:Trefoil', 'my_optics:Quatrefoil', "'trefoil' of my-optics cannot be loaded ("),
-    ('my_optics:Trefoil', 'my_optics:Rational', "'trefoil' of my-optics is not derived from E"),
-    ('trefoil =', 'skew =', "'skew' of my-optics: the name is taken, or"),
-])
+@pytest.mark.parametrize(
+    ('old', 'new', 'reason'),
+    [
+        ('my_optics:Trefoil', 'my_optics:Quatrefoil', "'trefoil' of my-optics cannot be loaded ("),
+        (
+            'my_optics:Trefoil',
+            'my_optics:Rational',
+            "'trefoil' of my-optics is not derived from E",
+        ),
+        ('trefoil =', 'skew =', "'skew' of my-optics: the name is taken, or"),
+    ],
+)
 def test_a_broken_entry_point_is_named_in_one_line(old, new, reason, distribution):
     entries = distribution / 'my_optics-1.0.dist-info' / 'entry_points.txt'
     entries.write_text(entries.read_text().replace(old, new))

@@ -16,8 +16,11 @@ threadpoolctl = pytest.importorskip('threadpoolctl', reason='comes with pip, not
 @limit_threads
 def _threads() -> set[int]:
     """Return the numbers of threads that BLAS libraries take."""
-    return {pool['num_threads'] for pool in threadpoolctl.threadpool_info()
-            if pool['user_api'] == 'blas'}
+    return {
+        pool['num_threads']
+        for pool in threadpoolctl.threadpool_info()
+        if pool['user_api'] == 'blas'
+    }
 
 
 @pytest.fixture
@@ -76,6 +79,13 @@ def test_processes_of_the_package_ask_for_one(monkeypatch: pytest.MonkeyPatch) -
 def test_the_library_is_single_threaded() -> None:
     from fisheye_svp_ros import library
 
-    for name in ('localize', 'calibrate', 'calibrate_stereo', 'stereo_depth', 'sweep', 'diagnose',
-                 'budget'):
+    for name in (
+        'localize',
+        'calibrate',
+        'calibrate_stereo',
+        'stereo_depth',
+        'sweep',
+        'diagnose',
+        'budget',
+    ):
         assert hasattr(getattr(library, name), '__wrapped__'), name

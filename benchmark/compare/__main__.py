@@ -64,15 +64,21 @@ from fisheye_svp_ros.solve.rig_state import group_by_frame  # noqa: E402
 _OV = (1280, 800)
 TOOLS = {**PEERS, **PYTHON_PEERS}
 # Not on halves: what needs minutes, or is far off on whole sets.
-_WHOLE_ONLY = {'mrcal, OPENCV8', 'mrcal, splined 30 x 18', 'lensboy, 14 coefficients',
-               'lensboy, splined 16 x 11'}
+_WHOLE_ONLY = {
+    'mrcal, OPENCV8',
+    'mrcal, splined 30 x 18',
+    'lensboy, 14 coefficients',
+    'lensboy, splined 16 x 11',
+}
 SETS: dict[str, Callable[[Path], Set]] = {
     'ov_plane': lambda data: table_set(data / 'ov_plane', _OV),
     'ov_cube': lambda data: table_set(data / 'ov_cube', _OV),
     'photos/chessboard': lambda data: photograph_set(
-        data / 'photos' / 'chessboard', 'chessboard:4x6:30mm'),
+        data / 'photos' / 'chessboard', 'chessboard:4x6:30mm'
+    ),
     'photos/square_grid': lambda data: photograph_set(
-        data / 'photos' / 'square_grid', 'squares:3x4:30mm:30mm'),
+        data / 'photos' / 'square_grid', 'squares:3x4:30mm:30mm'
+    ),
 }
 
 
@@ -119,29 +125,58 @@ def compared(data: Set, tools: Iterable[str] = tuple(TOOLS)) -> list[Row]:
     train, _ = posable_observations(data.train, lens)
     with timed() as naming:
         found = diagnose(train, lens, held_out=data.test)
-    gross = {(row['frame'], row['landmark']) for row in found.gross
-             if row['why'].startswith('held out')}
+    gross = {
+        (row['frame'], row['landmark']) for row in found.gross if row['why'].startswith('held out')
+    }
     places = zip(data.test.frame.tolist(), data.test.landmark.tolist(), strict=True)
     fair = np.array([place not in gross for place in places])
     start = fsvp.localize(data.test, lens)
     count, names = int(fair.sum()), ', '.join(cause.effect for cause in found.causes)
     figures = found.figures
     return [
-        Row('ours, `calibrate`', figures.base.heldout_rms_px, _nominal(lens, data.test, start),
-            count, fitting.seconds, ours=True),
-        Row('ours, `diagnose`: lens', figures.lens_only.heldout_rms_px, np.nan, count,
-            naming.seconds, names, True),
-        Row('ours, `diagnose`: named', figures.named.heldout_rms_px, _whole(found, data.test),
-            count, np.nan, ours=True),
-        Row('ours, `diagnose`: extended', figures.extended.heldout_rms_px,
-            _whole(found, data.test, found.offsets), count, np.nan, ours=True),
+        Row(
+            'ours, `calibrate`',
+            figures.base.heldout_rms_px,
+            _nominal(lens, data.test, start),
+            count,
+            fitting.seconds,
+            ours=True,
+        ),
+        Row(
+            'ours, `diagnose`: lens',
+            figures.lens_only.heldout_rms_px,
+            np.nan,
+            count,
+            naming.seconds,
+            names,
+            True,
+        ),
+        Row(
+            'ours, `diagnose`: named',
+            figures.named.heldout_rms_px,
+            _whole(found, data.test),
+            count,
+            np.nan,
+            ours=True,
+        ),
+        Row(
+            'ours, `diagnose`: extended',
+            figures.extended.heldout_rms_px,
+            _whole(found, data.test, found.offsets),
+            count,
+            np.nan,
+            ours=True,
+        ),
         *(_row(name, data, fair, start, lens.fx) for name in tools),
     ]
 
 
 def _nominal(lens: fsvp.Lens, test: Observations, start: Localized) -> float:
-    return rms(residuals(lambda points: fsvp.project(lens, points).uv, test.frame, test.xyz,
-                         test.uv, start.pose))
+    return rms(
+        residuals(
+            lambda points: fsvp.project(lens, points).uv, test.frame, test.xyz, test.uv, start.pose
+        )
+    )
 
 
 def _whole(found: Diagnosis, test: Observations, local: PredictedOffsets | None = None) -> float:
@@ -159,19 +194,27 @@ def _row(name: str, data: Set, fair: Mask, start: Localized, focal: float) -> Ro
             found = TOOLS[name](data, grid_of(data), focal)
     except NotHereError as reason:
         return Row(name, np.nan, np.nan, 0, np.nan, str(reason))
-    rows = [_scored(name, one, data.test, fair, start)._replace(seconds=clock.seconds)
-            for one in found]
+    rows = [
+        _scored(name, one, data.test, fair, start)._replace(seconds=clock.seconds) for one in found
+    ]
     return min(rows, key=lambda row: row.rms_px)
 
 
 def _scored(name: str, fitted: Fitted, test: Observations, fair: Mask, start: Localized) -> Row:
     near = _incidence(test, start) < fitted.before
-    apart = residuals(fitted.project, test.frame[near], fitted.places(test)[near], test.uv[near],
-                      start.pose)
+    apart = residuals(
+        fitted.project, test.frame[near], fitted.places(test)[near], test.uv[near], start.pose
+    )
     note = f'without {(~near).sum()} points beyond {fitted.before:.0f}°' * bool((~near).any())
     mine = fair[near]
-    return Row(name, rms(apart[mine]), rms(apart), int(mine.sum()), np.nan,
-               '; '.join(filter(None, (fitted.note, note))))
+    return Row(
+        name,
+        rms(apart[mine]),
+        rms(apart),
+        int(mine.sum()),
+        np.nan,
+        '; '.join(filter(None, (fitted.note, note))),
+    )
 
 
 def _incidence(test: Observations, start: Localized) -> Array:
@@ -186,21 +229,30 @@ def _incidence(test: Observations, start: Localized) -> Array:
 
 def section(data: Set, rows: list[Row]) -> list[str]:
     """Return the part of docs/results/compare.md on one set."""
-    best = min((row.rms_px for row in rows if not row.ours and np.isfinite(row.rms_px)),
-               default=np.nan)
+    best = min(
+        (row.rms_px for row in rows if not row.ours and np.isfinite(row.rms_px)), default=np.nan
+    )
     boards = len(np.unique(data.train.board))
     held_out = len(np.unique(data.test.frame // BOARDS))
     lines = [
-        f'## {data.name}', '',
+        f'## {data.name}',
+        '',
         f'{len(data.train)} points in {len(data.train.frames)} frames of '
         f'{boards} board{"s" * (boards > 1)} to fit; {len(data.test)} in {held_out} frames held '
-        'out.', '',
+        'out.',
+        '',
         '| model | held-out rms, px | beside the best of the others | points | with outliers, '
-        'px | s | causes, notes |', '|---|---:|---:|---:|---:|---:|---|',
+        'px | s | causes, notes |',
+        '|---|---:|---:|---:|---:|---:|---|',
     ]
     for row in rows:
-        figures = (f'{row.rms_px:.3f}', f'{row.rms_px / best:.2f}', f'{row.points or ""}',
-                   f'{row.whole_px:.3f}', f'{row.seconds:.1f}')
+        figures = (
+            f'{row.rms_px:.3f}',
+            f'{row.rms_px / best:.2f}',
+            f'{row.points or ""}',
+            f'{row.whole_px:.3f}',
+            f'{row.seconds:.1f}',
+        )
         cells = ' | '.join('' if cell == 'nan' else cell for cell in figures)
         lines.append(f'| {row.model} | {cells} | {row.note} |')
     return [*lines, '']
@@ -213,8 +265,15 @@ def halves_table(found: dict[str, list[list[Row]]]) -> list[str]:
         cells = []
         for many in found.values():
             mine = [rows[i] for rows in many if np.isfinite(rows[i].rms_px)]
-            pooled = np.sqrt(np.average([one.rms_px**2 for one in mine],
-                                        weights=[one.points for one in mine])) if mine else np.nan
+            pooled = (
+                np.sqrt(
+                    np.average(
+                        [one.rms_px**2 for one in mine], weights=[one.points for one in mine]
+                    )
+                )
+                if mine
+                else np.nan
+            )
             missing = f' ({len(mine)} of {len(many)})' * (len(mine) < len(many))
             cells.append(f'{pooled:.3f}{missing}' if mine else '-')
         lines.append(f'| {row.model} | {" | ".join(cells)} |')
@@ -228,9 +287,23 @@ def page(
     lines = [_versions(), '']
     for data, rows in sets:
         lines += section(data, rows)
-    return '\n'.join([
-        *lines, '## Half against half', '', *halves, '', '## Standard errors, half against half',
-        '', *apart, '', f'## Standard errors, {SIMULATED} simulated sets', '', *simulated, ''])
+    return '\n'.join(
+        [
+            *lines,
+            '## Half against half',
+            '',
+            *halves,
+            '',
+            '## Standard errors, half against half',
+            '',
+            *apart,
+            '',
+            f'## Standard errors, {SIMULATED} simulated sets',
+            '',
+            *simulated,
+            '',
+        ]
+    )
 
 
 def main() -> None:
@@ -242,12 +315,15 @@ def main() -> None:
     sets = [SETS[name](asked.data) for name in asked.only if (asked.data / name).is_dir()]
     # Whole sets one by one: their seconds are compared.
     rows = study.in_processes('comparing', compared, sets, 1)
-    halves, pairs = ({data.name: list(parts(data)) for data in sets}
-                     for parts in (half_sets, all_pairs))
-    scores = iter(study.in_processes(
-        'halves', compared_half, [*chain(*halves.values())], asked.workers))
-    apart = iter(study.in_processes(
-        'errors', differences, [*chain(*pairs.values())], asked.workers))
+    halves, pairs = (
+        {data.name: list(parts(data)) for data in sets} for parts in (half_sets, all_pairs)
+    )
+    scores = iter(
+        study.in_processes('halves', compared_half, [*chain(*halves.values())], asked.workers)
+    )
+    apart = iter(
+        study.in_processes('errors', differences, [*chain(*pairs.values())], asked.workers)
+    )
     simulated: dict[str, list[Difference]] = {}
     for one in study.in_processes('simulated', simulated_errors, range(SIMULATED), asked.workers):
         for kind, many in one.items():
@@ -255,9 +331,11 @@ def main() -> None:
     text = page(
         list(zip(sets, rows, strict=True)),
         halves_table({name: [next(scores) for _ in many] for name, many in halves.items()}),
-        honesty_table({name: [one for _ in many for one in next(apart)]
-                       for name, many in pairs.items()}),
-        honesty_table(dict(sorted(simulated.items()))))
+        honesty_table(
+            {name: [one for _ in many for one in next(apart)] for name, many in pairs.items()}
+        ),
+        honesty_table(dict(sorted(simulated.items()))),
+    )
     print(text)
     if asked.only == list(SETS):
         study.write_figures(asked.output, ['', text.rstrip('\n')])
@@ -265,8 +343,15 @@ def main() -> None:
 
 def _versions() -> str:
     found = []
-    for name in ('mrcal', 'lensboy', 'calibsense', 'ds-msp', 'opencv-python-headless',
-                 'numpy', 'scipy'):
+    for name in (
+        'mrcal',
+        'lensboy',
+        'calibsense',
+        'ds-msp',
+        'opencv-python-headless',
+        'numpy',
+        'scipy',
+    ):
         try:
             found.append(f'{name} {version(name)}')
         except PackageNotFoundError:

@@ -43,11 +43,15 @@ class Stated(NamedTuple):
 def whole(data: Set) -> Observations:
     """Return all frames of a set as one table, numbered in the order of time, equal weights."""
     parts = data.train, replace(data.test, frame=data.test.frame // BOARDS)
-    keys = [np.stack([np.nan_to_num(part.t), part.frame, np.full(len(part), i)], axis=-1)
-            for i, part in enumerate(parts)]
+    keys = [
+        np.stack([np.nan_to_num(part.t), part.frame, np.full(len(part), i)], axis=-1)
+        for i, part in enumerate(parts)
+    ]
     frame = np.unique(np.concatenate(keys), axis=0, return_inverse=True)[1]
-    landmark, uv, xyz, board = (np.concatenate([getattr(part, name) for part in parts])
-                                for name in ('landmark', 'uv', 'xyz', 'board'))
+    landmark, uv, xyz, board = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ('landmark', 'uv', 'xyz', 'board')
+    )
     return make_observations(frame, landmark, uv, xyz, board=board, source=data.name)
 
 
@@ -69,28 +73,42 @@ def half_sets(data: Set) -> Iterator[Set]:
 def all_pairs(data: Set) -> list[tuple[Set, Set]]:
     """Return the fixed halves and random ones, each as two sets without held-out frames."""
     table = whole(data)
-    shuffled = [np.random.default_rng([7, deal]).permutation(table.frames)
-                for deal in range(DEALS)]
-    pairs = [*fixed_halves(table.frames).values(),
-             *((order[::2], order[1::2]) for order in shuffled)]
-    return [tuple(replace(data, train=table.take(np.isin(table.frame, half)))
-                  for half in pair) for pair in pairs]
+    shuffled = [
+        np.random.default_rng([7, deal]).permutation(table.frames) for deal in range(DEALS)
+    ]
+    pairs = [
+        *fixed_halves(table.frames).values(),
+        *((order[::2], order[1::2]) for order in shuffled),
+    ]
+    return [
+        tuple(replace(data, train=table.take(np.isin(table.frame, half))) for half in pair)
+        for pair in pairs
+    ]
 
 
 def intrinsics_of(data: Set) -> dict[str, Stated]:
     """Return what tools state of fx, fy, cx, cy; a tool that finds no lens is left out."""
     found, kept, _ = calibrate_without_outliers(
-        data.train, lambda rows: calibrate(rows, 'kannala_brandt', data.size))
+        data.train, lambda rows: calibrate(rows, 'kannala_brandt', data.size)
+    )
     lens, names = found.adjusted.lens, found.adjusted.names
     trusted = assess_lens(kept, lens, names)
     mine = [names.index(name) for name in INTRINSICS]
-    stated = {'ours, `calibrate`': Stated(np.array(parameter_values(lens, INTRINSICS)), {
-        'target exact': np.array([trusted.stderr[name] for name in INTRINSICS]),
-        'any target': np.sqrt(np.diag(trusted.covariance))[mine]})}
+    stated = {
+        'ours, `calibrate`': Stated(
+            np.array(parameter_values(lens, INTRINSICS)),
+            {
+                'target exact': np.array([trusted.stderr[name] for name in INTRINSICS]),
+                'any target': np.sqrt(np.diag(trusted.covariance))[mine],
+            },
+        )
+    }
     fits: dict[str, Fit] = {
         'OpenCV, rational': opencv_rational,
         'calibsense, fisheye': installed(
-            lambda *asked: calibsense_fisheye(*asked, angles=(_ANGLE,)))}
+            lambda *asked: calibsense_fisheye(*asked, angles=(_ANGLE,))
+        ),
+    }
     for name, fit in fits.items():
         try:
             one = fit(data, grid_of(data), lens.fx)[0]
@@ -107,11 +125,16 @@ def differences(pair: tuple[Set, Set]) -> list[Difference]:
     except FisheyeSvpError:
         return []
     return [
-        Difference(f'{tool}, {kind}' if kind else tool,
-                   one.intrinsics - second[tool].intrinsics,
-                   np.hypot(error, second[tool].errors[kind]))
-        for tool, one in first.items() if tool in second
-        for kind, error in one.errors.items() if kind in second[tool].errors]
+        Difference(
+            f'{tool}, {kind}' if kind else tool,
+            one.intrinsics - second[tool].intrinsics,
+            np.hypot(error, second[tool].errors[kind]),
+        )
+        for tool, one in first.items()
+        if tool in second
+        for kind, error in one.errors.items()
+        if kind in second[tool].errors
+    ]
 
 
 def simulated_errors(number: int) -> dict[str, list[Difference]]:
@@ -123,8 +146,13 @@ def simulated_errors(number: int) -> dict[str, list[Difference]]:
         stated = intrinsics_of(Set('simulated', table, table, (lens.width, lens.height)))
     except FisheyeSvpError:
         return {kind: []}
-    return {kind: [Difference(f'{tool}, {name}' if name else tool, one.intrinsics - true, error)
-                   for tool, one in stated.items() for name, error in one.errors.items()]}
+    return {
+        kind: [
+            Difference(f'{tool}, {name}' if name else tool, one.intrinsics - true, error)
+            for tool, one in stated.items()
+            for name, error in one.errors.items()
+        ]
+    }
 
 
 def honesty_table(found: dict[str, list[Difference]]) -> list[str]:
@@ -132,7 +160,9 @@ def honesty_table(found: dict[str, list[Difference]]) -> list[str]:
     tools = dict.fromkeys(one.tool for many in found.values() for one in many)
     lines = [
         f'| tool | differences | within 95 % | {" | ".join(found)} | difference / stated error, '
-        'rms | its stated error for fx, px |', f'|---|{"---:|" * (len(found) + 4)}']
+        'rms | its stated error for fx, px |',
+        f'|---|{"---:|" * (len(found) + 4)}',
+    ]
     for tool in tools:
         by_set = [[one for one in many if one.tool == tool] for many in found.values()]
         every = [one for many in by_set for one in many]
@@ -140,7 +170,8 @@ def honesty_table(found: dict[str, list[Difference]]) -> list[str]:
         stated = ' / '.join(map(_stated, by_set))
         lines.append(
             f'| {tool} | {ratio.size} | {_share(every)} | {" | ".join(map(_share, by_set))} | '
-            f'{np.sqrt((ratio**2).mean()):.2f} | {stated} |')
+            f'{np.sqrt((ratio**2).mean()):.2f} | {stated} |'
+        )
     return lines
 
 

@@ -89,8 +89,14 @@ def opencv_fisheye(data: Set, grid: Grid, focal: float) -> list[Fitted]:
     def fit(limit: float) -> Fitted:
         points, seen = board_points(data.train, grid, start, limit)
         _, matrix, curve, _, _ = cv2.fisheye.calibrate(
-            [one[None] for one in points], [one[None] for one in seen], data.size,
-            start.copy(), np.zeros(4), flags=flags, criteria=_TERMS)
+            [one[None] for one in points],
+            [one[None] for one in seen],
+            data.size,
+            start.copy(),
+            np.zeros(4),
+            flags=flags,
+            criteria=_TERMS,
+        )
         return Fitted(fisheye_projection(matrix, curve), nominal_places, before=PLANE_LIMIT)
 
     return fit_within(fit, ANGLES)
@@ -114,8 +120,14 @@ def opencv_rational(data: Set, grid: Grid, focal: float) -> list[Fitted]:
     points, seen = board_points(data.train, grid, start)
     try:
         _, matrix, curve, _, _, errors, *_ = cv2.calibrateCameraExtended(
-            [one.astype(np.float32) for one in points], [one.astype(np.float32) for one in seen],
-            data.size, start, np.zeros(8), flags=flags, criteria=_TERMS)
+            [one.astype(np.float32) for one in points],
+            [one.astype(np.float32) for one in seen],
+            data.size,
+            start,
+            np.zeros(8),
+            flags=flags,
+            criteria=_TERMS,
+        )
     except cv2.error as failure:
         raise NotHereError(f'finds no lens: {failure.err}') from failure
 
@@ -123,9 +135,15 @@ def opencv_rational(data: Set, grid: Grid, focal: float) -> list[Fitted]:
         zero = np.zeros(3)
         return np.asarray(cv2.projectPoints(xyz, zero, zero, matrix, curve)[0][:, 0])
 
-    return [Fitted(project, nominal_places, before=PLANE_LIMIT,
-                   intrinsics=matrix[[0, 1, 0, 1], [0, 1, 2, 2]],
-                   errors={'': errors[:4].ravel()})]
+    return [
+        Fitted(
+            project,
+            nominal_places,
+            before=PLANE_LIMIT,
+            intrinsics=matrix[[0, 1, 0, 1], [0, 1, 2, 2]],
+            errors={'': errors[:4].ravel()},
+        )
+    ]
 
 
 def pinhole_matrix(data: Set, focal: float) -> Array:
@@ -164,13 +182,19 @@ def mrcal_model(model: str) -> Fit:
             left_out = _run_mrcal(Path(folder), model, data, grid, focal)
             found = mrcal.cameramodel(str(Path(folder, 'camera-0.cameramodel')))
         warp = found.optimization_inputs()['calobject_warp']
-        board = mrcal.ref_calibration_object(grid.width, grid.width, grid.spacing,
-                                             calobject_warp=warp)
+        board = mrcal.ref_calibration_object(
+            grid.width, grid.width, grid.spacing, calobject_warp=warp
+        )
         lens = found.intrinsics()
         note = f'{left_out} board views left out: it finds no start for them' if left_out else ''
-        return [Fitted(lambda xyz: np.asarray(mrcal.project(xyz, *lens)),
-                       lambda table: warped_places(table, grid, board), note,
-                       PLANE_LIMIT if 'OPENCV' in model else 180.0)]
+        return [
+            Fitted(
+                lambda xyz: np.asarray(mrcal.project(xyz, *lens)),
+                lambda table: warped_places(table, grid, board),
+                note,
+                PLANE_LIMIT if 'OPENCV' in model else 180.0,
+            )
+        ]
 
     return fit
 
@@ -182,11 +206,28 @@ def _run_mrcal(folder: Path, model: str, data: Set, grid: Grid, focal: float) ->
     while len(left_out) < _MOST_LEFT_OUT:
         (folder / 'corners.vnl').write_text(vnlog(data.train, grid, left_out))
         told = subprocess.run(
-            [command, '--corners-cache', folder / 'corners.vnl', '--lensmodel', model,
-             '--focal', f'{focal:.0f}', '--imagersize', *map(str, data.size),
-             '--object-spacing', str(grid.spacing), '--object-width-n', str(grid.width),
-             '--outdir', folder, 'view*.png'],
-            capture_output=True, text=True, check=False)
+            [
+                command,
+                '--corners-cache',
+                folder / 'corners.vnl',
+                '--lensmodel',
+                model,
+                '--focal',
+                f'{focal:.0f}',
+                '--imagersize',
+                *map(str, data.size),
+                '--object-spacing',
+                str(grid.spacing),
+                '--object-width-n',
+                str(grid.width),
+                '--outdir',
+                folder,
+                'view*.png',
+            ],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         if not told.returncode:
             return len(left_out)
         reason = told.stderr.strip().splitlines()[-1]
@@ -223,8 +264,9 @@ def warped_places(table: Observations, grid: Grid, board: Array) -> Array:
         steps = np.array([grid.places[one] for one in table.landmark[mine].tolist()])
         flat = grid.spacing * np.column_stack([steps, np.zeros(len(steps))])
         nominal = table.xyz[mine]
-        left, _, right = np.linalg.svd((flat - flat.mean(axis=0)).T
-                                       @ (nominal - nominal.mean(axis=0)))
+        left, _, right = np.linalg.svd(
+            (flat - flat.mean(axis=0)).T @ (nominal - nominal.mean(axis=0))
+        )
         turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
         places[mine] = (board[steps[:, 1], steps[:, 0]] - flat.mean(axis=0)) @ turn
         places[mine] += nominal.mean(axis=0)
@@ -236,7 +278,9 @@ PEERS: dict[str, Fit] = {
     'OpenCV, fisheye': opencv_fisheye,
     'OpenCV, rational': opencv_rational,
     'mrcal, OPENCV8': mrcal_model('LENSMODEL_OPENCV8'),
-    **{f'mrcal, splined {x} x {y}': mrcal_model(_SPLINED.format(x, y))
-       for x, y in ((10, 7), (16, 11), (30, 18))},
+    **{
+        f'mrcal, splined {x} x {y}': mrcal_model(_SPLINED.format(x, y))
+        for x, y in ((10, 7), (16, 11), (30, 18))
+    },
     'mrcal, CAHVORE': mrcal_model('LENSMODEL_CAHVORE_linearity=0.37'),
 }

@@ -62,11 +62,16 @@ def calibsense_fisheye(
     board = cs.Checkerboard(grid.width, grid.width, 1e3 * grid.spacing)
 
     def fit(limit: float) -> Fitted:
-        views = [cs.ViewObservations(f'{number}', grid_numbers(points, grid), uv)
-                 for number, (points, uv) in enumerate(zip(*board_points(
-                     data.train, grid, start, limit), strict=True))]
-        session = cs.CalibrationSession(cs.ObservationSet(board, data.size, tuple(views)),
-                                        cs.CalibrationRecord(lens, data.size))
+        views = [
+            cs.ViewObservations(f'{number}', grid_numbers(points, grid), uv)
+            for number, (points, uv) in enumerate(
+                zip(*board_points(data.train, grid, start, limit), strict=True)
+            )
+        ]
+        session = cs.CalibrationSession(
+            cs.ObservationSet(board, data.size, tuple(views)),
+            cs.CalibrationRecord(lens, data.size),
+        )
         try:
             found = cs.instrument(session, cs.RefitOptions(model='fisheye'))
         except cs.CalibSenseError as reason:
@@ -75,8 +80,13 @@ def calibsense_fisheye(
         errors = {'of points': known.intrinsic_std()[:4]}
         if known.robust is not None and known.robust.usable:
             errors['between views'] = known.robust.std()[:4]
-        return Fitted(fisheye_projection(camera.camera_matrix, camera.distortion), nominal_places,
-                      before=PLANE_LIMIT, intrinsics=camera.to_vector()[:4], errors=errors)
+        return Fitted(
+            fisheye_projection(camera.camera_matrix, camera.distortion),
+            nominal_places,
+            before=PLANE_LIMIT,
+            intrinsics=camera.to_vector()[:4],
+            errors=errors,
+        )
 
     return fit_within(fit, angles)
 
@@ -90,8 +100,12 @@ def ds_msp_model(name: str) -> Fit:
 
         start = pinhole_matrix(data, focal)
         points, seen = board_points(data.train, grid, start)
-        model = calibrate(seed_from_K(model_class(name), start), points, seen,
-                          [np.ones(len(uv), bool) for uv in seen])['model']
+        model = calibrate(
+            seed_from_K(model_class(name), start),
+            points,
+            seen,
+            [np.ones(len(uv), bool) for uv in seen],
+        )['model']
 
         def project(xyz: Array) -> Array:
             uv, valid = model.project(xyz)
@@ -113,13 +127,16 @@ def lensboy_model(config: Callable[[Any, Set], Any]) -> Fit:
         square = grid.spacing * np.stack([column, row, 0.0 * row], axis=-1)
         on_board = np.unique([c + grid.width * r for c, r in grid.places.values()])
 
-        frames = [lensboy.Frame(np.searchsorted(on_board, grid_numbers(points, grid)), uv)
-                  for points, uv in zip(*board_points(data.train, grid, start), strict=True)]
+        frames = [
+            lensboy.Frame(np.searchsorted(on_board, grid_numbers(points, grid)), uv)
+            for points, uv in zip(*board_points(data.train, grid, start), strict=True)
+        ]
         # In a process of its own, which may crash: splines do where a fit diverges.
         with ProcessPoolExecutor(1, mp_context=get_context('spawn')) as pool:
             try:
                 camera, warp = pool.submit(
-                    _lensboy_fit, square[on_board], frames, config(lensboy, data)).result()
+                    _lensboy_fit, square[on_board], frames, config(lensboy, data)
+                ).result()
             except (cv2.error, BrokenProcessPool, RuntimeError, ValueError) as reason:
                 raise NotHereError(f'finds no lens: {reason}') from reason
         board = warp.warp_target(square).reshape(grid.width, grid.width, 3)
@@ -131,8 +148,9 @@ def lensboy_model(config: Callable[[Any, Set], Any]) -> Fit:
                 uv[before] = camera.project_points(xyz[before])
             return uv
 
-        return [Fitted(project, lambda table: warped_places(table, grid, board),
-                       before=PLANE_LIMIT)]
+        return [
+            Fitted(project, lambda table: warped_places(table, grid, board), before=PLANE_LIMIT)
+        ]
 
     return installed(fit)
 
@@ -148,8 +166,8 @@ def _lensboy_fit(*asked: Any) -> tuple[Any, Any]:
 
 def _opencv(terms: str) -> Callable[[Any, Set], Any]:
     return lambda lensboy, data: lensboy.OpenCVConfig(
-        *data.size[::-1],
-        included_distortion_coefficients=getattr(lensboy.OpenCVConfig, terms))
+        *data.size[::-1], included_distortion_coefficients=getattr(lensboy.OpenCVConfig, terms)
+    )
 
 
 def _splined(lensboy: Any, data: Set) -> Any:

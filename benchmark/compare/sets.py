@@ -60,8 +60,9 @@ def photograph_set(folder: Path, board: str) -> Set:
 
 def one_board_a_frame(table: Observations) -> Observations:
     """Return a table in which each board of a frame has a frame, and all points count alike."""
-    return replace(table, frame=BOARDS * table.frame + table.board,
-                   sigma=np.full(len(table), np.nan))
+    return replace(
+        table, frame=BOARDS * table.frame + table.board, sigma=np.full(len(table), np.nan)
+    )
 
 
 def grid_of(data: Set) -> Grid:
@@ -70,8 +71,10 @@ def grid_of(data: Set) -> Grid:
     Raises ObservationError where they lie on no regular grid.
     """
     parts = data.train, data.test
-    landmark, board, xyz = (np.concatenate([getattr(part, name) for part in parts])
-                            for name in ('landmark', 'board', 'xyz'))
+    landmark, board, xyz = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ('landmark', 'board', 'xyz')
+    )
     places: dict[int, tuple[int, int]] = {}
     spacings = []
     for number in np.unique(board):

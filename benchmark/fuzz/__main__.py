@@ -96,26 +96,49 @@ def section(outcomes: dict[str, Outcome], command: str) -> str:
     whole = Outcome()
     for outcome in outcomes.values():
         whole.add(outcome)
-    said = ', '.join(f'{kind} {whole.faults[kind]}' for kind in (
-        'crashed', 'hung or died', 'wrong', 'slow', 'large'))
-    rows = [[name, one.tried, one.refused, *(one.faults[kind] for kind in (
-        'crashed', 'hung or died', 'wrong')), f'{one.slowest:.2f}', f'{one.largest:.0f}']
-            for name, one in outcomes.items()]
-    return '\n'.join([
-        f'`{command}`: {whole.tried} inputs, {whole.refused} refused, {said}. Slow is above '
-        f'{SLOWEST:g} s of processor time or {WAITING:g} s on the clock, large above {LARGEST:g} '
-        'MB of memory more than ever before.', '', *study.table(
-            'surface | inputs | refused | crashed | hung or died | wrong | slowest s | most MB',
-            rows, numbers=True)])
+    said = ', '.join(
+        f'{kind} {whole.faults[kind]}'
+        for kind in ('crashed', 'hung or died', 'wrong', 'slow', 'large')
+    )
+    rows = [
+        [
+            name,
+            one.tried,
+            one.refused,
+            *(one.faults[kind] for kind in ('crashed', 'hung or died', 'wrong')),
+            f'{one.slowest:.2f}',
+            f'{one.largest:.0f}',
+        ]
+        for name, one in outcomes.items()
+    ]
+    return '\n'.join(
+        [
+            f'`{command}`: {whole.tried} inputs, {whole.refused} refused, {said}. Slow is above '
+            f'{SLOWEST:g} s of processor time or {WAITING:g} s on the clock, large above '
+            f'{LARGEST:g} '
+            'MB of memory more than ever before.',
+            '',
+            *study.table(
+                'surface | inputs | refused | crashed | hung or died | wrong | slowest s '
+                '| most MB',
+                rows,
+                numbers=True,
+            ),
+        ]
+    )
 
 
 def main() -> int:
     """Run, print, write the section; return 1 where anything is at fault."""
     parser = study.parser(
-        'fuzz', __doc__, None, inputs=(1_000_000, 'of all surfaces'),
+        'fuzz',
+        __doc__,
+        None,
+        inputs=(1_000_000, 'of all surfaces'),
         first=(0, 'the first seed of each surface'),
         only=('', 'surfaces whose names contain this'),
-        no_docs=(False, 'leave docs/results/reliability.md alone'))
+        no_docs=(False, 'leave docs/results/reliability.md alone'),
+    )
     parser.add_argument('--seed', type=int, help='try this one, here, and show what it raises')
     args = parser.parse_args()
     wanted = [surface for surface in every() if args.only in surface.name]
@@ -123,8 +146,9 @@ def main() -> int:
         print(repr(trial_of(wanted[0].name)(Random(f'{wanted[0].name} {args.seed}'))))
         return 0
     outcomes = run_all(wanted, args.inputs, args.first, args.workers)
-    text = section(outcomes, f'python -m benchmark.fuzz --inputs {args.inputs} '
-                   f'--first {args.first}')
+    text = section(
+        outcomes, f'python -m benchmark.fuzz --inputs {args.inputs} --first {args.first}'
+    )
     print(text)
     for outcome in outcomes.values():
         for line in outcome.told[:5]:

@@ -6,17 +6,94 @@ import re
 from random import Random
 
 NUMBERS = (
-    '0', '-0', '-1', '1', '2', '0.5', '1.5', '-1e-300', '1e-320', '1e300', '-1e308', '1e999',
-    'nan', 'inf', '-inf', '.nan', '.inf', '4294967295', '4294967296', '9007199254740993', '1e20',
-    '0x10', '010', '1_000', '9' * 5000, '\u0661', '1e5', '100000',
-    '1000000000', '1e-9', '89.99', '180',
+    '0',
+    '-0',
+    '-1',
+    '1',
+    '2',
+    '0.5',
+    '1.5',
+    '-1e-300',
+    '1e-320',
+    '1e300',
+    '-1e308',
+    '1e999',
+    'nan',
+    'inf',
+    '-inf',
+    '.nan',
+    '.inf',
+    '4294967295',
+    '4294967296',
+    '9007199254740993',
+    '1e20',
+    '0x10',
+    '010',
+    '1_000',
+    '9' * 5000,
+    '\u0661',
+    '1e5',
+    '100000',
+    '1000000000',
+    '1e-9',
+    '89.99',
+    '180',
 )
 WORDS = (
-    '', ' ', 'null', '~', 'true', 'no', '[]', '{}', '[1', '{a', '&a x', '*a', '<<', '!!binary x',
-    '!!timestamp x', '!!python/name:os.system', '2001-99-99', '"', "'", '\x00', '\ufeff', '\n',
-    '\r', '#', ':', ',', ';', '|', '%YAML 1.2', '---', '...', '../../x', '/dev/zero', '/(*', '..',
-    'a' * 5000, '\u2028', '\x1b[31m', 'é', '\U0001f600', '-', '- - - -', '{{', '<a>', '</a>',
-    '<!DOCTYPE a>', '&lt;', '%s', '$(x)', '\\', 'gennery', 'flat_port', 'equidistant', 'pinhole',
+    '',
+    ' ',
+    'null',
+    '~',
+    'true',
+    'no',
+    '[]',
+    '{}',
+    '[1',
+    '{a',
+    '&a x',
+    '*a',
+    '<<',
+    '!!binary x',
+    '!!timestamp x',
+    '!!python/name:os.system',
+    '2001-99-99',
+    '"',
+    "'",
+    '\x00',
+    '\ufeff',
+    '\n',
+    '\r',
+    '#',
+    ':',
+    ',',
+    ';',
+    '|',
+    '%YAML 1.2',
+    '---',
+    '...',
+    '../../x',
+    '/dev/zero',
+    '/(*',
+    '..',
+    'a' * 5000,
+    '\u2028',
+    '\x1b[31m',
+    'é',
+    '\U0001f600',
+    '-',
+    '- - - -',
+    '{{',
+    '<a>',
+    '</a>',
+    '<!DOCTYPE a>',
+    '&lt;',
+    '%s',
+    '$(x)',
+    '\\',
+    'gennery',
+    'flat_port',
+    'equidistant',
+    'pinhole',
 )
 _TOKEN = re.compile(rb'[-+]?[0-9][-+.0-9eE]*|[A-Za-z_][A-Za-z_0-9]*')
 
@@ -42,7 +119,7 @@ def _cut(data: bytes, rng: Random) -> bytes:
 
 
 def _truncate(data: bytes, rng: Random) -> bytes:
-    return data[:rng.randrange(len(data) + 1)]
+    return data[: rng.randrange(len(data) + 1)]
 
 
 def _repeat(data: bytes, rng: Random) -> bytes:
@@ -64,7 +141,7 @@ def _replace_token(data: bytes, rng: Random) -> bytes:
     one, other = rng.choice(tokens), rng.choice(tokens)
     number = one[0][-1:].isdigit() and rng.random() < 0.8
     new = rng.choice(NUMBERS if number else WORDS).encode()
-    return data[:one.start()] + rng.choice((new, new, other[0])) + data[one.end():]
+    return data[: one.start()] + rng.choice((new, new, other[0])) + data[one.end() :]
 
 
 def _lines(data: bytes, rng: Random) -> bytes:
@@ -104,8 +181,21 @@ def nasty(rng: Random, kind: type) -> object:
     if rng.random() < 0.2:
         return rng.choice((None, (), [1], {}, True, b'x', 1 + 2j, '', 0, float('nan'), [[1.0]]))
     if kind is float:
-        return rng.choice((0.0, -0.0, 1e308, -1e308, 5e-324, float('inf'), float('nan'), 1e-9,
-                           89.9, rng.uniform(-10, 10), 10.0 ** rng.randrange(-320, 308)))
+        return rng.choice(
+            (
+                0.0,
+                -0.0,
+                1e308,
+                -1e308,
+                5e-324,
+                float('inf'),
+                float('nan'),
+                1e-9,
+                89.9,
+                rng.uniform(-10, 10),
+                10.0 ** rng.randrange(-320, 308),
+            )
+        )
     if kind is int:
         return rng.choice((0, -1, 1, 2**31, 2**63 - 1, 2**64, 10**30, rng.randrange(-10, 100)))
     if kind is bool:

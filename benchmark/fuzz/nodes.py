@@ -21,8 +21,16 @@ from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 
 _NUMBERS = (0.0, -0.0, 1e308, -1e308, 5e-324, 1e12, np.inf, -np.inf, np.nan, 1e-9, 1e9)
 _GOOD_EVERY = 25  # hostile inputs
-_NAMES = ('localizer', 'stereo_calibrator', 'stereo_depth', 'model_critic', 'detector',
-          'synthetic_camera', 'measured_camera', 'rectifier')
+_NAMES = (
+    'localizer',
+    'stereo_calibrator',
+    'stereo_depth',
+    'model_critic',
+    'detector',
+    'synthetic_camera',
+    'measured_camera',
+    'rectifier',
+)
 _SOLVING = ('lens:=fish214', 'svp:=true', 'patience:=0.0')
 
 
@@ -73,13 +81,23 @@ class _Node:
 
         if not rclpy.ok():
             path = folder / 'observations.csv'
-            path.write_text('frame,landmark,u,v,x,y,z\n' + ''.join(
-                f'0,{i},{10 * i},{5 * i},0,{i},1\n' for i in range(5)))
+            path.write_text(
+                'frame,landmark,u,v,x,y,z\n'
+                + ''.join(f'0,{i},{10 * i},{5 * i},0,{i},1\n' for i in range(5))
+            )
             given = [f'{node}:{text}' for node in _NAMES[:4] for text in _SOLVING]
-            given += ['synthetic_camera:lock_step:=localizer/result',
-                      f'measured_camera:observations:={path}']
-            rclpy.init(args=['--ros-args', '--log-level', 'fatal',
-                             *(word for text in given for word in ('-p', text))])
+            given += [
+                'synthetic_camera:lock_step:=localizer/result',
+                f'measured_camera:observations:={path}',
+            ]
+            rclpy.init(
+                args=[
+                    '--ros-args',
+                    '--log-level',
+                    'fatal',
+                    *(word for text in given for word in ('-p', text)),
+                ]
+            )
         self.told, self.heard, self.refused = told, heard, refused
         self.node = Unwired()
         self._executor = SingleThreadedExecutor()
@@ -105,17 +123,31 @@ def seeds() -> dict[str, list[bytes]]:
     picture = np.zeros((48, 64), np.uint8)
     files = [cv2.imencode(kind, picture)[1].tobytes() for kind in ('.png', '.jpg', '.webp')]
     made = {
-        'PointCloud2': [messages.landmarks_message(world, 7, 'world'),
-                        messages.image_points_message(seen.landmark, seen.uv, 7, 'camera')],
+        'PointCloud2': [
+            messages.landmarks_message(world, 7, 'world'),
+            messages.image_points_message(seen.landmark, seen.uv, 7, 'camera'),
+        ],
         'PoseStamped': [messages.pose_message(pose, 7, 'world')],
         'TransformStamped': [messages.transform_message(pose, 7, 'a', 'b')],
-        'DiagnosticArray': [messages.key_values_message(
-            's', {'lens': 'fish214', 'shift_scale': 0.5, 'radius': 2.0, 'scenario': 1}, 7)],
+        'DiagnosticArray': [
+            messages.key_values_message(
+                's', {'lens': 'fish214', 'shift_scale': 0.5, 'radius': 2.0, 'scenario': 1}, 7
+            )
+        ],
         'CameraInfo': [messages.camera_info_message(load_lens(lens_path('fish214')), 7, 'camera')],
-        'Image': [Image(header=messages.header(7), height=48, width=64, encoding='mono8', step=64,
-                        data=picture.tobytes())],
-        'CompressedImage': [CompressedImage(header=messages.header(7), format='png', data=data)
-                            for data in files],
+        'Image': [
+            Image(
+                header=messages.header(7),
+                height=48,
+                width=64,
+                encoding='mono8',
+                step=64,
+                data=picture.tobytes(),
+            )
+        ],
+        'CompressedImage': [
+            CompressedImage(header=messages.header(7), format='png', data=data) for data in files
+        ],
     }
     return {kind: [serialize_message(one) for one in several] for kind, several in made.items()}
 
@@ -126,11 +158,11 @@ def spoilt(data: bytes, rng: Random) -> bytes:
     if chance < 0.4 and len(data) > 60:
         place = 4 + 8 * rng.randrange((len(data) - 12) // 8)
         number = np.float64(rng.choice((*_NUMBERS, rng.uniform(-10, 10))))
-        return data[:place] + number.tobytes() + data[place + 8:]
+        return data[:place] + number.tobytes() + data[place + 8 :]
     if chance < 0.6:
         place = 4 + 4 * rng.randrange((len(data) - 8) // 4 or 1)
         number = rng.choice((0, 1, 2**31, 2**32 - 1, rng.randrange(2**32)))
-        return data[:place] + number.to_bytes(4, 'little') + data[place + 4:]
+        return data[:place] + number.to_bytes(4, 'little') + data[place + 4 :]
     return mutated(data, rng, binary=True)
 
 
@@ -142,8 +174,10 @@ def tags(rng: Random) -> bytes:
 
     values = {'lens': 'fish214', 'shift_scale': 0.5}
     names = (*values, 'radius', 'scenario', 'scenarios', 'set', 'sets', 'x')
-    values |= {rng.choice(names): str(rng.choice((*WORDS, nasty(rng, float)))).replace('\0', '')
-               for _ in range(2)}
+    values |= {
+        rng.choice(names): str(rng.choice((*WORDS, nasty(rng, float)))).replace('\0', '')
+        for _ in range(2)
+    }
     return serialize_message(messages.key_values_message('s', values, rng.randrange(5)))
 
 
@@ -205,10 +239,16 @@ class _Good:
 
         self._stamp += 1
         seen = simulate_scenario(Scenario(shift_scale=0.0)).observations
-        self._one.hear('landmarks', serialize_message(
-            messages.landmarks_message(environment('whole', 2.0), 0, 'world')))
-        self._one.hear('image_points', serialize_message(
-            messages.image_points_message(seen.landmark, seen.uv, self._stamp, 'camera')))
+        self._one.hear(
+            'landmarks',
+            serialize_message(messages.landmarks_message(environment('whole', 2.0), 0, 'world')),
+        )
+        self._one.hear(
+            'image_points',
+            serialize_message(
+                messages.image_points_message(seen.landmark, seen.uv, self._stamp, 'camera')
+            ),
+        )
         result = self._one.told['~/result']
         for _ in range(200):
             if result.latest is not None and stamp_of(result.latest) == self._stamp:

@@ -148,9 +148,11 @@ def _file(
     name: str, write: Callable[[Path], Any], read: Callable[[Path], str], binary: bool = False
 ) -> Callable[[Path], Trial]:
     """Return what makes the surface of one file, which `write` writes at first."""
+
     def make(folder: Path) -> Trial:
-        return of_files(_written(folder, name, write), lambda where: read(where / name), folder,
-                        binary)
+        return of_files(
+            _written(folder, name, write), lambda where: read(where / name), folder, binary
+        )
 
     return make
 
@@ -199,9 +201,11 @@ def _orpc(folder: Path) -> Trial:
 
 
 def _sweeps(folder: Path) -> Trial:
-    text = ('/**:\n  ros__parameters:\n    sweep.radius: [2.0, 0.3]\n    noise_px: 0.3\n'
-            'synthetic_camera:\n  ros__parameters:\n    lens: fish214\n    sweep.seed: [1, 2]\n'
-            'localizer: {ros__parameters: {svp: true, sigma_px: 0.5}}\n')
+    text = (
+        '/**:\n  ros__parameters:\n    sweep.radius: [2.0, 0.3]\n    noise_px: 0.3\n'
+        'synthetic_camera:\n  ros__parameters:\n    lens: fish214\n    sweep.seed: [1, 2]\n'
+        'localizer: {ros__parameters: {svp: true, sigma_px: 0.5}}\n'
+    )
 
     def read(folder: Path) -> str:
         plan = read_sweep(folder / 'a.yaml')
@@ -213,8 +217,13 @@ def _sweeps(folder: Path) -> Trial:
 def _boards(folder: Path) -> Trial:
     target = folder / 'target.yaml'
     text = b"target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.088\ntagSpacing: 0.3\n"
-    specs = (b'chessboard:9x6:24mm', b'charuco:7x5:30mm:22mm:DICT_5X5_100', b'squares:3x4:3cm:3cm',
-             b'circles:4x11:20mm:asymmetric', f'aprilgrid:{target}'.encode())
+    specs = (
+        b'chessboard:9x6:24mm',
+        b'charuco:7x5:30mm:22mm:DICT_5X5_100',
+        b'squares:3x4:3cm:3cm',
+        b'circles:4x11:20mm:asymmetric',
+        f'aprilgrid:{target}'.encode(),
+    )
 
     def trial(rng: Random) -> str:
         target.write_bytes(mutated(text, rng))
@@ -229,8 +238,10 @@ def _boards(folder: Path) -> Trial:
 
 def _photographs(folder: Path) -> Trial:
     image = (np.add.outer(np.arange(48), np.arange(64)) * 2 % 256).astype(np.uint8)
-    seeds = [cv2.imencode(kind, image)[1].tobytes()
-             for kind in ('.png', '.jpg', '.bmp', '.tiff', '.pgm', '.webp')]
+    seeds = [
+        cv2.imencode(kind, image)[1].tobytes()
+        for kind in ('.png', '.jpg', '.bmp', '.tiff', '.pgm', '.webp')
+    ]
 
     def trial(rng: Random) -> str:
         data = mutated(rng.choice(seeds), rng, binary=True)
@@ -241,8 +252,13 @@ def _photographs(folder: Path) -> Trial:
 
 
 def _settings(folder: Path) -> Trial:
-    tables: tuple[Any, ...] = (Scenario, SyntheticCameraSettings, SolverSettings,
-                               StereoCalibratorSettings, StereoDepthSettings)
+    tables: tuple[Any, ...] = (
+        Scenario,
+        SyntheticCameraSettings,
+        SolverSettings,
+        StereoCalibratorSettings,
+        StereoDepthSettings,
+    )
 
     def trial(rng: Random) -> str:
         table = rng.choice(tables)
@@ -250,8 +266,10 @@ def _settings(folder: Path) -> Trial:
         chosen = {row.name: row for row in rng.sample(known, rng.randrange(1, 4))}
         values = {name: _value(row.default, rng) for name, row in chosen.items()}
         if rng.random() < 0.3:
-            swept = {f'sweep.{name}': rng.choice(([value], [value, value], value, []))
-                     for name, value in values.items()}
+            swept = {
+                f'sweep.{name}': rng.choice(([value], [value, value], value, []))
+                for name, value in values.items()
+            }
             sweep = sweep_of(table, swept)
             last = sweep.point(len(sweep) - 1)
             return 'no value' if None in last.values() else ''
@@ -299,18 +317,18 @@ def _foreign(folder: Path) -> Trial:
   resolution: [752, 480]
 """,
         'ds.yaml': b'cam0: {camera_model: ds, intrinsics: [-0.2, 0.59, 158.0, 158.0, 255.0, 257.0]'
-                   b', distortion_model: none, distortion_coeffs: [], resolution: [512, 512]}\n',
+        b', distortion_model: none, distortion_coeffs: [], resolution: [512, 512]}\n',
         'fisheye.xml': b'<?xml version="1.0"?><opencv_storage><K type_id="opencv-matrix"><rows>3'
-                       b'</rows><cols>3</cols><dt>d</dt><data>300. 0. 320. 0. 301. 240. 0. 0. 1.'
-                       b'</data></K><D type_id="opencv-matrix"><rows>4</rows><cols>1</cols><dt>d'
-                       b'</dt><data>0.01 0.002 0. -0.001</data></D><image_width>640'
-                       b'</image_width><image_height>480</image_height></opencv_storage>\n',
+        b'</rows><cols>3</cols><dt>d</dt><data>300. 0. 320. 0. 301. 240. 0. 0. 1.'
+        b'</data></K><D type_id="opencv-matrix"><rows>4</rows><cols>1</cols><dt>d'
+        b'</dt><data>0.01 0.002 0. -0.001</data></D><image_width>640'
+        b'</image_width><image_height>480</image_height></opencv_storage>\n',
         'cahvore.cameramodel': b"{'lensmodel': 'LENSMODEL_CAHVORE_linearity=0.37', 'imagersize': "
-                               b"[800, 800], 'intrinsics': [300.0, 300.0, 400.0, 400.0, 0, 0, "
-                               b'0.01, -0.02, 0.003, 0.004, 0.001, 0]}',
+        b"[800, 800], 'intrinsics': [300.0, 300.0, 400.0, 400.0, 0, 0, "
+        b'0.01, -0.02, 0.003, 0.004, 0.001, 0]}',
         'boofcv.yaml': b'model: omnidirectional_universal\npinhole: {width: 640, height: 720, fx: '
-                       b'400.0, fy: 400.0, cx: 320.0, cy: 360.0}\nmirror_offset: 0.9\n'
-                       b'radial_tangential: {radial: [-0.1, 0.01], t1: 0.0, t2: 0.0}\n',
+        b'400.0, fy: 400.0, cx: 320.0, cy: 360.0}\nmirror_offset: 0.9\n'
+        b'radial_tangential: {radial: [-0.1, 0.01], t1: 0.0, t2: 0.0}\n',
     }
 
     def trial(rng: Random) -> str:
@@ -333,38 +351,93 @@ def surfaces() -> list[Surface]:
     saved = library.localize(simulate_scenario(Scenario(noise_px=0.1)).observations, lens)
     made = [
         Surface('lens YAML', _file('a.yaml', partial(save_lens, lens), _lens), 90),
-        *(Surface(f'lens, {form}', _file(
-            'a.txt', lambda p, f=form: p.write_text(write_foreign(short, f)), _lens), 40)
-          for form in WRITABLE),
+        *(
+            Surface(
+                f'lens, {form}',
+                _file('a.txt', lambda p, f=form: p.write_text(write_foreign(short, f)), _lens),
+                40,
+            )
+            for form in WRITABLE
+        ),
         Surface('lens, other models', _foreign, 40),
-        Surface('observations CSV', _file('a.csv', lambda p: write_observations(p, few),
-                                          _observations), 100),
-        Surface('poses CSV', _file('a.csv', lambda p: write_poses(
-            p, saved.frame, saved.pose), _poses), 50),
-        Surface('landmarks CSV', _file('a.csv', lambda p: p.write_text(
-            'landmark,x,y,z\n0,1,2,3\n1,0.5,2.25,-1e-3\n'), _quietly(load_landmarks)), 30),
-        Surface('environment YAML', _file(
-            'a.yaml', lambda p: p.write_bytes(config_path('environments/kita.yaml').read_bytes()),
-            _quietly(lambda path: environment('whole', 2.0, path))), 20),
+        Surface(
+            'observations CSV',
+            _file('a.csv', lambda p: write_observations(p, few), _observations),
+            100,
+        ),
+        Surface(
+            'poses CSV',
+            _file('a.csv', lambda p: write_poses(p, saved.frame, saved.pose), _poses),
+            50,
+        ),
+        Surface(
+            'landmarks CSV',
+            _file(
+                'a.csv',
+                lambda p: p.write_text('landmark,x,y,z\n0,1,2,3\n1,0.5,2.25,-1e-3\n'),
+                _quietly(load_landmarks),
+            ),
+            30,
+        ),
+        Surface(
+            'environment YAML',
+            _file(
+                'a.yaml',
+                lambda p: p.write_bytes(config_path('environments/kita.yaml').read_bytes()),
+                _quietly(lambda path: environment('whole', 2.0, path)),
+            ),
+            20,
+        ),
         Surface('ORPC, target', _orpc, 70),
         Surface('sweep file', _sweeps, 40),
         Surface('parameter tables', _settings, 150),
         Surface('boards, target YAML', _boards, 50),
         Surface('photographs', _photographs, 50),
-        *([] if missing_rclpy() else [  # which writes their messages
-            Surface('recording, table', lambda folder: _unchanged(
-                _table, {'a.mcap': _recording(folder)}, folder), 12),
-            Surface('recording, points', lambda folder: of_files(
-                {'a.mcap': _recording(folder)},
-                lambda f: table_trouble(read_observations_bag(f / 'a.mcap')), folder, True), 12)]),
-        Surface('table CSV', _file('a.csv', lambda p: write_columns(p.with_suffix(''), _COLUMNS),
-                                   _quietly(read_columns)), 50),
+        *(
+            []
+            if missing_rclpy()
+            else [  # which writes their messages
+                Surface(
+                    'recording, table',
+                    lambda folder: _unchanged(_table, {'a.mcap': _recording(folder)}, folder),
+                    12,
+                ),
+                Surface(
+                    'recording, points',
+                    lambda folder: of_files(
+                        {'a.mcap': _recording(folder)},
+                        lambda f: table_trouble(read_observations_bag(f / 'a.mcap')),
+                        folder,
+                        True,
+                    ),
+                    12,
+                ),
+            ]
+        ),
+        Surface(
+            'table CSV',
+            _file(
+                'a.csv',
+                lambda p: write_columns(p.with_suffix(''), _COLUMNS),
+                _quietly(read_columns),
+            ),
+            50,
+        ),
         Surface('parts of a sweep', _parts, 20),
         Surface('result JSON', _file('a.json', saved.save, _quietly(library.Localized.load)), 40),
     ]
     if arrow()[0] is not None:
-        made.append(Surface('table Parquet', lambda folder: _unchanged(
-            lambda path: (read_columns(path), False),
-            _written(folder, 'a.parquet', lambda p: write_columns(p.with_suffix(''), _COLUMNS)),
-            folder), 20))
+        made.append(
+            Surface(
+                'table Parquet',
+                lambda folder: _unchanged(
+                    lambda path: (read_columns(path), False),
+                    _written(
+                        folder, 'a.parquet', lambda p: write_columns(p.with_suffix(''), _COLUMNS)
+                    ),
+                    folder,
+                ),
+                20,
+            )
+        )
     return made

@@ -97,8 +97,14 @@ def fit_lens(scene: Scene, uv: Array, start: Lens) -> tuple[Lens, float]:
     """
     kept = ~scene.held[scene.frame]
     _, renumbered = np.unique(scene.frame[kept], return_inverse=True)
-    used = replace(scene, frame=renumbered, camera=scene.camera[kept], fitted=True,
-                   landmark=scene.landmark[kept], held=scene.held[~scene.held])
+    used = replace(
+        scene,
+        frame=renumbered,
+        camera=scene.camera[kept],
+        fitted=True,
+        landmark=scene.landmark[kept],
+        held=scene.held[~scene.held],
+    )
     world, uv = scene.target.points[used.landmark], uv[kept]
     centres = scene.track.centres[~scene.held]
     turns, rig, lens = scene.track.turns[~scene.held].inv(), scene.rig, start
@@ -115,11 +121,11 @@ def fit_lens(scene: Scene, uv: Array, start: Lens) -> tuple[Lens, float]:
         step = Free.of(used, lens, points).step(missing, weight)
         turn = Rotation.from_rotvec(step.poses[:, :3])
         turns, shifts = turn * turns, turn.apply(shifts) + step.poses[:, 3:]
-        lens = _moved(lens, step.common[:4 + len(lens.k)])
+        lens = _moved(lens, step.common[: 4 + len(lens.k)])
         if rig is not None:
             turn = Rotation.from_rotvec(step.common[-6:-3])
             rig = (turn * rig[0], turn.apply(rig[1]) + step.common[-3:])
-    return lens, float(np.sqrt(np.mean(norm ** 2)))
+    return lens, float(np.sqrt(np.mean(norm**2)))
 
 
 def _moved(lens: Lens, step: Array) -> Lens:

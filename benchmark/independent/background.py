@@ -33,12 +33,14 @@ def smooth(rng: Rng, length: float, dimensions: int = 2, values: int = 2) -> Fie
 
 def per_frame(scene: Scene, fields: Sequence[Field], amount: float) -> Field:
     """Return the field that is another one in every frame."""
+
     def field(uv: Array) -> Array:
         moved = np.empty_like(uv)
         for frame in range(scene.frames):
             rows = scene.frame == frame
             moved[rows] = fields[frame](uv[rows])
         return amount * moved
+
     return field
 
 
@@ -74,8 +76,9 @@ def frame_fields(rng: Rng, scene: Scene) -> Callable[[float], Departure]:
 def static_fields(rng: Rng, scene: Scene) -> Callable[[float], Departure]:
     """Each camera has a smooth image field that no radial curve holds."""
     fields = [smooth(rng, scene.lens.height * rng.uniform(0.06, 0.25)) for _ in range(2)]
-    return lambda a: Departure(field=lambda uv: a * np.where(
-        scene.camera[:, None] == 0, fields[0](uv), fields[1](uv)))
+    return lambda a: Departure(
+        field=lambda uv: a * np.where(scene.camera[:, None] == 0, fields[0](uv), fields[1](uv))
+    )
 
 
 PARTS = {'board': board_errors, 'frame': frame_fields, 'static': static_fields}

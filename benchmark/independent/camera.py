@@ -80,9 +80,9 @@ def behind_window(points: Array, thickness: float, index: float) -> tuple[Array,
     r, z = np.hypot(points[:, 0], points[:, 1]), points[:, 2]
     q = np.sin(theta)
     for _ in range(50):
-        air, glass = np.sqrt(1 - q * q), np.sqrt(index ** 2 - q * q)
+        air, glass = np.sqrt(1 - q * q), np.sqrt(index**2 - q * q)
         missing = r - (z - thickness) * q / air - thickness * q / glass
-        slope = (z - thickness) / air ** 3 + thickness * index ** 2 / glass ** 3
+        slope = (z - thickness) / air**3 + thickness * index**2 / glass**3
         q = np.clip(q + missing / slope, 0.0, 1 - 1e-9)
     return np.arcsin(q), azimuth
 
@@ -90,8 +90,9 @@ def behind_window(points: Array, thickness: float, index: float) -> tuple[Array,
 def image_points(lens: Lens, theta: Array, azimuth: Array) -> Array:
     """Return the image points (M, 2), px, of rays."""
     g = lens.unit_height(theta)
-    return np.stack([lens.cx + lens.fx * g * np.cos(azimuth),
-                     lens.cy + lens.fy * g * np.sin(azimuth)], axis=1)
+    return np.stack(
+        [lens.cx + lens.fx * g * np.cos(azimuth), lens.cy + lens.fy * g * np.sin(azimuth)], axis=1
+    )
 
 
 def project(lens: Lens, points: Array) -> Array:
@@ -145,7 +146,8 @@ def _draw_k(rng: np.random.Generator, theta_max: float) -> tuple[float, ...]:
 def draw_lens(rng: np.random.Generator, model: str, widest: float) -> Lens:
     """Return a random lens of a model, with at most `widest` rad of incidence angle."""
     width, height = [(1280, 800), (1024, 1024), (1536, 1536), (1920, 1200), (640, 480)][
-        rng.integers(5)]
+        rng.integers(5)
+    ]
     limit = {'orthographic': 1.25, 'stereographic': 1.75}.get(model, 1.85)
     while True:
         theta_max = rng.uniform(1.05, min(widest, limit))

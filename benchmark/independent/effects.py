@@ -56,18 +56,20 @@ def viewpoint_shift(rng: Rng, scene: Scene) -> Form:
 
     def shift(theta: Array) -> Array:
         safe = np.maximum(theta, 1e-6)
-        return (safe / np.sin(safe) - 1) * (1 + e1 * theta ** 2 + e2 * theta ** 4)
+        return (safe / np.sin(safe) - 1) * (1 + e1 * theta**2 + e2 * theta**4)
 
     return lambda a: Departure(
-        pupil=lambda t, _: sign * a * shift(t)[:, None] * np.array([0.0, 0.0, 1.0]))
+        pupil=lambda t, _: sign * a * shift(t)[:, None] * np.array([0.0, 0.0, 1.0])
+    )
 
 
 def radial_profile(rng: Rng, scene: Scene) -> Form:
     """h(θ) departs by a random odd polynomial without its linear term."""
     share = rng.normal(size=3) * [1, 0.7, 0.4]
     edge = scene.lens.theta_max
-    return lambda a: Departure(profile=lambda t: a * sum(
-        c * (t / edge) ** (2 * i + 3) for i, c in enumerate(share)))
+    return lambda a: Departure(
+        profile=lambda t: a * sum(c * (t / edge) ** (2 * i + 3) for i, c in enumerate(share))
+    )
 
 
 def focal_length(rng: Rng, scene: Scene) -> Form:
@@ -80,21 +82,24 @@ def principal_point(rng: Rng, scene: Scene) -> Form:
     """The axis meets the sensor elsewhere."""
     phi = rng.uniform(0, 2 * np.pi)
     return lambda a: Departure(
-        centre=np.broadcast_to(a * np.array([np.cos(phi), np.sin(phi)]), (len(scene.frame), 2)))
+        centre=np.broadcast_to(a * np.array([np.cos(phi), np.sin(phi)]), (len(scene.frame), 2))
+    )
 
 
 def aspect(rng: Rng, scene: Scene) -> Form:
     """Pixels are not square."""
     sign = rng.choice([-1, 1])
     return lambda a: Departure(
-        focal=np.tile([1 + sign * a / 2, 1 - sign * a / 2], (len(scene.frame), 1)))
+        focal=np.tile([1 + sign * a / 2, 1 - sign * a / 2], (len(scene.frame), 1))
+    )
 
 
 def skew(rng: Rng, scene: Scene) -> Form:
     """Rows and columns of the sensor are not at right angles."""
     sign, middle = rng.choice([-1, 1]), centre_of(scene)
     return lambda a: Departure(
-        field=lambda uv: sign * a * (uv[:, 1:] - middle[1]) * np.array([1.0, 0.0]))
+        field=lambda uv: sign * a * (uv[:, 1:] - middle[1]) * np.array([1.0, 0.0])
+    )
 
 
 def decentering(rng: Rng, scene: Scene) -> Form:
@@ -104,7 +109,7 @@ def decentering(rng: Rng, scene: Scene) -> Form:
 
     def field(uv: Array) -> Array:
         q = (uv - middle) / radius
-        return (q ** 2).sum(1)[:, None] * p + 2 * (q @ p)[:, None] * q
+        return (q**2).sum(1)[:, None] * p + 2 * (q @ p)[:, None] * q
 
     return lambda a: Departure(field=lambda uv: a * field(uv))
 
@@ -139,7 +144,8 @@ def focal_drift(rng: Rng, scene: Scene) -> Form:
     """The focal length follows a smooth curve in time."""
     t = _over_time(scene)
     curve = rng.normal() * t + rng.normal() * np.sin(
-        np.pi * rng.uniform(0.8, 2) * t + rng.uniform(0, 2 * np.pi))
+        np.pi * rng.uniform(0.8, 2) * t + rng.uniform(0, 2 * np.pi)
+    )
     curve = ((curve - curve.mean()) / curve.std())[scene.frame]
     return lambda a: Departure(focal=(1 + a * curve)[:, None] * np.ones(2))
 
@@ -148,8 +154,9 @@ def session_step(rng: Rng, scene: Scene) -> Form:
     """From some frame on the lens sits differently: focal length and centre have jumped."""
     after = (np.arange(scene.frames) >= scene.frames * rng.uniform(0.3, 0.7))[scene.frame]
     zoom, move = rng.normal(), rng.normal(size=2) * image_radius(scene) / 2
-    return lambda a: Departure(focal=1 + a * zoom * after[:, None] * np.ones(2),
-                               centre=a * after[:, None] * move)
+    return lambda a: Departure(
+        focal=1 + a * zoom * after[:, None] * np.ones(2), centre=a * after[:, None] * move
+    )
 
 
 def landmark_survey(rng: Rng, scene: Scene) -> Form:
@@ -172,8 +179,7 @@ def landmark_scale(rng: Rng, scene: Scene) -> Form:
         return lambda a: Departure(landmarks=a * (target.points @ along)[:, None] * along)
     which = rng.integers(2)
     along = target.axes[:, which]
-    return lambda a: Departure(
-        landmarks=a * target.half * target.local[:, which, None] * along)
+    return lambda a: Departure(landmarks=a * target.half * target.local[:, which, None] * along)
 
 
 def target_shape(rng: Rng, scene: Scene) -> Form:
@@ -185,8 +191,8 @@ def target_shape(rng: Rng, scene: Scene) -> Form:
         p = target.local[on] @ [np.cos(phi), np.sin(phi)]
         q = target.local[on] @ [-np.sin(phi), np.cos(phi)]
         bow, twist = rng.choice([-1, 1]) * rng.uniform(0.5, 1), rng.normal(0, 0.3)
-        warp = rng.normal(0, 0.25) * p ** 2 + rng.normal(0, 0.25) * q ** 2
-        height[on] = bow * p ** 2 + twist * p * q + warp * p
+        warp = rng.normal(0, 0.25) * p**2 + rng.normal(0, 0.25) * q**2
+        height[on] = bow * p**2 + twist * p * q + warp * p
     return lambda a: Departure(landmarks=a * height[:, None] * target.axes[:, 2])
 
 
@@ -241,19 +247,25 @@ def rig_flex(rng: Rng, scene: Scene) -> Form:
 
 def wrong_ids(rng: Rng, scene: Scene) -> Form:
     """Neighbours in some views exchange their names."""
+
     def swap(size: float) -> Departure:
         rows: list[tuple[int, int]] = []
         wanted = max(1, round(5 * size))
         while len(rows) < wanted:
             first = rng.integers(len(scene.frame))
-            view = np.flatnonzero((scene.frame == scene.frame[first])
-                                  & (scene.camera == scene.camera[first]))
-            away = np.linalg.norm(scene.target.points[scene.landmark[view]]
-                                  - scene.target.points[scene.landmark[first]], axis=1)
+            view = np.flatnonzero(
+                (scene.frame == scene.frame[first]) & (scene.camera == scene.camera[first])
+            )
+            away = np.linalg.norm(
+                scene.target.points[scene.landmark[view]]
+                - scene.target.points[scene.landmark[first]],
+                axis=1,
+            )
             second = view[np.argsort(away)[rng.integers(1, 4)]]
             if not {int(first), int(second)} & {row for pair in rows for row in pair}:
                 rows.append((int(first), int(second)))
         return Departure(swaps=np.array(rows))
+
     return swap
 
 
@@ -263,7 +275,7 @@ def noise_vs_angle(rng: Rng, scene: Scene) -> Form:
     axis = scene.track.turns[scene.frame].apply([0, 0, 1])
     cosine = np.einsum('ij,ij->i', points, axis) / np.linalg.norm(points, axis=1)
     growth = np.arccos(cosine.clip(-1, 1)) ** rng.uniform(2, 4)
-    growth = growth / np.sqrt(np.mean(growth ** 2))
+    growth = growth / np.sqrt(np.mean(growth**2))
     return lambda size: Departure(spread=1 + size * growth)
 
 
@@ -290,12 +302,10 @@ EFFECTS: dict[str, Effect] = {
     'landmark_scale': Effect('target', '1', 0.03, landmark_scale),
     'target_shape': Effect('target', 'm', 0.02, target_shape, kinds=BOARDS),
     'board_pose': Effect('target', 'm', 0.02, board_pose, kinds=('cube',)),
-    'dot_centroid': Effect('target or frame', '1', 0.45, dot_centroid, kinds=BOARDS,
-                           power=2.0),
+    'dot_centroid': Effect('target or frame', '1', 0.45, dot_centroid, kinds=BOARDS, power=2.0),
     'detector_bias': Effect('lens or noise', 'px', 0.14, detector_bias),
     'rolling_shutter': Effect('frame', 's', 0.05, rolling_shutter, moving=True),
-    'stereo_time_offset': Effect('frame', 's', 0.05, stereo_time_offset, stereo=True,
-                                 moving=True),
+    'stereo_time_offset': Effect('frame', 's', 0.05, stereo_time_offset, stereo=True, moving=True),
     'rig_flex': Effect('frame', 'rad', 0.03, rig_flex, stereo=True),
     'wrong_ids': Effect('noise', 'pairs', 5, wrong_ids, direct=True),
     'quantisation': Effect('noise', 'px', 1.0, quantisation, direct=True),

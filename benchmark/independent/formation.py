@@ -55,8 +55,7 @@ def form(scene: Scene, departures: Sequence[Departure]) -> Array:
     """Return the image points (M, 2), px, without noise."""
     radius = max((d.dot for d in departures), default=0.0)
     world = scene.target.points[scene.landmark]
-    world = world + sum(d.landmarks[scene.landmark] for d in departures
-                        if d.landmarks is not None)
+    world = world + sum(d.landmarks[scene.landmark] for d in departures if d.landmarks is not None)
     uv = _dots(scene, world, radius, departures) if radius else _points(scene, world, departures)
     for departure in departures:
         if departure.lock is not None:
@@ -101,9 +100,16 @@ def _lens(scene: Scene, points: Array, departures: Sequence[Departure]) -> Array
 def _dots(scene: Scene, world: Array, radius: float, departures: Sequence[Departure]) -> Array:
     """Return the centroids of the images of dots in the planes of their boards."""
     axes = scene.target.axes[scene.landmark]
-    rim = np.stack([
-        _points(scene, world + radius * (np.cos(a) * axes[:, 0] + np.sin(a) * axes[:, 1]),
-                departures) for a in RIM])
+    rim = np.stack(
+        [
+            _points(
+                scene,
+                world + radius * (np.cos(a) * axes[:, 0] + np.sin(a) * axes[:, 1]),
+                departures,
+            )
+            for a in RIM
+        ]
+    )
     start = rim.mean(0)
     a, b = rim - start, np.roll(rim, -1, axis=0) - start
     cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
@@ -140,5 +146,7 @@ def observed(
     for d in departures:
         if d.swaps is not None:
             landmark[d.swaps[:, 0]], landmark[d.swaps[:, 1]] = (
-                landmark[d.swaps[:, 1]], landmark[d.swaps[:, 0]])
+                landmark[d.swaps[:, 1]],
+                landmark[d.swaps[:, 0]],
+            )
     return uv, replace(scene, landmark=landmark)

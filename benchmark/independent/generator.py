@@ -22,9 +22,14 @@ Rng = np.random.Generator
 CATALOGUE = {**EFFECTS, **OUTSIDE}
 SIZES = (1.0, 0.5, 0.2)
 # Pairs of which nobody could say which of the two it is.
-ALIKE = ({'viewpoint_shift', 'flat_port'}, {'focal_length', 'radial_profile'},
-         {'focal_drift', 'session_step'}, {'noise_vs_angle', 'quantisation'},
-         {'detector_bias', 'quantisation'}, {'rolling_shutter', 'stereo_time_offset'})
+ALIKE = (
+    {'viewpoint_shift', 'flat_port'},
+    {'focal_length', 'radial_profile'},
+    {'focal_drift', 'session_step'},
+    {'noise_vs_angle', 'quantisation'},
+    {'detector_bias', 'quantisation'},
+    {'rolling_shutter', 'stereo_time_offset'},
+)
 
 
 class Hidden(NamedTuple):
@@ -61,10 +66,15 @@ def plan(mode: str, seed: int, index: int) -> tuple[tuple[str, float], ...]:
         return ((first, sizes[(turn + place) % len(sizes)]),)
     if mode != 'two':
         raise ValueError(f'mode {mode!r}; known are one, two, clean, outside')
-    others = [name for name in names if name != first and {first, name} not in ALIKE
-              and _both(EFFECTS[first], EFFECTS[name])]
-    return tuple((name, float(rng.choice([1.0, 0.5])))
-                 for name in (first, others[rng.integers(len(others))]))
+    others = [
+        name
+        for name in names
+        if name != first and {first, name} not in ALIKE and _both(EFFECTS[first], EFFECTS[name])
+    ]
+    return tuple(
+        (name, float(rng.choice([1.0, 0.5])))
+        for name in (first, others[rng.integers(len(others))])
+    )
 
 
 def _both(a: Effect, b: Effect) -> bool:
@@ -117,8 +127,9 @@ def _scene(rng: Rng, effects: list[Effect]) -> Scene | None:
         models = [model for model in HEIGHTS if model != 'kannala_brandt']
     lens = draw_lens(rng, str(rng.choice(models)), min([e.widest for e in effects], default=2.0))
     noise = float(np.exp(rng.uniform(np.log(0.05), np.log(0.5))))
-    return draw_scene(rng, lens, str(rng.choice(kinds)), fitted=fitted, stereo=stereo,
-                      moving=moving, noise=noise)
+    return draw_scene(
+        rng, lens, str(rng.choice(kinds)), fitted=fitted, stereo=stereo, moving=moving, noise=noise
+    )
 
 
 def _hide(
@@ -131,9 +142,9 @@ def _hide(
     effect = CATALOGUE[name]
     draw = effect.draw(rng, scene)
     if name == 'quantisation':
-        steps = [step for step in STEPS if 0.05 <= step / (12 ** 0.5 * size) <= 0.5]
+        steps = [step for step in STEPS if 0.05 <= step / (12**0.5 * size) <= 0.5]
         step = float(rng.choice(steps))
-        return replace(scene, noise=step / (12 ** 0.5 * size)), step, draw(step)
+        return replace(scene, noise=step / (12**0.5 * size)), step, draw(step)
     if effect.direct:
         departure = draw(size)
         return scene, size if departure.swaps is None else len(departure.swaps), departure
@@ -149,7 +160,11 @@ def _hide(
 
 
 def _observe(
-    rng: Rng, scene: Scene, free: Free, hidden: tuple[Hidden, ...], departures: list[Departure],
+    rng: Rng,
+    scene: Scene,
+    free: Free,
+    hidden: tuple[Hidden, ...],
+    departures: list[Departure],
     size: float,
 ) -> BlindSet:
     background = draw_background(rng, scene, size, free)
@@ -178,9 +193,13 @@ def _table(blind: BlindSet, rows: Array) -> str:
     lines = [','.join(head + ['board'] * boards + ['camera'] * rig)]
     for i in np.flatnonzero(rows):
         frame, landmark = scene.frame[i], scene.landmark[i]
-        words = [str(frame), str(landmark), *(f'{value:.5f}' for value in blind.uv[i]),
-                 *(f'{value:.7f}' for value in target.points[landmark]),
-                 f'{scene.track.times[frame]:.6f}']
+        words = [
+            str(frame),
+            str(landmark),
+            *(f'{value:.5f}' for value in blind.uv[i]),
+            *(f'{value:.7f}' for value in target.points[landmark]),
+            f'{scene.track.times[frame]:.6f}',
+        ]
         words += [str(target.board[landmark])] * boards
         words += [('left', 'right')[scene.camera[i]]] * rig
         lines.append(','.join(words))
@@ -194,25 +213,38 @@ def _lens_document(blind: BlindSet) -> dict[str, Any]:
     projection |= {'cx': lens.cx, 'cy': lens.cy}
     if lens.k:
         projection['k'] = list(lens.k)
-    document = {'name': 'camera', 'image': {'width': lens.width, 'height': lens.height},
-                'projection': projection,
-                'max_incidence_deg': round(float(np.degrees(lens.theta_max)), 3)}
+    document = {
+        'name': 'camera',
+        'image': {'width': lens.width, 'height': lens.height},
+        'projection': projection,
+        'max_incidence_deg': round(float(np.degrees(lens.theta_max)), 3),
+    }
     if blind.scene.fitted:
         kept = ~blind.scene.held
         document['calibration'] = {
-            'rms_px': blind.rms_px, 'observations': int(kept[blind.scene.frame].sum()),
-            'frames': int(kept.sum()), 'source': 'observations.csv'}
+            'rms_px': blind.rms_px,
+            'observations': int(kept[blind.scene.frame].sum()),
+            'frames': int(kept.sum()),
+            'source': 'observations.csv',
+        }
     return document
 
 
 def _truth(blind: BlindSet) -> dict[str, Any]:
     scene = blind.scene
     return {
-        'hidden': [{**h._asdict(), 'stage': CATALOGUE[h.effect].stage,
-                    'unit': CATALOGUE[h.effect].unit} for h in blind.hidden],
+        'hidden': [
+            {**h._asdict(), 'stage': CATALOGUE[h.effect].stage, 'unit': CATALOGUE[h.effect].unit}
+            for h in blind.hidden
+        ],
         'background': {'outliers': blind.background.outliers, **blind.background.parts},
-        'noise_px': scene.noise, 'target': scene.target.kind, 'model': scene.lens.model,
-        'fitted': scene.fitted, 'stereo': scene.rig is not None, 'moving': scene.track.moving,
-        'frames': scene.frames, 'observations': len(scene.frame),
+        'noise_px': scene.noise,
+        'target': scene.target.kind,
+        'model': scene.lens.model,
+        'fitted': scene.fitted,
+        'stereo': scene.rig is not None,
+        'moving': scene.track.moving,
+        'frames': scene.frames,
+        'observations': len(scene.frame),
         'theta_max_deg': float(np.degrees(scene.lens.theta_max)),
     }

@@ -29,7 +29,7 @@ def dent(rng: Rng, scene: Scene) -> Form:
 
     def field(uv: Array) -> Array:
         arm = (uv - place) / width
-        return sign * arm * np.exp(-0.5 * (arm ** 2).sum(1))[:, None]
+        return sign * arm * np.exp(-0.5 * (arm**2).sum(1))[:, None]
 
     return lambda a: Departure(field=lambda uv: a * field(uv))
 
@@ -63,7 +63,8 @@ def trefoil(rng: Rng, scene: Scene) -> Form:
 def heavy_tails(rng: Rng, scene: Scene) -> Form:
     """Noise after Student with 3 degrees of freedom, of the same standard deviation."""
     return lambda size: Departure(
-        noise=lambda r, count: r.standard_t(3, size=(count, 2)) / np.sqrt(3))
+        noise=lambda r, count: r.standard_t(3, size=(count, 2)) / np.sqrt(3)
+    )
 
 
 def blurred_frames(rng: Rng, scene: Scene) -> Form:

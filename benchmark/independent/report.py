@@ -35,8 +35,7 @@ def write_reports(docs: Path, name: str, table: Mapping[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     lines = ',\n'.join(json.dumps(score) for score in table['scores'])
     head = json.dumps({key: value for key, value in table.items() if key != 'scores'})
-    (folder / f'independent_{name}.json').write_text(
-        f'{head[:-1]}, "scores": [\n{lines}\n]}}\n')
+    (folder / f'independent_{name}.json').write_text(f'{head[:-1]}, "scores": [\n{lines}\n]}}\n')
     tables = [json.loads(path.read_text()) for path in sorted(folder.glob('independent_*.json'))]
     (docs / 'blind_independent.md').write_text(page(tables))
 
@@ -45,18 +44,23 @@ def page(tables: Sequence[Mapping[str, Any]]) -> str:
     """Return the Markdown page of all tables."""
     parts = [INTRODUCTION]
     by_mode: dict[str, dict[float, list[Mapping[str, Any]]]] = defaultdict(
-        lambda: defaultdict(list))
+        lambda: defaultdict(list)
+    )
     for table in tables:
         by_mode[table['mode']][table['background']] += table['scores']
     for mode, title, section in (
-        ('one', 'One hidden effect', _one), ('two', 'Two hidden effects', _two),
-        ('clean', 'Nothing hidden', _clean), ('outside', 'Outside the catalog', _outside),
+        ('one', 'One hidden effect', _one),
+        ('two', 'Two hidden effects', _two),
+        ('clean', 'Nothing hidden', _clean),
+        ('outside', 'Outside the catalog', _outside),
     ):
         if mode in by_mode:
             commands = '\n'.join(
                 f'    python -m benchmark.independent --trials {t["trials"]} --seed {t["seed"]} '
                 f'--background {t["background"]:g} --mode {mode} -o DIR'
-                for t in tables if t['mode'] == mode)
+                for t in tables
+                if t['mode'] == mode
+            )
             parts.append(f'## {title}\n\n{commands}\n\n' + section(by_mode[mode]))
     return '\n'.join(parts)
 
@@ -68,8 +72,9 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 def _rate(hits: Iterable[object]) -> str:
     values = [bool(hit) for hit in hits]
-    return f'{100 * sum(values) / len(values):.0f} % ({sum(values)}/{len(values)})' \
-        if values else '-'
+    return (
+        f'{100 * sum(values) / len(values):.0f} % ({sum(values)}/{len(values)})' if values else '-'
+    )
 
 
 def _verdicts(scores: Scores) -> str:
@@ -83,30 +88,55 @@ def _one(runs: Mapping[float, Scores]) -> str:
         for size in sorted({s['hidden'][0]['size'] for s in scores}, reverse=True):
             some = [s for s in scores if s['hidden'][0]['size'] == size]
             stages = [s['stage_right'][0] for s in some if s['stage_right'] and not background]
-            rows.append((f'{background:g}', f'{size:g}', _rate(s['found'][0] for s in some),
-                         _rate(s['exactly'][0] for s in some), _rate(s['false'] for s in some),
-                         _rate(stages), _verdicts(some)))
+            rows.append(
+                (
+                    f'{background:g}',
+                    f'{size:g}',
+                    _rate(s['found'][0] for s in some),
+                    _rate(s['exactly'][0] for s in some),
+                    _rate(s['false'] for s in some),
+                    _rate(stages),
+                    _verdicts(some),
+                )
+            )
             for s in some:
                 cells[s['hidden'][0]['effect'], background].append(s)
     backgrounds = sorted(runs)
     effects = sorted({effect for effect, _ in cells})
-    named = [(f'`{effect}`', *(_by_size(cells[effect, b]) for b in backgrounds))
-             for effect in effects]
-    return '\n'.join([
-        _table(('background', 'size', 'its class is named', 'itself', 'another effect named too',
-                'stage right', 'verdicts'), rows),
-        'By effect and background: named at size 1, 0.5, 0.2.\n',
-        _table(('effect', *(f'background {b:g}' for b in backgrounds)), named),
-        'Hidden effect (rows) and the first one named (columns); its confounded set counts as '
-        'itself.\n', _confusion([s for scores in runs.values() for s in scores])])
+    named = [
+        (f'`{effect}`', *(_by_size(cells[effect, b]) for b in backgrounds)) for effect in effects
+    ]
+    return '\n'.join(
+        [
+            _table(
+                (
+                    'background',
+                    'size',
+                    'its class is named',
+                    'itself',
+                    'another effect named too',
+                    'stage right',
+                    'verdicts',
+                ),
+                rows,
+            ),
+            'By effect and background: named at size 1, 0.5, 0.2.\n',
+            _table(('effect', *(f'background {b:g}' for b in backgrounds)), named),
+            'Hidden effect (rows) and the first one named (columns); its confounded set counts as '
+            'itself.\n',
+            _confusion([s for scores in runs.values() for s in scores]),
+        ]
+    )
 
 
 def _by_size(scores: Scores) -> str:
     found: dict[float, list[bool]] = defaultdict(list)
     for score in scores:
         found[score['hidden'][0]['size']].append(score['found'][0])
-    return ', '.join(f'{sum(found[size])}/{len(found[size])}' if size in found else '-'
-                     for size in (1.0, 0.5, 0.2))
+    return ', '.join(
+        f'{sum(found[size])}/{len(found[size])}' if size in found else '-'
+        for size in (1.0, 0.5, 0.2)
+    )
 
 
 def _confusion(scores: Scores) -> str:
@@ -117,26 +147,55 @@ def _confusion(scores: Scores) -> str:
         counts[true][true if score['said'] and true in score['classes'][0] else first] += 1
     columns = sorted(counts)
     others = sorted({name for row in counts.values() for name in row} - set(columns) - {'nothing'})
-    return _table(('hidden', 'itself', 'nothing', 'another'), [
-        (f'`{true}`', row[true], row['nothing'], ', '.join(
-            f'`{name}` {row[name]}' for name in columns + others
-            if name != true and row[name])) for true, row in sorted(counts.items())])
+    return _table(
+        ('hidden', 'itself', 'nothing', 'another'),
+        [
+            (
+                f'`{true}`',
+                row[true],
+                row['nothing'],
+                ', '.join(
+                    f'`{name}` {row[name]}'
+                    for name in columns + others
+                    if name != true and row[name]
+                ),
+            )
+            for true, row in sorted(counts.items())
+        ],
+    )
 
 
 def _two(runs: Mapping[float, Scores]) -> str:
     rows = []
     for background, scores in sorted(runs.items()):
-        rows.append((f'{background:g}', _rate(all(s['found']) for s in scores),
-                     _rate(f for s in scores for f in s['found']),
-                     _rate(s['false'] for s in scores), _verdicts(scores)))
-    return _table(('background', 'both are named', 'each is named', 'another effect named too',
-                   'verdicts'), rows)
+        rows.append(
+            (
+                f'{background:g}',
+                _rate(all(s['found']) for s in scores),
+                _rate(f for s in scores for f in s['found']),
+                _rate(s['false'] for s in scores),
+                _verdicts(scores),
+            )
+        )
+    return _table(
+        ('background', 'both are named', 'each is named', 'another effect named too', 'verdicts'),
+        rows,
+    )
 
 
 def _clean(runs: Mapping[float, Scores]) -> str:
-    return _table(('background', 'no name', 'false names', 'verdicts'), [
-        (f'{background:g}', _rate(not s['said'] for s in scores), _names(scores),
-         _verdicts(scores)) for background, scores in sorted(runs.items())])
+    return _table(
+        ('background', 'no name', 'false names', 'verdicts'),
+        [
+            (
+                f'{background:g}',
+                _rate(not s['said'] for s in scores),
+                _names(scores),
+                _verdicts(scores),
+            )
+            for background, scores in sorted(runs.items())
+        ],
+    )
 
 
 def _names(scores: Scores) -> str:
@@ -148,17 +207,25 @@ def _outside(runs: Mapping[float, Scores]) -> str:
     rows = []
     for background, scores in sorted(runs.items()):
         keys: list[tuple[str, float]] = sorted(
-            {(s['hidden'][0]['effect'], -s['hidden'][0]['size']) for s in scores})
+            {(s['hidden'][0]['effect'], -s['hidden'][0]['size']) for s in scores}
+        )
         for effect, size in keys:
-            some = [s for s in scores if s['hidden'][0]['effect'] == effect
-                    and s['hidden'][0]['size'] == -size]
+            some = [
+                s
+                for s in scores
+                if s['hidden'][0]['effect'] == effect and s['hidden'][0]['size'] == -size
+            ]
             rows.append((f'{background:g}', effect, f'{-size:g}', *_line(some, background)))
         rows.append((f'{background:g}', 'all', '', *_line(scores, background)))
-    return _table(('background', 'what', 'size', 'no name', 'names', 'stage right', 'verdicts'),
-                  rows)
+    return _table(
+        ('background', 'what', 'size', 'no name', 'names', 'stage right', 'verdicts'), rows
+    )
 
 
 def _line(scores: Scores, background: float) -> tuple[str, ...]:
-    return (_rate(not s['said'] for s in scores), _names(scores),
-            '-' if background else _rate(hit for s in scores for hit in s['stage_right']),
-            _verdicts(scores))
+    return (
+        _rate(not s['said'] for s in scores),
+        _names(scores),
+        '-' if background else _rate(hit for s in scores for hit in s['stage_right']),
+        _verdicts(scores),
+    )

@@ -46,8 +46,11 @@ def trial(run: Run, index: int, folder: Path) -> dict[str, Any]:
     place = folder / run.name / f'{index:04d}'
     given, truth, said = place / 'given', place / 'truth.json', place / 'said.json'
     if not said.exists():
-        write(generate(run.seed, index, plan(run.mode, run.seed, index), run.background),
-              given, truth)
+        write(
+            generate(run.seed, index, plan(run.mode, run.seed, index), run.background),
+            given,
+            truth,
+        )
         answer = diagnose(given, place / 'out')
         fresh = said.with_suffix('.new')
         fresh.write_text(json.dumps(answer))
@@ -58,14 +61,29 @@ def trial(run: Run, index: int, folder: Path) -> dict[str, Any]:
 def diagnose(given: Path, output: Path) -> dict[str, Any]:
     """Return diagnosis.json of the command line with its wall time; `failed` says why not."""
     program = Path(sys.executable).with_name('fisheye-svp')
-    command = [str(program) if program.exists() else shutil.which('fisheye-svp') or 'fisheye-svp',
-               'diagnose', 'observations.csv', '--lens', 'lens.yaml', '--held-out', 'held_out.csv',
-               '-o', str(output.resolve())]
+    command = [
+        str(program) if program.exists() else shutil.which('fisheye-svp') or 'fisheye-svp',
+        'diagnose',
+        'observations.csv',
+        '--lens',
+        'lens.yaml',
+        '--held-out',
+        'held_out.csv',
+        '-o',
+        str(output.resolve()),
+    ]
     threads = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
     begun = time.monotonic()
     try:
-        done = subprocess.run(command, cwd=given, env=os.environ | threads, timeout=LIMIT,
-                              capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            command,
+            cwd=given,
+            env=os.environ | threads,
+            timeout=LIMIT,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
     except subprocess.TimeoutExpired:
         return {'failed': f'nothing after {LIMIT:g} s', 'seconds': LIMIT}
     seconds = time.monotonic() - begun
@@ -80,15 +98,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog='python -m benchmark.independent', description=__doc__)
     parser.add_argument('--trials', type=int, default=69)
     parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--background', type=float, nargs='+', default=[0.0, 0.5, 1.0],
-                        help='rms of the background, in noise levels')
+    parser.add_argument(
+        '--background',
+        type=float,
+        nargs='+',
+        default=[0.0, 0.5, 1.0],
+        help='rms of the background, in noise levels',
+    )
     parser.add_argument('--mode', nargs='+', choices=MODES, default=list(MODES))
     parser.add_argument('--docs', type=Path, default=Path('docs/results'))
-    parser.add_argument('-o', '--output', type=Path, required=True,
-                        help='folder of the sets and of what was said about them')
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=Path,
+        required=True,
+        help='folder of the sets and of what was said about them',
+    )
     args = parser.parse_args()
-    runs = [Run(mode, args.seed, size, args.trials)
-            for mode in args.mode for size in args.background]
+    runs = [
+        Run(mode, args.seed, size, args.trials) for mode in args.mode for size in args.background
+    ]
     for run in runs:
         with ThreadPoolExecutor(2) as pool:
             jobs = [pool.submit(trial, run, i, args.output) for i in range(run.trials)]

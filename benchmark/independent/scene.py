@@ -44,8 +44,10 @@ class Track:
         if not self.moving or not np.any(delay):
             return self.centres[frame], self.turns[frame]
         when = self.times[frame] + delay
-        return (CubicSpline(self.times, self.centres)(when),
-                RotationSpline(self.times, self.turns)(when))
+        return (
+            CubicSpline(self.times, self.centres)(when),
+            RotationSpline(self.times, self.turns)(when),
+        )
 
 
 @dataclass(frozen=True)
@@ -69,9 +71,7 @@ class Scene:
         return len(self.held)
 
 
-def in_camera(
-    scene: Scene, points: Array, delay: Array, flex: Array | None = None
-) -> Array:
+def in_camera(scene: Scene, points: Array, delay: Array, flex: Array | None = None) -> Array:
     """Return points (M, 3) of the world in the frames of the cameras that observe them.
 
     `flex` (F, 6) turns (rad) and moves (m) the right camera in each frame.
@@ -96,8 +96,15 @@ def draw_board(rng: np.random.Generator) -> Target:
     plane = (local - local.mean(0)) * spacing
     half = float(plane.max())
     count = len(local)
-    return Target('board', np.c_[plane, np.zeros(count)], np.zeros(count, np.int64),
-                  np.broadcast_to(np.eye(3), (count, 3, 3)), plane / half, spacing, half)
+    return Target(
+        'board',
+        np.c_[plane, np.zeros(count)],
+        np.zeros(count, np.int64),
+        np.broadcast_to(np.eye(3), (count, 3, 3)),
+        plane / half,
+        spacing,
+        half,
+    )
 
 
 def draw_cube(rng: np.random.Generator) -> Target:
@@ -118,9 +125,15 @@ def draw_cube(rng: np.random.Generator) -> Target:
         points.append(centre + half * local @ frame[:2])
         axes.append(np.broadcast_to(frame, (len(local), 3, 3)))
     board = np.repeat(np.arange(len(into)), len(local))
-    return Target('inner cube' if inside else 'outer cube', np.concatenate(points), board,
-                  np.concatenate(axes), np.tile(local / 0.8, (len(into), 1)),
-                  1.6 * half / (n - 1), half)
+    return Target(
+        'inner cube' if inside else 'outer cube',
+        np.concatenate(points),
+        board,
+        np.concatenate(axes),
+        np.tile(local / 0.8, (len(into), 1)),
+        1.6 * half / (n - 1),
+        half,
+    )
 
 
 def draw_world(rng: np.random.Generator) -> Target:
@@ -129,15 +142,23 @@ def draw_world(rng: np.random.Generator) -> Target:
     towards = rng.normal(size=(count, 3))
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     points = np.round(towards * np.exp(rng.uniform(np.log(0.5), np.log(3), count))[:, None], 4)
-    return Target('world', points, np.full(count, -1), np.broadcast_to(np.eye(3), (count, 3, 3)),
-                  np.zeros((count, 2)), 0.3, 1.0)
+    return Target(
+        'world',
+        points,
+        np.full(count, -1),
+        np.broadcast_to(np.eye(3), (count, 3, 3)),
+        np.zeros((count, 2)),
+        0.3,
+        1.0,
+    )
 
 
 TARGETS = {'board': draw_board, 'cube': draw_cube, 'world': draw_world}
 
 
-def _view(rng: np.random.Generator, target: Target, lens: Lens, calm: float
-          ) -> tuple[Array, Rotation]:
+def _view(
+    rng: np.random.Generator, target: Target, lens: Lens, calm: float
+) -> tuple[Array, Rotation]:
     """Return one random camera centre and rotation to world that sees the target."""
     half = target.half
     if target.kind == 'board':
@@ -163,11 +184,14 @@ def _view(rng: np.random.Generator, target: Target, lens: Lens, calm: float
     return centre, aim * Rotation.from_rotvec([*off, 0]) * roll
 
 
-def draw_track(rng: np.random.Generator, target: Target, lens: Lens, frames: int, moving: bool
-               ) -> Track:
+def draw_track(
+    rng: np.random.Generator, target: Target, lens: Lens, frames: int, moving: bool
+) -> Track:
     """Return stills seconds apart, or a video along smooth curves, every fifth frame at random."""
-    views = [_view(rng, target, lens, 0.15 if moving else 1.0)
-             for _ in range(frames if not moving else frames // 5 + 3)]
+    views = [
+        _view(rng, target, lens, 0.15 if moving else 1.0)
+        for _ in range(frames if not moving else frames // 5 + 3)
+    ]
     centres = np.array([centre for centre, _ in views])
     turns = Rotation.concatenate([turn for _, turn in views])
     if not moving:
@@ -175,8 +199,9 @@ def draw_track(rng: np.random.Generator, target: Target, lens: Lens, frames: int
         return Track(times, centres, turns, moving)
     knots = np.arange(len(views)) * rng.uniform(0.8, 1.6)
     times = np.linspace(0.3 * knots[1], knots[-1] - 0.3 * knots[1], frames)
-    return Track(times, CubicSpline(knots, centres)(times), RotationSpline(knots, turns)(times),
-                 moving)
+    return Track(
+        times, CubicSpline(knots, centres)(times), RotationSpline(knots, turns)(times), moving
+    )
 
 
 def visible(lens: Lens, local: Array, facing: Array) -> NDArray[np.bool_]:
@@ -189,7 +214,13 @@ def visible(lens: Lens, local: Array, facing: Array) -> NDArray[np.bool_]:
 
 
 def draw_scene(
-    rng: np.random.Generator, lens: Lens, kind: str, *, fitted: bool, stereo: bool, moving: bool,
+    rng: np.random.Generator,
+    lens: Lens,
+    kind: str,
+    *,
+    fitted: bool,
+    stereo: bool,
+    moving: bool,
     noise: float,
 ) -> Scene | None:
     """Return a scene of 12 to 40 frames and a third more, held out; None if little is seen."""
@@ -224,5 +255,15 @@ def _keep_seen(rng: np.random.Generator, scene: Scene, seen: NDArray[np.bool_]) 
     new, track = np.cumsum(good) - 1, scene.track
     kept = Track(track.times[good], track.centres[good], track.turns[good], track.moving)
     held = np.arange(count) % 4 == rng.integers(4)
-    return Scene(scene.lens, scene.fitted, scene.noise, scene.target, kept, scene.rig, held,
-                 new[scene.frame[seen]], scene.camera[seen], scene.landmark[seen])
+    return Scene(
+        scene.lens,
+        scene.fitted,
+        scene.noise,
+        scene.target,
+        kept,
+        scene.rig,
+        held,
+        new[scene.frame[seen]],
+        scene.camera[seen],
+        scene.landmark[seen],
+    )

@@ -20,32 +20,54 @@ def score(truth: Mapping[str, Any], said: Mapping[str, Any]) -> dict[str, Any]:
     hidden = [h['effect'] for h in truth['hidden']]
     causes = said.get('causes', [])
     classes = [named_by(cause) for cause in causes]
-    components = [c for c in said.get('components', []) if c.get('stage') != 'noise'
-                  and (c.get('p_value') is None or c['p_value'] < LEVEL)]
+    components = [
+        c
+        for c in said.get('components', [])
+        if c.get('stage') != 'noise' and (c.get('p_value') is None or c['p_value'] < LEVEL)
+    ]
     strength: dict[str, float] = {}
     for component in components:
         stage = component['stage']
         strength[stage] = strength.get(stage, 0.0) + component['sd_px'] ** 2
     return {
-        'hidden': [{key: h[key] for key in ('effect', 'size', 'amount', 'stage')}
-                   for h in truth['hidden']],
+        'hidden': [
+            {key: h[key] for key in ('effect', 'size', 'amount', 'stage')} for h in truth['hidden']
+        ],
         'said': [cause['effect'] for cause in causes],
         'classes': [sorted(members) for members in classes],
         'p_values': [cause.get('p_value') for cause in causes],
         'found': [any(name in members for members in classes) for name in hidden],
         'exactly': [name in {cause['effect'] for cause in causes} for name in hidden],
-        'false': [cause['effect'] for cause, members in zip(causes, classes, strict=True)
-                  if not members & set(hidden)],
+        'false': [
+            cause['effect']
+            for cause, members in zip(causes, classes, strict=True)
+            if not members & set(hidden)
+        ],
         'verdict': said.get('verdict', 'failed'),
         'stages': strength,
         'stage_right': [stage_right(h['stage'], strength) for h in truth['hidden']]
-        if 'components' in said else [],
-        'rms': {key: (said.get(key) or {}).get('heldout_rms_px')
-                for key in ('base', 'named', 'lens', 'extended')},
-        'set': {key: truth[key] for key in (
-            'noise_px', 'target', 'model', 'fitted', 'stereo', 'moving', 'frames',
-            'observations', 'background')},
-        'noise_px': said.get('noise_px'), 'failed': said.get('failed'),
+        if 'components' in said
+        else [],
+        'rms': {
+            key: (said.get(key) or {}).get('heldout_rms_px')
+            for key in ('base', 'named', 'lens', 'extended')
+        },
+        'set': {
+            key: truth[key]
+            for key in (
+                'noise_px',
+                'target',
+                'model',
+                'fitted',
+                'stereo',
+                'moving',
+                'frames',
+                'observations',
+                'background',
+            )
+        },
+        'noise_px': said.get('noise_px'),
+        'failed': said.get('failed'),
         'seconds': round(said['seconds'], 1),
     }
 

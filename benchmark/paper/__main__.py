@@ -45,8 +45,9 @@ def search(executor: Executor) -> dict[str, Any]:
     best = best_of(found)
     documents = [lens_document(lens, best, STARTS) for lens in lenses]
     with progress('calibrating rigs from many sets of poses'):
-        ranges = executor.map(calibration_range, map(lens_from_dict, documents),
-                              [whole_directions(best)] * 2)
+        ranges = executor.map(
+            calibration_range, map(lens_from_dict, documents), [whole_directions(best)] * 2
+        )
         family = family_document(found, dict(zip(LENSES, ranges, strict=True)))
     return {
         **{f'lenses/{name}.yaml': one for name, one in zip(LENSES, documents, strict=True)},
@@ -65,8 +66,9 @@ def main() -> None:
     """Run one study and write its files."""
     parser = argparse.ArgumentParser(prog='python -m benchmark.paper', description=__doc__)
     parser.add_argument('study', choices=('search', 'stopping'))
-    parser.add_argument('-o', '--output', type=Path, default=Path('config'), metavar='DIR',
-                        help='default: config')
+    parser.add_argument(
+        '-o', '--output', type=Path, default=Path('config'), metavar='DIR', help='default: config'
+    )
     args = parser.parse_args()
     with process_pool(os.cpu_count() or 1) as workers:
         files = {'search': search, 'stopping': stopping}[args.study](workers.executor)

@@ -28,7 +28,9 @@ _SCALE = np.array([100.0, 1e-3, 1e-2, 1e-2, 1e-2])  # px and m for one unit of a
 _LARGEST_F = np.array([3.20, 4.11])  # the circular fields must fit the images
 _COUNT = INNER + OUTER
 _GROUPS: tuple[Index, ...] = (
-    np.arange(_COUNT), np.arange(INNER), np.arange(INNER, _COUNT),
+    np.arange(_COUNT),
+    np.arange(INNER),
+    np.arange(INNER, _COUNT),
 )
 # Inner stays inside, Outer outside 64 degrees; past 88 the shift would push it out of Fish180.
 _LIMITS = np.radians([[0.0, 62.0]] * INNER + [[66.0, 88.0]] * OUTER)
@@ -70,10 +72,10 @@ def recover(lenses: tuple[Lens, Lens], seed: int, iterations: int = ITERATIONS) 
         fit, (np.concatenate([layout_start, lens_start.ravel()])[None],), iterations
     )
     x = solved.state[0][0]
-    numbers = x[2 * _COUNT:].reshape(2, -1)
+    numbers = x[2 * _COUNT :].reshape(2, -1)
     numbers[:, 0] = np.minimum(numbers[:, 0], _LARGEST_F)
     tables, misfit = fit.tables_and_misfit(x)
-    flat = x[:2 * _COUNT].reshape(_COUNT, 2)
+    flat = x[: 2 * _COUNT].reshape(_COUNT, 2)
     layout = np.stack([np.hypot(*flat.T), np.arctan2(flat[:, 1], flat[:, 0])], axis=-1)
     return Recovered(seed, layout, numbers * _SCALE, misfit, float(solved.cost[0]), tables)
 
@@ -109,13 +111,18 @@ class _TableFit:
         cost = float(residual @ residual)
         if not np.isfinite(cost):
             return np.array([np.inf]), (np.eye(len(x))[None], np.zeros((1, len(x))))
-        jacobian = np.concatenate([
-            self._cell_columns(x, tables, localized),
-            np.stack([
-                (self._priors(x + step) - self._priors(x)) / _STEP
-                for step in _STEP * np.eye(len(x))
-            ], axis=1),
-        ])
+        jacobian = np.concatenate(
+            [
+                self._cell_columns(x, tables, localized),
+                np.stack(
+                    [
+                        (self._priors(x + step) - self._priors(x)) / _STEP
+                        for step in _STEP * np.eye(len(x))
+                    ],
+                    axis=1,
+                ),
+            ]
+        )
         return np.array([cost]), ((jacobian.T @ jacobian)[None], (jacobian.T @ residual)[None])
 
     def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
@@ -129,8 +136,8 @@ class _TableFit:
 
     def _tables(self, x: Array) -> tuple[Array, list[list[LocalizedSpread]]]:
         """Return tables (2, 3, 3, 5) and what was localized, by lens and spread."""
-        directions = _directions(x[:2 * _COUNT].reshape(1, _COUNT, 2))
-        numbers = x[2 * _COUNT:].reshape(2, -1)
+        directions = _directions(x[: 2 * _COUNT].reshape(1, _COUNT, 2))
+        numbers = x[2 * _COUNT :].reshape(2, -1)
         localized = [
             [_at_all_radii(self._lens(k, numbers[k]), directions[:, group]) for group in _GROUPS]
             for k in range(2)
@@ -141,12 +148,12 @@ class _TableFit:
         self, x: Array, tables: Array, localized: list[list[LocalizedSpread]]
     ) -> Array:
         """Differentiate the whitened misfits (90, 76), each solve starting from its neighbour."""
-        moved = x[:2 * _COUNT] + _STEP * np.eye(2 * _COUNT)
+        moved = x[: 2 * _COUNT] + _STEP * np.eye(2 * _COUNT)
         moved_directions = _directions(moved.reshape(-1, _COUNT, 2))
-        directions = _directions(x[:2 * _COUNT].reshape(1, _COUNT, 2))
+        directions = _directions(x[: 2 * _COUNT].reshape(1, _COUNT, 2))
         change = np.zeros((len(x), *tables.shape))
         for k in range(2):
-            numbers = x[2 * _COUNT:].reshape(2, -1)[k]
+            numbers = x[2 * _COUNT :].reshape(2, -1)[k]
             lens = self._lens(k, numbers)
             for spread, group in enumerate(_GROUPS):
                 start = localized[k][spread].solved.pose
@@ -155,8 +162,9 @@ class _TableFit:
                 change[own, k, :, spread] = there.reshape(len(own), len(RADII), -1)
                 change[own, k, :, spread] -= tables[k, :, spread]
                 for i, step in enumerate(_STEP * np.eye(len(NAMES))):
-                    other = _at_all_radii(self._lens(k, numbers + step), directions[:, group],
-                                          start)
+                    other = _at_all_radii(
+                        self._lens(k, numbers + step), directions[:, group], start
+                    )
                     row = 2 * _COUNT + k * len(NAMES) + i
                     change[row, k, :, spread] = other.rows - tables[k, :, spread]
         columns: Array = (change / _sigma() / _STEP).reshape(len(x), -1).T
@@ -167,15 +175,17 @@ class _TableFit:
         return whitened
 
     def _priors(self, x: Array) -> Array:
-        layout, numbers = x[:2 * _COUNT], x[2 * _COUNT:].reshape(2, -1)
+        layout, numbers = x[: 2 * _COUNT], x[2 * _COUNT :].reshape(2, -1)
         angle = np.hypot(*layout.reshape(_COUNT, 2).T)
         over = np.maximum(angle - _LIMITS[:, 1], 0) + np.minimum(angle - _LIMITS[:, 0], 0)
-        return np.concatenate([
-            (layout - self._rings) / _IRREGULAR,
-            ((numbers - START) / _LENS_SIGMA).ravel(),
-            over / _WALL,
-            np.maximum(numbers[:, 0] - _LARGEST_F, 0) / _F_WALL,
-        ])
+        return np.concatenate(
+            [
+                (layout - self._rings) / _IRREGULAR,
+                ((numbers - START) / _LENS_SIGMA).ravel(),
+                over / _WALL,
+                np.maximum(numbers[:, 0] - _LARGEST_F, 0) / _F_WALL,
+            ]
+        )
 
 
 def _sigma() -> Array:
@@ -192,7 +202,8 @@ def _sigma() -> Array:
 def _at_all_radii(lens: Lens, directions: Array, start: Pose | None = None) -> LocalizedSpread:
     """Localize among layouts (B, N, 3) at the three radii, B * 3 environments."""
     points = (np.array(RADII)[:, None, None] * directions[:, None]).reshape(
-        -1, *directions.shape[1:])
+        -1, *directions.shape[1:]
+    )
     if start is not None:
         start = start.broadcast_to(len(directions), *start.shape).reshape(-1)
     return localize_environments(lens, points, start=start)
@@ -205,13 +216,16 @@ def _rings(rng: np.random.Generator) -> Array:
     chosen = counts[rng.integers(len(counts))]
     angles[0] = 8.0 if chosen[0] > 1 else 0.0
     offsets = rng.uniform(size=len(angles))
-    polar = np.array([
-        (np.radians(angle), 2 * np.pi * (i + offset) / count)
-        for angle, count, offset in zip(angles, chosen, offsets, strict=True)
-        for i in range(count)
-    ])
-    return np.stack([polar[:, 0] * np.cos(polar[:, 1]), polar[:, 0] * np.sin(polar[:, 1])],
-                    axis=-1).ravel()
+    polar = np.array(
+        [
+            (np.radians(angle), 2 * np.pi * (i + offset) / count)
+            for angle, count, offset in zip(angles, chosen, offsets, strict=True)
+            for i in range(count)
+        ]
+    )
+    return np.stack(
+        [polar[:, 0] * np.cos(polar[:, 1]), polar[:, 0] * np.sin(polar[:, 1])], axis=-1
+    ).ravel()
 
 
 def _directions(flat: Array) -> Array:

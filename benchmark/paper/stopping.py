@@ -59,8 +59,9 @@ def stopping_document(executor: Executor) -> dict[str, Any]:
         'gains_px2': list(GAINS),
         'median_off_z': {
             name: off.reshape(-1, off.shape[-1]).tolist()
-            for name, off in zip(LENSES, executor.map(stopped_early, localized, lenses),
-                                 strict=True)
+            for name, off in zip(
+                LENSES, executor.map(stopped_early, localized, lenses), strict=True
+            )
         },
     }
 

@@ -56,8 +56,14 @@ def layout_document(best: Recovered, starts: int) -> dict[str, Any]:
 def whole_directions(best: Recovered) -> Array:
     """Return the unit directions (33, 3), world, of the layout as `layout_document` rounds it."""
     incidence, azimuth = np.radians(np.degrees(best.layout).round(2)).T
-    return np.stack([np.sin(incidence) * np.cos(azimuth), np.sin(incidence) * np.sin(azimuth),
-                     -np.cos(incidence)], axis=-1)
+    return np.stack(
+        [
+            np.sin(incidence) * np.cos(azimuth),
+            np.sin(incidence) * np.sin(azimuth),
+            -np.cos(incidence),
+        ],
+        axis=-1,
+    )
 
 
 def family_document(

@@ -78,8 +78,10 @@ def _settle(watch: Watch, victims: dict[str, Victim]) -> None:
     before: list[dict[str, int]] = []
     for _ in range(60):
         watch.until(victims, lambda: False, 2.5)
-        now = [{k: n for k, n in v.counts.items() if ': read' in k or 'sets: w' in k}
-               for v in victims.values()]
+        now = [
+            {k: n for k, n in v.counts.items() if ': read' in k or 'sets: w' in k}
+            for v in victims.values()
+        ]
         if now == before:
             return
         before = now
@@ -91,8 +93,9 @@ def judged(victim: Victim, exactly: bool) -> list[str]:
     if counts.get('internal errors'):
         faults.append(f'{counts["internal errors"]} internal errors')
     for topic in victim.topics:
-        got, read, bad = (counts.get(f'{topic}: {what}', 0)
-                          for what in ('received', 'read', 'dropped'))
+        got, read, bad = (
+            counts.get(f'{topic}: {what}', 0) for what in ('received', 'read', 'dropped')
+        )
         came = victim.sent[topic] - victim.lost[topic]
         if got > came or (exactly and got != came):
             faults.append(f'{topic}: {came} sent, {got} received')
@@ -122,29 +125,64 @@ def row(victim: Victim, answers_well: str) -> list[object]:
     counts = victim.counts
     unusable = '' if victim.name == 'detector' else victim.unusable.total()
     dropped = victim.received('dropped')
-    sets = [counts.get(f'sets: {end}', '')
-            for end in ('taken', 'solved', 'not solved', 'dropped', 'incomplete')]
-    return [victim.name, victim.hostile.total(), victim.sent.total(), victim.lost.total(),
-            victim.received(), victim.received('read'), unusable, dropped, *sets,
-            counts.get('internal errors', ''), f'{grown(victim):.0f}', answers_well]
+    sets = [
+        counts.get(f'sets: {end}', '')
+        for end in ('taken', 'solved', 'not solved', 'dropped', 'incomplete')
+    ]
+    return [
+        victim.name,
+        victim.hostile.total(),
+        victim.sent.total(),
+        victim.lost.total(),
+        victim.received(),
+        victim.received('read'),
+        unusable,
+        dropped,
+        *sets,
+        counts.get('internal errors', ''),
+        f'{grown(victim):.0f}',
+        answers_well,
+    ]
 
 
 def section(rounds: list[list[list[object]]], total: int, how: str) -> str:
     """Return the section of docs/results/reliability.md."""
-    counted, flooded = (study.table(
-        'node | hostile | sent | lost by the sender | received | read | unusable | dropped '
-        '| sets taken | solved | not solved | sets dropped | incomplete | internal errors '
-        '| memory grown MB | answers', rows, numbers=True) for rows in rounds)
-    return '\n'.join([f'`{how}`: {total} hostile messages.', '', 'All counted:', '', *counted,
-                      '', 'Flooded, as nodes are by default:', '', *flooded])
+    counted, flooded = (
+        study.table(
+            'node | hostile | sent | lost by the sender | received | read | unusable | dropped '
+            '| sets taken | solved | not solved | sets dropped | incomplete | internal errors '
+            '| memory grown MB | answers',
+            rows,
+            numbers=True,
+        )
+        for rows in rounds
+    )
+    return '\n'.join(
+        [
+            f'`{how}`: {total} hostile messages.',
+            '',
+            'All counted:',
+            '',
+            *counted,
+            '',
+            'Flooded, as nodes are by default:',
+            '',
+            *flooded,
+        ]
+    )
 
 
 def main() -> int:
     """Attack, write the section; return 1 where anything is at fault."""
     parser = study.parser(
-        'soak', __doc__, None, workers=False, messages=(1_000_000, 'hostile ones'),
+        'soak',
+        __doc__,
+        None,
+        workers=False,
+        messages=(1_000_000, 'hostile ones'),
         flood=(0.2, 'share of the second round'),
-        no_docs=(False, 'leave docs/results/reliability.md alone'))
+        no_docs=(False, 'leave docs/results/reliability.md alone'),
+    )
     parser.add_argument('--nodes', nargs='*', choices=KINDS, default=[*KINDS])
     asked = parser.parse_args()
     flood = round(asked.flood * asked.messages)

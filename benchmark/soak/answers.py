@@ -22,6 +22,7 @@ _FIGURES = {'stereo_depth': ('error3_m', 0.05)}
 
 def wrong(victim: Victim, watch: Watch, victims: dict[str, Victim]) -> str:
     """Say what is wrong with a node's answer to what is good; empty for nothing."""
+
     def until(condition: Callable[[], bool]) -> bool:
         return watch.until(victims, condition, _LONG)
 

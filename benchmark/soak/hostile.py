@@ -68,7 +68,8 @@ def is_usable(topic: str, kind: Any, data: bytes) -> bool:
     """Say whether the decoder of a topic takes a message."""
     last = topic.rpartition('/')[2]
     decode = {
-        'landmarks': decoding.read_landmarks, 'image_points': decoding.read_image_points,
+        'landmarks': decoding.read_landmarks,
+        'image_points': decoding.read_image_points,
         'true_pose': decoding.read_pose,
     }.get(last, decoding.read_key_values)
     unread = Unread(topic, kind, data, decode, Count())
@@ -85,18 +86,33 @@ def good_sets(cameras: Sequence[str], count: int, first: int) -> Iterator[tuple[
     world = environment('whole', 2.0)
     for stamp in range(first, first + count):
         place = np.random.default_rng(stamp).uniform(-0.1, 0.1, 3)
-        scenario = Scenario(style=style, shift_scale=0.0, noise_px=NOISE, seed=stamp % 1000,
-                            poses=(*place.tolist(), 1.0, 0.0, 0.0, 0.0))
+        scenario = Scenario(
+            style=style,
+            shift_scale=0.0,
+            noise_px=NOISE,
+            seed=stamp % 1000,
+            poses=(*place.tolist(), 1.0, 0.0, 0.0, 0.0),
+        )
         found = simulate_scenario(scenario)
-        told = [('landmarks', messages.landmarks_message(world, 0, 'world')),
-                ('scenario', messages.key_values_message(
-                    'scenario', {'lens': 'fish214', 'shift_scale': 0.0, 'x': first}, stamp))]
+        told = [
+            ('landmarks', messages.landmarks_message(world, 0, 'world')),
+            (
+                'scenario',
+                messages.key_values_message(
+                    'scenario', {'lens': 'fish214', 'shift_scale': 0.0, 'x': first}, stamp
+                ),
+            ),
+        ]
         for number, camera in enumerate(cameras):
             seen = found.observations.take(found.observations.camera == number)
             pose = found.poses[number].take(0)
-            told += [(f'{camera}true_pose', messages.pose_message(pose, stamp, 'world')),
-                     (f'{camera}image_points', messages.image_points_message(
-                         seen.landmark, seen.uv, stamp, 'camera'))]
+            told += [
+                (f'{camera}true_pose', messages.pose_message(pose, stamp, 'world')),
+                (
+                    f'{camera}image_points',
+                    messages.image_points_message(seen.landmark, seen.uv, stamp, 'camera'),
+                ),
+            ]
         yield stamp, [(topic, serialize_message(message)) for topic, message in told]
 
 

@@ -48,8 +48,9 @@ KINDS = {
     'stereo_calibrator': Kind(_STEREO),
     'stereo_depth': Kind(_STEREO),
     'model_critic': Kind(('',), arguments=('every_frames:=5000', 'max_frames:=20')),
-    'detector': Kind((), {'image': Image, 'image/compressed': CompressedImage},
-                     (f'board:={hostile.BOARD}',)),
+    'detector': Kind(
+        (), {'image': Image, 'image/compressed': CompressedImage}, (f'board:={hostile.BOARD}',)
+    ),
     'synthetic_camera': Kind((), _CAMERA, ('lock_step:=answer',)),
     'measured_camera': Kind((), _CAMERA, ('lock_step:=answer', 'observations:={observations}')),
 }
@@ -97,8 +98,10 @@ class Victim:
         self._wire = wire
         self._start(folder, exactly)
         rng = Random(f'pool {name}')
-        self._pools = {topic: hostile.pool(topic, kind, _POOL, rng, self._sends(kind))
-                       for topic, kind in self.topics.items()}
+        self._pools = {
+            topic: hostile.pool(topic, kind, _POOL, rng, self._sends(kind))
+            for topic, kind in self.topics.items()
+        }
         self._writers = {topic: self._writer(topic, kind) for topic, kind in self.topics.items()}
         # A detector looks at images where somebody wants to know what is in them.
         self._listener = self.hear_topic('image_points', PointCloud2)
@@ -106,8 +109,12 @@ class Victim:
 
     def _start(self, folder: Path, exactly: bool) -> None:
         observations = folder / 'observations.csv'
-        observations.write_text('frame,landmark,u,v,x,y,z\n' + ''.join(
-            f'{frame},{i},{10 * i},{5 * i},0,{i},1\n' for frame in range(3) for i in range(5)))
+        observations.write_text(
+            'frame,landmark,u,v,x,y,z\n'
+            + ''.join(
+                f'{frame},{i},{10 * i},{5 * i},0,{i},1\n' for frame in range(3) for i in range(5)
+            )
+        )
         given = [word.format(observations=observations) for word in self._kind.arguments]
         if exactly:
             given += [*_SOLVING] if self._kind.cameras else []
@@ -118,7 +125,10 @@ class Victim:
         with self._log.open('ab') as log:
             self._process = subprocess.Popen(
                 [*study.node_command(self.name, *given), '-r', f'__ns:={self._space}'],
-                stdout=log, stderr=log, env={**os.environ, 'OMP_NUM_THREADS': '1'})
+                stdout=log,
+                stderr=log,
+                env={**os.environ, 'OMP_NUM_THREADS': '1'},
+            )
 
     def _writer(self, topic: str, kind: Any) -> Any:
         return self._wire.node.create_publisher(kind, f'{self._space}/{topic}', _ALL)
@@ -145,8 +155,9 @@ class Victim:
 
     def trouble(self) -> str:
         """Return why the node is not up."""
-        deaf = [topic for topic, writer in self._writers.items()
-                if not writer.get_subscription_count()]
+        deaf = [
+            topic for topic, writer in self._writers.items() if not writer.get_subscription_count()
+        ]
         return f'{self.name}: {deaf} {self._log.read_text(errors="replace")[-500:]}'
 
     def good(self, count: int) -> list[tuple[int, hostile.Told]]:
@@ -179,8 +190,9 @@ class Victim:
 
     def hear(self, values: dict[str, str]) -> None:
         """Take in what the node counts."""
-        self.counts = {key: int(value) for key, value in values.items()
-                       if value.lstrip('-').isdigit()}
+        self.counts = {
+            key: int(value) for key, value in values.items() if value.lstrip('-').isdigit()
+        }
 
     def received(self, what: str = 'received') -> int:
         """Return how many messages the node says that it has received, or read."""
@@ -198,8 +210,11 @@ class Victim:
         """Note the memory of the node and its children, MB."""
         with suppress(psutil.Error):  # it may be dead
             node = psutil.Process(self._process.pid)
-            self.memory.append(sum(one.memory_info().rss / 2**20 for one in (
-                node, *node.children(recursive=True))))
+            self.memory.append(
+                sum(
+                    one.memory_info().rss / 2**20 for one in (node, *node.children(recursive=True))
+                )
+            )
 
     def end(self) -> str:
         """End the node; return what it said of internal errors."""
@@ -210,7 +225,7 @@ class Victim:
         except subprocess.TimeoutExpired:
             self._process.kill()
         text = self._log.read_text(errors='replace')
-        return text[text.index('Traceback'):][:3000] if 'Traceback' in text else ''
+        return text[text.index('Traceback') :][:3000] if 'Traceback' in text else ''
 
 
 def _publish(publisher: Any, data: bytes) -> bool:

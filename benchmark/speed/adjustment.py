@@ -65,8 +65,11 @@ def moved(pose: Pose, change: Array) -> tuple[Pose, Array]:
 
 
 def minimise(
-    residuals: Callable[[Array], Array], jacobian: Callable[[Array], Array], size: int,
-    tolerance: float, exact: bool = False,
+    residuals: Callable[[Array], Array],
+    jacobian: Callable[[Array], Array],
+    size: int,
+    tolerance: float,
+    exact: bool = False,
 ) -> Array:
     """Return the solution (size,) of scipy.optimize.least_squares (MINPACK's lm) from 0.
 
@@ -74,8 +77,13 @@ def minimise(
     tell poses less than some 1e-10 m apart.
     """
     x: Array = least_squares(
-        residuals, np.zeros(size), jacobian, method='lm',
-        xtol=tolerance, ftol=tolerance, gtol=tolerance,
+        residuals,
+        np.zeros(size),
+        jacobian,
+        method='lm',
+        xtol=tolerance,
+        ftol=tolerance,
+        gtol=tolerance,
     ).x
     return x - np.linalg.lstsq(jacobian(x), residuals(x), rcond=None)[0] if exact else x
 

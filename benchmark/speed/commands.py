@@ -64,8 +64,11 @@ def tables() -> list[Table]:
             met = ('yes' if seconds <= limit else 'no') if text else ''
             rows.append((work.name, number(seconds), text, met))
             before = seconds
-    absent = [path.name for path in (*(_SHARED / one for one in _CORNERS), _PHOTOGRAPHS)
-              if not path.is_dir()]
+    absent = [
+        path.name
+        for path in (*(_SHARED / one for one in _CORNERS), _PHOTOGRAPHS)
+        if not path.is_dir()
+    ]
     notes = [f'{", ".join(absent)}: not there, and not measured.'] if absent else []
     return [Table('Commands', ('command', 'time, s', 'goal, s', 'met'), rows, _TEXT, notes)]
 
@@ -94,19 +97,31 @@ def _measured_corners(folder: Path, name: str) -> Iterator[_Work]:
     train, test = (_SHARED / name / f'{part}.csv' for part in ('train', 'test'))
     options = '--model kannala_brandt --image-size 1280x800'
     line = f'calibrate {train} -o {name}.yaml {options}'
-    yield _Work(f'{_shown(line)}, {name}, until the lens is printed',
-                lambda: _seconds_until(line, folder, _THERE), 1)
+    yield _Work(
+        f'{_shown(line)}, {name}, until the lens is printed',
+        lambda: _seconds_until(line, folder, _THERE),
+        1,
+    )
     yield _command(folder, line, f', {name}', 2)
-    yield _Work(f'`fsvp.calibrate` with threads of BLAS, {name}', lambda: _seconds(
-        [sys.executable, '-c', _IN_A_SCRIPT, str(train)], folder), times=1.2)
-    yield _command(folder, f'diagnose {train} --lens {name}.yaml --held-out {test} -o diagnosis',
-                   f', {name}', 10)
+    yield _Work(
+        f'`fsvp.calibrate` with threads of BLAS, {name}',
+        lambda: _seconds([sys.executable, '-c', _IN_A_SCRIPT, str(train)], folder),
+        times=1.2,
+    )
+    yield _command(
+        folder,
+        f'diagnose {train} --lens {name}.yaml --held-out {test} -o diagnosis',
+        f', {name}',
+        10,
+    )
 
 
 def _simulated_corners(folder: Path) -> Iterator[_Work]:
     """Yield diagnoses of more points, and of a rig."""
     for what, frames, landmarks, cameras, goal in (
-            ('20 000 points', 20, 1024, 1, 30.0), ('2 cameras of 29 views', 29, 64, 2, 10.0)):
+        ('20 000 points', 20, 1024, 1, 30.0),
+        ('2 cameras of 29 views', 29, 64, 2, 10.0),
+    ):
         table, names = on_board(frames, landmarks, cameras)
         path = folder / f'simulated{cameras}.csv'
         write_observations(path, table)
@@ -122,20 +137,30 @@ def _photographs(folder: Path) -> Iterator[_Work]:
     for path in _PHOTOGRAPHS.glob('*.jpg'):
         cv2.imwrite(str(negatives / path.name), 255 - cv2.imread(str(path)))
     for where, board, what, times, code in (
-            (_PHOTOGRAPHS, _BOARD, '', None, 0),
-            (negatives, _BOARD, ', in negatives', 1.5, 0),
-            (_PHOTOGRAPHS, _BOARD, '', None, 0),
-            (_PHOTOGRAPHS, _OTHER_BOARD, ', which is not there', 2, 2)):
+        (_PHOTOGRAPHS, _BOARD, '', None, 0),
+        (negatives, _BOARD, ', in negatives', 1.5, 0),
+        (_PHOTOGRAPHS, _BOARD, '', None, 0),
+        (_PHOTOGRAPHS, _OTHER_BOARD, ', which is not there', 2, 2),
+    ):
         yield _command(
-            folder, f'detect {where} --board {board} -o corners.csv', what, None, times, code)
+            folder, f'detect {where} --board {board} -o corners.csv', what, None, times, code
+        )
 
 
 def _command(
-    folder: Path, line: str, what: str = '', goal: float | None = None,
-    times: float | None = None, code: int = 0,
+    folder: Path,
+    line: str,
+    what: str = '',
+    goal: float | None = None,
+    times: float | None = None,
+    code: int = 0,
 ) -> _Work:
-    return _Work(f'{_shown(line)}{what}',
-                 lambda: _seconds([*_COMMAND, *line.split()], folder, code), goal, times)
+    return _Work(
+        f'{_shown(line)}{what}',
+        lambda: _seconds([*_COMMAND, *line.split()], folder, code),
+        goal,
+        times,
+    )
 
 
 def _shown(line: str) -> str:
@@ -153,7 +178,8 @@ def _seconds(command: Sequence[str], folder: Path, code: int = 0) -> float:
     """Return how long a command takes; raise CalledProcessError for another exit code."""
     start = time.perf_counter()
     run = subprocess.run(
-        command, check=False, cwd=folder, env=all_cores(), stdout=subprocess.DEVNULL)
+        command, check=False, cwd=folder, env=all_cores(), stdout=subprocess.DEVNULL
+    )
     if run.returncode != code:
         raise subprocess.CalledProcessError(run.returncode, command)
     return time.perf_counter() - start
@@ -163,8 +189,13 @@ def _seconds_until(line: str, folder: Path, text: bytes) -> float:
     """Return how long a command takes until it prints a text to a terminal."""
     terminal, end = pty.openpty()
     start, seen = time.perf_counter(), b''
-    with subprocess.Popen([*_COMMAND, *line.split()], cwd=folder, env=all_cores(), stderr=end,
-                          stdout=subprocess.DEVNULL) as process:
+    with subprocess.Popen(
+        [*_COMMAND, *line.split()],
+        cwd=folder,
+        env=all_cores(),
+        stderr=end,
+        stdout=subprocess.DEVNULL,
+    ) as process:
         os.close(end)
         while text not in seen:
             seen += os.read(terminal, 4096)

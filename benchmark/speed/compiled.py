@@ -36,7 +36,7 @@ class Kernel:
         self._project = getattr(library, f'project_{end}')
         self._linearise = getattr(library, f'linearise_{end}')
         k = np.zeros(4)
-        k[:len(lens.image_height.coefficients)] = lens.image_height.coefficients
+        k[: len(lens.image_height.coefficients)] = lens.image_height.coefficients
         shift = lens.viewpoint_shift.coefficients if lens.viewpoint_shift else np.zeros(4)
         self._lens = np.array([lens.fx, lens.fy, lens.cx, lens.cy, *k, *shift])
 
@@ -86,8 +86,15 @@ class MrcalCore:
 
 
 # -Ofast by its parts: a library linked with it makes the whole process flush subnormal numbers.
-_OFAST = ('-O3', '-fno-math-errno', '-fno-trapping-math', '-ffinite-math-only',
-          '-fno-signed-zeros', '-fassociative-math', '-freciprocal-math')
+_OFAST = (
+    '-O3',
+    '-fno-math-errno',
+    '-fno-trapping-math',
+    '-ffinite-math-only',
+    '-fno-signed-zeros',
+    '-fassociative-math',
+    '-freciprocal-math',
+)
 
 
 @cache
@@ -118,7 +125,9 @@ def mrcal_revision() -> str:
         )
     run = subprocess.run(
         ['git', f'--git-dir={MRCAL}/.git', 'rev-parse', '--short', 'HEAD'],
-        capture_output=True, text=True, check=False,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     return run.stdout.strip() or 'unknown'
 
@@ -130,8 +139,17 @@ def _compile(
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / f'{name}.so'
         for fast in _FAST:
-            line = [command, *flags, *fast, '-shared', '-fPIC', *map(str, sources), '-o',
-                    str(library), '-lm']
+            line = [
+                command,
+                *flags,
+                *fast,
+                '-shared',
+                '-fPIC',
+                *map(str, sources),
+                '-o',
+                str(library),
+                '-lm',
+            ]
             run = subprocess.run(line, capture_output=True, text=True, check=False)
             if run.returncode == 0:
                 return ctypes.CDLL(str(library))

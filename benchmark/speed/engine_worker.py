@@ -14,6 +14,12 @@ job = work_of(sys.argv[1], int(sys.argv[2]))
 for _ in sys.stdin:
     wall, processor = time.perf_counter(), time.process_time()
     job()
-    print(json.dumps({
-        'wall': time.perf_counter() - wall, 'processor': time.process_time() - processor,
-    }), flush=True)
+    print(
+        json.dumps(
+            {
+                'wall': time.perf_counter() - wall,
+                'processor': time.process_time() - processor,
+            }
+        ),
+        flush=True,
+    )

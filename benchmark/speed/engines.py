@@ -21,9 +21,7 @@ def name_of(engine: str) -> str:
     return f'{OURS}, {engine}'
 
 
-def sides(
-    run: Callable[[], Any], way: str = '', **keywords: Any
-) -> dict[str, Callable[[], Side]]:
+def sides(run: Callable[[], Any], way: str = '', **keywords: Any) -> dict[str, Callable[[], Side]]:
     """Return makers of one side an engine; way: what sets the sides apart from other ones."""
     return {
         name_of(engine) + way: partial(_side, engine, way, run, keywords) for engine in engines()
@@ -31,13 +29,25 @@ def sides(
 
 
 def row(
-    title: str, unit: tuple[str, float], makers: dict[str, Callable[[], Side]], repeats: int,
-    goals: Sequence[tuple[str, str, float]] = (), error_unit: str = 'm', text: str = '',
+    title: str,
+    unit: tuple[str, float],
+    makers: dict[str, Callable[[], Side]],
+    repeats: int,
+    goals: Sequence[tuple[str, str, float]] = (),
+    error_unit: str = 'm',
+    text: str = '',
 ) -> Row:
     """Measure the sides of a row; unit: its name and size, s; goals: engine, peer and ratio."""
     sides, left_out = available(makers)
-    return Row(title, *unit, measure(sides, repeats), error_unit, left_out,
-               [Goal(name_of(engine), peer, ratio) for engine, peer, ratio in goals], text)
+    return Row(
+        title,
+        *unit,
+        measure(sides, repeats),
+        error_unit,
+        left_out,
+        [Goal(name_of(engine), peer, ratio) for engine, peer, ratio in goals],
+        text,
+    )
 
 
 def _side(engine: str, way: str, run: Callable[[], Any], keywords: dict[str, Any]) -> Side:

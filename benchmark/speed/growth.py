@@ -62,7 +62,9 @@ def line(growth: Growth, repeats: int) -> tuple[str, ...]:
     seconds = [timing.median for timing in timings]
     memory = [_peak(run) for run in runs.values()]
     return (
-        growth.work, growth.what, ' '.join(map(str, growth.sizes)),
+        growth.work,
+        growth.what,
+        ' '.join(map(str, growth.sizes)),
         ' '.join(number(1e3 * value) for value in seconds),
         f'{exponent(growth.sizes, seconds):.2f}',
         ' '.join(number(value / 1e6) for value in memory),
@@ -79,10 +81,18 @@ def growths() -> list[Growth]:
         Growth('stereo calibration', 'views', (10, 40, 160), _stereo),
         Growth('null model and tests, 30 frames', 'effects', (5, 10, 20), _evidence),
         Growth('diagnosis, 33 landmarks', 'frames', (20, 40, 80, 160, 320), _diagnosis),
-        Growth('diagnosis, 10 frames of a board', 'landmarks', (32, 64, 128, 256, 512),
-               lambda count: _of_board(count, 1)),
-        Growth('diagnosis, 10 frames of a board, 32 landmarks', 'cameras', (1, 2, 4, 8, 16),
-               lambda count: _of_board(32, count)),
+        Growth(
+            'diagnosis, 10 frames of a board',
+            'landmarks',
+            (32, 64, 128, 256, 512),
+            lambda count: _of_board(count, 1),
+        ),
+        Growth(
+            'diagnosis, 10 frames of a board, 32 landmarks',
+            'cameras',
+            (1, 2, 4, 8, 16),
+            lambda count: _of_board(32, count),
+        ),
     ]
 
 

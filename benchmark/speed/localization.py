@@ -34,9 +34,18 @@ def rows(many: int = 10_000, looped: int = 100, repeats: int = 7) -> list[Row]:
     svp, shift = svp_lens(), shift_lens()
     return [
         _one(localization(svp, looped), repeats),
-        _many('SVP Kannala-Brandt', localization(svp, many), looped, repeats, [
-            ('numpy', 'poselib', 1.3), ('numpy', 'GTSAM', 15.0), ('numba', 'poselib', 4.0),
-            ('numba', 'GTSAM', 40.0)]),
+        _many(
+            'SVP Kannala-Brandt',
+            localization(svp, many),
+            looped,
+            repeats,
+            [
+                ('numpy', 'poselib', 1.3),
+                ('numpy', 'GTSAM', 15.0),
+                ('numba', 'poselib', 4.0),
+                ('numba', 'GTSAM', 40.0),
+            ],
+        ),
         _many('ShiftVP', localization(shift, many), looped, repeats, []),
     ]
 
@@ -47,15 +56,22 @@ def _one(scene: Scene, repeats: int) -> Row:
     starts = [scene.start.take([i]) for i in range(len(views))]
 
     def ours() -> Array:
-        return np.concatenate([
-            localize(model, view, start).pose.position
-            for view, start in zip(views, starts, strict=True)
-        ])
+        return np.concatenate(
+            [
+                localize(model, view, start).pose.position
+                for view, start in zip(views, starts, strict=True)
+            ]
+        )
 
     makers = engines.sides(ours, work=len(views), error=_off(truth))
     makers |= _peers(scene, len(views), truth)
-    return engines.row('One localization at a time, SVP Kannala-Brandt', _UNIT, makers, repeats,
-                       [('numba', 'poselib', 2.5)])
+    return engines.row(
+        'One localization at a time, SVP Kannala-Brandt',
+        _UNIT,
+        makers,
+        repeats,
+        [('numba', 'poselib', 2.5)],
+    )
 
 
 def _many(
@@ -94,14 +110,18 @@ def _peers(scene: Scene, looped: int, truth: Array) -> dict[str, Callable[[], Si
 
 def _exact_positions(scene: Scene) -> Array:
     views = [exact_view(scene.lens, scene.landmarks, uv) for uv in scene.views.uv[:_CHECKED]]
-    return np.stack([
-        scipy_pose(view, scene.start.take(i), _EXACT, exact=True).position
-        for i, view in enumerate(views)
-    ])
+    return np.stack(
+        [
+            scipy_pose(view, scene.start.take(i), _EXACT, exact=True).position
+            for i, view in enumerate(views)
+        ]
+    )
 
 
 def _off(truth: Array) -> Callable[[Array], float]:
     def error(positions: Array) -> float:
-        return float(np.linalg.norm(positions[:len(truth)] - truth[:len(positions)], axis=1).max())
+        return float(
+            np.linalg.norm(positions[: len(truth)] - truth[: len(positions)], axis=1).max()
+        )
 
     return error

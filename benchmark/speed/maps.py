@@ -23,9 +23,12 @@ _TEXT = 'To a pinhole camera 100 degrees wide, float32.'
 
 def rows(repeats: int = 15) -> list[Row]:
     """Return the rows about maps to a pinhole camera."""
-    return [_maps('Undistortion maps of 1280 x 800, ShiftVP', shift_lens(), repeats),
-            _maps('Undistortion maps of 1280 x 800, SVP Kannala-Brandt', svp_lens(), repeats,
-                  opencv=True)]
+    return [
+        _maps('Undistortion maps of 1280 x 800, ShiftVP', shift_lens(), repeats),
+        _maps(
+            'Undistortion maps of 1280 x 800, SVP Kannala-Brandt', svp_lens(), repeats, opencv=True
+        ),
+    ]
 
 
 def _maps(title: str, lens: Lens, repeats: int, opencv: bool = False) -> Row:
@@ -34,8 +37,10 @@ def _maps(title: str, lens: Lens, repeats: int, opencv: bool = False) -> Row:
     exact, mask = side.maps[:2], side.maps.mask
 
     def error(found: Sequence[Any]) -> float:
-        return max(float(np.abs(one - other)[mask].max())
-                   for one, other in zip(found, exact, strict=False))
+        return max(
+            float(np.abs(one - other)[mask].max())
+            for one, other in zip(found, exact, strict=False)
+        )
 
     def ours() -> Maps:
         return replace(side).maps  # a copy has none yet
@@ -46,8 +51,14 @@ def _maps(title: str, lens: Lens, repeats: int, opencv: bool = False) -> Row:
 
         matrix, k = camera_matrix(lens)
 
-        return Side(OPENCV, lambda: cv2.fisheye.initUndistortRectifyMap(
-            matrix, k, np.eye(3), camera.k, _SIZE, cv2.CV_32FC1), 1, error)
+        return Side(
+            OPENCV,
+            lambda: cv2.fisheye.initUndistortRectifyMap(
+                matrix, k, np.eye(3), camera.k, _SIZE, cv2.CV_32FC1
+            ),
+            1,
+            error,
+        )
 
     makers: dict[str, Callable[[], Side]] = engines.sides(ours, work=1, error=error)
     if opencv:

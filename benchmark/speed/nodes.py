@@ -42,14 +42,28 @@ def tables(count: int = 300) -> list[Table]:
     """Return the table: a line an engine."""
     rows, notes = [], []
     for name in engines():
-        run = subprocess.run([*_RUN, str(count)], env={**os.environ, VARIABLE: name},
-                             stdout=subprocess.PIPE, text=True, check=False)
+        run = subprocess.run(
+            [*_RUN, str(count)],
+            env={**os.environ, VARIABLE: name},
+            stdout=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
         if run.returncode:
             notes.append(f'{name}: the nodes did not run.')
             continue
         rows.append(_line(name, json.loads(run.stdout)))
-    header = ('engine', 'echo node, ms', 'localizer, ms', 'adds, ms', 'goal, ms', 'met',
-              'adds after jumps, ms', 'echo node, sets/s', 'localizer, sets/s')
+    header = (
+        'engine',
+        'echo node, ms',
+        'localizer, ms',
+        'adds, ms',
+        'goal, ms',
+        'met',
+        'adds after jumps, ms',
+        'echo node, sets/s',
+        'localizer, sets/s',
+    )
     return [_starts(), Table('Nodes', header, rows, _TEXT, notes)]
 
 
@@ -58,14 +72,26 @@ def _starts() -> Table:
     seconds: dict[str, list[list[float]]] = {name: [] for name in names}
     for _ in range(_STARTS):
         for name in names:
-            run = subprocess.run([sys.executable, '-c', _START, name], stdout=subprocess.PIPE,
-                                 stderr=subprocess.DEVNULL, text=True, check=True)
+            run = subprocess.run(
+                [sys.executable, '-c', _START, name],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                text=True,
+                check=True,
+            )
             seconds[name].append([float(word) for word in run.stdout.split()])
     rows = []
     for name, several in seconds.items():
         clock, processor = (median(column) for column in zip(*several, strict=True))
-        rows.append((name, number(clock), number(processor), f'{_START_GOAL:g}',
-                     'yes' if clock < _START_GOAL else 'no'))
+        rows.append(
+            (
+                name,
+                number(clock),
+                number(processor),
+                f'{_START_GOAL:g}',
+                'yes' if clock < _START_GOAL else 'no',
+            )
+        )
     header = ('node', 'on the clock, s', 'processor, s', 'goal, s', 'met')
     return Table('Starts of nodes', header, rows, _START_TEXT)
 
@@ -75,9 +101,14 @@ def _line(name: str, measured: dict[str, Any]) -> tuple[str, ...]:
     added = localizer - echo
     jumps = measured['jumps'][1] - measured['jumps'][0]
     return (
-        name, number(1e3 * echo), number(1e3 * localizer), number(1e3 * added),
-        f'{1e3 * _GOAL:g}', 'yes' if added < _GOAL else 'no',
-        number(1e3 * jumps), *map(_throughput, measured['throughput']),
+        name,
+        number(1e3 * echo),
+        number(1e3 * localizer),
+        number(1e3 * added),
+        f'{1e3 * _GOAL:g}',
+        'yes' if added < _GOAL else 'no',
+        number(1e3 * jumps),
+        *map(_throughput, measured['throughput']),
     )
 
 

@@ -92,8 +92,15 @@ def opencv(scene: Scene) -> Solve:
 
     def solve(i: int) -> Pose:
         _, turn, place = cv2.fisheye.solvePnP(
-            scene.landmarks, scene.views.uv[i][:, None], matrix, k, turns[i].copy(),
-            inverse.position[i].copy(), True, cv2.SOLVEPNP_ITERATIVE, criteria,
+            scene.landmarks,
+            scene.views.uv[i][:, None],
+            matrix,
+            k,
+            turns[i].copy(),
+            inverse.position[i].copy(),
+            True,
+            cv2.SOLVEPNP_ITERATIVE,
+            criteria,
         )
         return Pose(rotation_from_vector(turn.ravel()), place.ravel()).inverse()
 

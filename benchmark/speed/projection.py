@@ -47,9 +47,12 @@ def _project(count: int, repeats: int) -> Row:
         return Side(MRCAL, lambda: core.project(own), count, _off(exact))
 
     return engines.row(
-        'Projection, ShiftVP', _UNIT,
+        'Projection, ShiftVP',
+        _UNIT,
         engines.sides(ours, work=count, error=_off(exact)) | {KERNEL: kernel, MRCAL: mrcal},
-        repeats, [('numpy', MRCAL, 1.3), ('numba', MRCAL, 4.5), ('numba', KERNEL, 1 / 1.5)], 'px',
+        repeats,
+        [('numpy', MRCAL, 1.3), ('numba', MRCAL, 4.5), ('numba', KERNEL, 1 / 1.5)],
+        'px',
     )
 
 
@@ -79,14 +82,20 @@ def _project_with_pose(count: int, repeats: int) -> Row:
         core = MrcalCore(lens)
         own = core.prepared(seen)
         return Side(
-            MRCAL, lambda: core.project_with_gradient(own)[0], count, _off(exact),
+            MRCAL,
+            lambda: core.project_with_gradient(own)[0],
+            count,
+            _off(exact),
             note='differentiates by the point only, by automatic differentiation',
         )
 
     return engines.row(
-        'Projection with derivatives by the pose, ShiftVP', _UNIT,
+        'Projection with derivatives by the pose, ShiftVP',
+        _UNIT,
         engines.sides(ours, work=count, error=_off(exact)) | {KERNEL: kernel, MRCAL: mrcal},
-        repeats, [('numpy', MRCAL, 2.0), ('numba', MRCAL, 6.0)], 'px',
+        repeats,
+        [('numpy', MRCAL, 2.0), ('numba', MRCAL, 6.0)],
+        'px',
     )
 
 
@@ -103,13 +112,18 @@ def _svp(count: int, repeats: int) -> Row:
         return Side(
             OPENCV,
             lambda: cv2.fisheye.projectPoints(seen[:, None], still, still, matrix, k)[0][:, 0],
-            count, _off(exact), note='differentiates by the intrinsics, too',
+            count,
+            _off(exact),
+            note='differentiates by the intrinsics, too',
         )
 
     return engines.row(
-        'Projection with derivatives by the pose, SVP Kannala-Brandt', _UNIT,
+        'Projection with derivatives by the pose, SVP Kannala-Brandt',
+        _UNIT,
         engines.sides(ours, work=count, error=_off(exact)) | {KERNEL: kernel, OPENCV: opencv},
-        repeats, [('numpy', OPENCV, 1.8), ('numba', OPENCV, 4.0)], 'px',
+        repeats,
+        [('numpy', OPENCV, 1.8), ('numba', OPENCV, 4.0)],
+        'px',
     )
 
 

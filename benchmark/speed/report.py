@@ -12,11 +12,32 @@ from typing import NamedTuple
 from benchmark.speed.compiled import compiler, mrcal_revision
 from benchmark.speed.harness import OURS, NotHereError, Row
 
-_PACKAGES = ('numpy', 'scipy', 'numba', 'opencv-python-headless', 'poselib', 'pycolmap', 'gtsam',
-             'ros-jazzy-rclpy', 'mrcal')
+_PACKAGES = (
+    'numpy',
+    'scipy',
+    'numba',
+    'opencv-python-headless',
+    'poselib',
+    'pycolmap',
+    'gtsam',
+    'ros-jazzy-rclpy',
+    'mrcal',
+)
 # Columns of words; all others hold numbers.
-_WORDS = ('what', 'node', 'version', 'who', 'notes', 'work', 'that grows', 'command', 'on', 'met',
-          'engine', 'against')
+_WORDS = (
+    'what',
+    'node',
+    'version',
+    'who',
+    'notes',
+    'work',
+    'that grows',
+    'command',
+    'on',
+    'met',
+    'engine',
+    'against',
+)
 _HEAD = """# Benchmarks
 
 `make bench` runs `{command}` in its own environment (`benchmark/requirements.txt`).
@@ -42,9 +63,10 @@ def document(command: str, noise: float, sections: Sequence[Row | Table]) -> str
     """Return the report as Markdown."""
     rows = [section for section in sections if isinstance(section, Row)]
     parts = [_HEAD.format(command=command, noise=noise)]
-    tables = [goals(rows), *(
-        of_row(section) if isinstance(section, Row) else section for section in sections
-    )]
+    tables = [
+        goals(rows),
+        *(of_row(section) if isinstance(section, Row) else section for section in sections),
+    ]
     return '\n'.join([*parts, versions(), *(markdown(table) for table in tables)])
 
 
@@ -90,10 +112,16 @@ def goals(rows: Sequence[Row]) -> Table:
         for goal in row.goals:
             reached = row.ratio(goal.ours, goal.peer)
             met = '-' if reached is None else 'yes' if reached >= goal.ratio else 'no'
-            lines.append((
-                row.title, goal.ours.removeprefix(OURS + ', '), goal.peer, f'{goal.ratio:.3g} ×',
-                'not measured' if reached is None else f'{number(reached)} ×', met,
-            ))
+            lines.append(
+                (
+                    row.title,
+                    goal.ours.removeprefix(OURS + ', '),
+                    goal.peer,
+                    f'{goal.ratio:.3g} ×',
+                    'not measured' if reached is None else f'{number(reached)} ×',
+                    met,
+                )
+            )
     return Table('Goals', ('work', 'engine', 'against', 'goal', 'reached', 'met'), lines)
 
 
@@ -101,7 +129,11 @@ def of_row(row: Row) -> Table:
     """Return the table of one row: a line a side."""
     compared = any(timing.error is not None for timing in row.timings)
     header = (
-        'who', row.unit, 'quartiles', *([f'off, {row.error_unit}'] if compared else ()), 'notes',
+        'who',
+        row.unit,
+        'quartiles',
+        *([f'off, {row.error_unit}'] if compared else ()),
+        'notes',
     )
     lines = []
     for timing in row.timings:

@@ -77,8 +77,15 @@ def opencv_rig(scene: StereoScene) -> Pose:
     seen = [[uv[:, None] for uv in views.uv] for views in (scene.left, scene.right)]
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, TOLERANCE)
     found = cv2.fisheye.stereoCalibrate(
-        board, *seen, matrix.copy(), k.copy(), matrix.copy(), k.copy(),
-        (scene.lens.width, scene.lens.height), flags=fixed, criteria=criteria,
+        board,
+        *seen,
+        matrix.copy(),
+        k.copy(),
+        matrix.copy(),
+        k.copy(),
+        (scene.lens.width, scene.lens.height),
+        flags=fixed,
+        criteria=criteria,
     )
     return Pose(found[5], found[6].ravel())
 
@@ -95,10 +102,15 @@ def mrcal_rig(scene: StereoScene) -> Iterator[Callable[[], dict[str, Any]]]:
     with tempfile.TemporaryDirectory() as folder:
         problem = Path(folder) / 'problem.npz'
         np.savez(
-            problem, intrinsics=[lens.fx, lens.fy, lens.cx, lens.cy], grid=scene.grid,
-            size=[lens.width, lens.height], spacing=scene.spacing,
-            left=scene.left.uv, right=scene.right.uv,
-            frames=_rt(scene.pose.inverse()), extrinsics=_rt(scene.rig.inverse())[None],
+            problem,
+            intrinsics=[lens.fx, lens.fy, lens.cx, lens.cy],
+            grid=scene.grid,
+            size=[lens.width, lens.height],
+            spacing=scene.spacing,
+            left=scene.left.uv,
+            right=scene.right.uv,
+            frames=_rt(scene.pose.inverse()),
+            extrinsics=_rt(scene.rig.inverse())[None],
         )
         with worker([python, '-E', str(_WORKER), str(problem)]) as run:
             yield run
@@ -107,8 +119,9 @@ def mrcal_rig(scene: StereoScene) -> Iterator[Callable[[], dict[str, Any]]]:
 def _python_with_mrcal() -> str:
     for python in _PYTHONS:
         with suppress(OSError):
-            if not subprocess.run([python, '-E', '-c', 'import mrcal'], capture_output=True,
-                                  check=False).returncode:
+            if not subprocess.run(
+                [python, '-E', '-c', 'import mrcal'], capture_output=True, check=False
+            ).returncode:
                 return python
     raise NotHereError('no mrcal; `pip install mrcal` or `apt install python3-mrcal`')
 

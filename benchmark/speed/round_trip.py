@@ -69,8 +69,10 @@ class Probe:
             )
         self.scene = 'motion'
         self._sets = {
-            name: [messages.image_points_message(landmarks.ids, uv, 0, 'camera')
-                   for uv in scene.views.uv]
+            name: [
+                messages.image_points_message(landmarks.ids, uv, 0, 'camera')
+                for uv in scene.views.uv
+            ]
             for name, scene in scenes.items()
         }
         self._sent = 0
@@ -162,8 +164,19 @@ def nodes() -> Iterator[tuple[str, str]]:
     names = ('echo', 'localizer_under_test')
     commands = (
         [str(_ECHO), '--ros-args'],
-        ['-m', 'fisheye_svp_ros.cli', 'run', 'localizer', '--ros-args',
-         '-p', f'lens:={_LENS}', '-p', 'svp:=false', '-p', 'patience:=0.5'],
+        [
+            '-m',
+            'fisheye_svp_ros.cli',
+            'run',
+            'localizer',
+            '--ros-args',
+            '-p',
+            f'lens:={_LENS}',
+            '-p',
+            'svp:=false',
+            '-p',
+            'patience:=0.5',
+        ],
     )
     running = [
         subprocess.Popen([sys.executable, *command, '-r', f'__ns:=/{name}'])

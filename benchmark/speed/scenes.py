@@ -115,13 +115,18 @@ def stereo(lens: Lens, views: int = 10, grid: tuple[int, int] = (3, 11)) -> Ster
     place = middle + rng.uniform(-0.05, 0.05, (views, 3))
     pose = Pose(turn, board.mean(axis=0) - (turn @ place[..., None])[..., 0])
     left, right = (
-        project(lens, each.into_body(board)).uv
-        + rng.normal(0, NOISE_PX, (views, len(board), 2))
+        project(lens, each.into_body(board)).uv + rng.normal(0, NOISE_PX, (views, len(board), 2))
         for each in (pose.compose(pair), pose)
     )
     return StereoScene(
-        lens, board, grid, spacing, views_of(board, left), views_of(board, right),
-        pose.retract(rng.normal(0, 0.01, (views, 6))), pair.retract(rng.normal(0, 0.01, 6)),
+        lens,
+        board,
+        grid,
+        spacing,
+        views_of(board, left),
+        views_of(board, right),
+        pose.retract(rng.normal(0, 0.01, (views, 6))),
+        pair.retract(rng.normal(0, 0.01, 6)),
     )
 
 
@@ -133,10 +138,11 @@ def on_board(frames: int, landmarks: int, cameras: int) -> tuple[Observations, t
     board = 0.4 / rows * np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=-1)
     board -= board.mean(axis=0)
     frame, camera, point = np.indices((frames, cameras, landmarks)).reshape(3, -1)
-    poses = Pose(rotation_from_vector(rng.uniform(-0.5, 0.5, (frames, 3))),
-                 rng.uniform([-0.2, -0.2, 0.3], [0.2, 0.2, 0.7], (frames, 3)))
+    poses = Pose(
+        rotation_from_vector(rng.uniform(-0.5, 0.5, (frames, 3))),
+        rng.uniform([-0.2, -0.2, 0.3], [0.2, 0.2, 0.7], (frames, 3)),
+    )
     seen = poses.take(frame).transform(board[point]) - camera[:, None] * [0.02, 0.0, 0.0]
     names = tuple(f'camera{i}' for i in range(cameras))
     uv = project(lens, seen).uv + rng.normal(0, 0.2, (len(seen), 2))
-    return make_observations(
-        frame, point, uv, board[point], camera=camera, cameras=names), names
+    return make_observations(frame, point, uv, board[point], camera=camera, cameras=names), names

@@ -37,11 +37,14 @@ def _kannala_brandt(views: int, repeats: int) -> Row:
     scene = stereo(svp_lens(), views)
     off = _off(scene)
     makers = _ours(scene, off)
-    makers |= {
-        name: partial(_peer, name, *peer, scene, off) for name, peer in _PEERS.items()
-    }
-    return _row(scene, 'SVP Kannala-Brandt', makers, repeats,
-                [('numpy', OPENCV, 4), ('numba', OPENCV, 20), ('numpy, own start', OPENCV, 1.5)])
+    makers |= {name: partial(_peer, name, *peer, scene, off) for name, peer in _PEERS.items()}
+    return _row(
+        scene,
+        'SVP Kannala-Brandt',
+        makers,
+        repeats,
+        [('numpy', OPENCV, 4), ('numba', OPENCV, 20), ('numpy, own start', OPENCV, 1.5)],
+    )
 
 
 def _stereographic(views: int, repeats: int) -> Row:
@@ -53,19 +56,31 @@ def _stereographic(views: int, repeats: int) -> Row:
             run = stack.enter_context(mrcal_rig(scene))
             run()  # if it ends by itself, its row is left out
             return Side(
-                'mrcal', run, 1.0, lambda answer: off(mrcal_pose(answer)),
+                'mrcal',
+                run,
+                1.0,
+                lambda answer: off(mrcal_pose(answer)),
                 lambda answer: float(answer['seconds']),
                 'in a process of its own that reports its own time',
             )
 
         makers = _ours(scene, off)
-        return _row(scene, 'SVP stereographic', makers | {'mrcal': mrcal}, repeats,
-                    [('numba', 'mrcal', 3.0)])
+        return _row(
+            scene,
+            'SVP stereographic',
+            makers | {'mrcal': mrcal},
+            repeats,
+            [('numba', 'mrcal', 3.0)],
+        )
 
 
 def _peer(
-    name: str, module: str, solve: Callable[[StereoScene], Pose], note: str,
-    scene: StereoScene, off: Callable[[Pose], float],
+    name: str,
+    module: str,
+    solve: Callable[[StereoScene], Pose],
+    note: str,
+    scene: StereoScene,
+    off: Callable[[Pose], float],
 ) -> Side:
     require(module)
     return Side(name, lambda: solve(scene), error=off, note=note)
@@ -91,7 +106,10 @@ def _off(scene: StereoScene) -> Callable[[Pose], float]:
 
 
 def _row(
-    scene: StereoScene, lens: str, makers: dict[str, Callable[[], Side]], repeats: int,
+    scene: StereoScene,
+    lens: str,
+    makers: dict[str, Callable[[], Side]],
+    repeats: int,
     goals: list[tuple[str, str, float]],
 ) -> Row:
     views, board = len(scene.left.uv), len(scene.board)

@@ -55,10 +55,18 @@ def tables() -> list[Table]:
             rows.append(_line(_scenarios(seeds), 'one process', pairs))
         run = _run(path, folder / 'undisturbed', _WORKERS)
         rows.append(_line(_scenarios(seeds), ' '.join(_WORKERS), [(starts[-1], run)]))
-        notes = [f'The start: {number(median(run.processor for run in starts))} s of processor '
-                 'time.', _disturbed(path, folder, run.clock)]
-    header = ('scenarios', 'on', 'on the clock, s', 'processor, s', 'each further one, ms',
-              'memory, MiB')
+        notes = [
+            f'The start: {number(median(run.processor for run in starts))} s of processor time.',
+            _disturbed(path, folder, run.clock),
+        ]
+    header = (
+        'scenarios',
+        'on',
+        'on the clock, s',
+        'processor, s',
+        'each further one, ms',
+        'memory, MiB',
+    )
     return [Table('Sweeps', header, rows, _TEXT, notes)]
 
 
@@ -80,12 +88,17 @@ def _disturbed(path: Path, folder: Path, clock: float) -> str:
         process.kill()
         psutil.wait_procs(tree)
     _run(path, out, (*_WORKERS, '--resume'))
-    names = [name for name in ('sweep.parquet', 'sweep.csv', 'sweep.json')
-             if (folder / 'undisturbed' / name).exists()]
+    names = [
+        name
+        for name in ('sweep.parquet', 'sweep.csv', 'sweep.json')
+        if (folder / 'undisturbed' / name).exists()
+    ]
     equal, *other = filecmp.cmpfiles(folder / 'undisturbed', out, names, shallow=False)
     same = 'the same files, byte for byte' if not any(other) else f'other files: {other}'
-    return ('The million on two processes, killed (SIGKILL) after a third of the time and again '
-            f'after another, then resumed: {same} ({", ".join(f"`{n}`" for n in equal)}).')
+    return (
+        'The million on two processes, killed (SIGKILL) after a third of the time and again '
+        f'after another, then resumed: {same} ({", ".join(f"`{n}`" for n in equal)}).'
+    )
 
 
 def _scenarios(seeds: int) -> int:

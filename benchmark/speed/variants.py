@@ -37,24 +37,46 @@ def rows(many: int = 10_000, count: int = 100_000, repeats: int = 9) -> list[Row
         scalar = {**_UNVECTORISED, 'XDG_CACHE_HOME': folder}
         compilations = {NUMBA: {}, 'without vectorisation': scalar}
         return [
-            _row(f'{many} localizations, ShiftVP, on two cores', ('localization', many), cores,
-                 ('µs each', 1e-6), repeats, 'wall', [Goal(two, one, 1.7)],
-                 'On the clock on the wall: both cores must be free.'),
-            _row('Projection with derivatives by the pose, ShiftVP, without vectorisation',
-                 ('projection', count), compilations, ('ns a point', 1e-9), repeats, 'processor',
-                 [], 'The same code compiled twice: alike, vectorisation would be lost.'),
+            _row(
+                f'{many} localizations, ShiftVP, on two cores',
+                ('localization', many),
+                cores,
+                ('µs each', 1e-6),
+                repeats,
+                'wall',
+                [Goal(two, one, 1.7)],
+                'On the clock on the wall: both cores must be free.',
+            ),
+            _row(
+                'Projection with derivatives by the pose, ShiftVP, without vectorisation',
+                ('projection', count),
+                compilations,
+                ('ns a point', 1e-9),
+                repeats,
+                'processor',
+                [],
+                'The same code compiled twice: alike, vectorisation would be lost.',
+            ),
         ]
 
 
 def _row(
-    title: str, job: tuple[str, int], variants: Mapping[str, Mapping[str, str]],
-    unit: tuple[str, float], repeats: int, clock: str, goals: list[Goal], text: str,
+    title: str,
+    job: tuple[str, int],
+    variants: Mapping[str, Mapping[str, str]],
+    unit: tuple[str, float],
+    repeats: int,
+    clock: str,
+    goals: list[Goal],
+    text: str,
 ) -> Row:
     with ExitStack() as stack:
-        sides, left_out = available({
-            name: partial(_side, stack, name, job, environment, clock)
-            for name, environment in variants.items()
-        })
+        sides, left_out = available(
+            {
+                name: partial(_side, stack, name, job, environment, clock)
+                for name, environment in variants.items()
+            }
+        )
         timings = measure(sides, repeats)
     return Row(title, *unit, timings, left_out=left_out, goals=goals, text=text)
 

@@ -20,28 +20,63 @@ _LIMITS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('--lens', required=True, metavar='LENS',
-                        help='lens file with a viewpoint_shift or a port, or the name of a lens '
-                        'of this package')
-    parser.add_argument('--range', type=float, default=0.5, metavar='M', dest='working_range',
-                        help='nearest range of the landmarks or targets; default: 0.5')
-    parser.add_argument('--spread', type=float, metavar='DEG',
-                        help='largest angle of the landmarks from the axis; default: 1 degree '
-                        'less than the field of view, or, for a lens from `calibrate`, the '
-                        'largest angle of its image points')
-    parser.add_argument('--noise', type=float, default=0.3, metavar='PX',
-                        help='standard deviation of u and of v; default: 0.3')
-    parser.add_argument('--baseline', type=float, default=0.15, metavar='M',
-                        help='baseline of the stereo rig; default: 0.15')
-    parser.add_argument('--style', default='parallel', metavar='STYLE',
-                        help='style of the stereo rig: parallel, vergent or divergent; default: '
-                        'parallel')
+    parser.add_argument(
+        '--lens',
+        required=True,
+        metavar='LENS',
+        help='lens file with a viewpoint_shift or a port, or the name of a lens of this package',
+    )
+    parser.add_argument(
+        '--range',
+        type=float,
+        default=0.5,
+        metavar='M',
+        dest='working_range',
+        help='nearest range of the landmarks or targets; default: 0.5',
+    )
+    parser.add_argument(
+        '--spread',
+        type=float,
+        metavar='DEG',
+        help='largest angle of the landmarks from the axis; default: 1 degree '
+        'less than the field of view, or, for a lens from `calibrate`, the '
+        'largest angle of its image points',
+    )
+    parser.add_argument(
+        '--noise',
+        type=float,
+        default=0.3,
+        metavar='PX',
+        help='standard deviation of u and of v; default: 0.3',
+    )
+    parser.add_argument(
+        '--baseline',
+        type=float,
+        default=0.15,
+        metavar='M',
+        help='baseline of the stereo rig; default: 0.15',
+    )
+    parser.add_argument(
+        '--style',
+        default='parallel',
+        metavar='STYLE',
+        help='style of the stereo rig: parallel, vergent or divergent; default: parallel',
+    )
     for option, unit, _, what in _LIMITS.values():
-        parser.add_argument(option, type=float, metavar=unit,
-                            help=f'largest {what} that you allow; default: unlimited, or, without '
-                            'any limit, what noise alone causes')
-    parser.add_argument('-o', '--output', type=output_folder, metavar='DIR',
-                        help='folder to write budget.json and budget.png to')
+        parser.add_argument(
+            option,
+            type=float,
+            metavar=unit,
+            help=f'largest {what} that you allow; default: unlimited, or, without '
+            'any limit, what noise alone causes',
+        )
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_folder,
+        metavar='DIR',
+        help='folder to write budget.json and budget.png to',
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -59,16 +94,20 @@ def run(args: argparse.Namespace) -> None:
     spread = default_spread(lens) if args.spread is None else np.radians(args.spread).item()
     limits = {
         name: (value := getattr(args, option[2:].replace('-', '_'))) and factor * value
-        for name, (option, _, factor, _) in _LIMITS.items()}
+        for name, (option, _, factor, _) in _LIMITS.items()
+    }
     with progress('solving'):
         budget = make_budget(Setup(lens, rig(args.style, args.baseline), args.noise))
     points = at_point(budget, spread, args.working_range, limits)
     given = frozenset(name for name, value in limits.items() if value is not None)
-    asked = BudgetRequest(lens.name, spread, args.working_range, given,
-                  lens.port is not None, bool(budget.own))
+    asked = BudgetRequest(
+        lens.name, spread, args.working_range, given, lens.port is not None, bool(budget.own)
+    )
     print_table(
         f'{lens.name}: landmarks within {np.degrees(spread):.0f} degrees of the axis, at '
-        f'{args.working_range:g} m, {args.noise:g} px of noise', asked.header, rows(points, asked),
+        f'{args.working_range:g} m, {args.noise:g} px of noise',
+        asked.header,
+        rows(points, asked),
     )
     print(f'  {answer(points, asked)}')
     if args.output:

@@ -63,36 +63,62 @@ from fisheye_svp_ros.solve.rig_checks import MAX_RIG_RATIO, MIN_SHARED_FRAMES
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     add_observation_arguments(parser)
-    parser.add_argument('--model', default='kannala_brandt', choices=IMAGE_HEIGHTS,
-                        metavar='MODEL', help='image-height curve: ' + ', '.join(IMAGE_HEIGHTS)
-                        + '; default: kannala_brandt')
-    parser.add_argument('--image-size', type=image_sizes, metavar='WxH',
-                        help='image size, px; if the cameras differ, left=1280x960,right=640x480; '
-                        'not needed for photographs and for observations from `detect`')
-    parser.add_argument('--free', type=_names, metavar='NAME,...',
-                        help='parameters to fit: f (or fx,fy), cx, cy, the coefficients of the '
-                        'model, of a viewpoint shift (e0,e1,e2 or '
-                        'thickness,refractive_index), of a port (port_medium_index, ...); '
-                        'default: all except the viewpoint shift; of a port, only its place')
+    parser.add_argument(
+        '--model',
+        default='kannala_brandt',
+        choices=IMAGE_HEIGHTS,
+        metavar='MODEL',
+        help='image-height curve: ' + ', '.join(IMAGE_HEIGHTS) + '; default: kannala_brandt',
+    )
+    parser.add_argument(
+        '--image-size',
+        type=image_sizes,
+        metavar='WxH',
+        help='image size, px; if the cameras differ, left=1280x960,right=640x480; '
+        'not needed for photographs and for observations from `detect`',
+    )
+    parser.add_argument(
+        '--free',
+        type=_names,
+        metavar='NAME,...',
+        help='parameters to fit: f (or fx,fy), cx, cy, the coefficients of the '
+        'model, of a viewpoint shift (e0,e1,e2 or '
+        'thickness,refractive_index), of a port (port_medium_index, ...); '
+        'default: all except the viewpoint shift; of a port, only its place',
+    )
     add_port_arguments(parser)
-    parser.add_argument('--lens', metavar='AIR.yaml', type=Path,
-                        help='the same camera calibrated in air; with --medium or --port, only '
-                        'the place of the port is fitted')
-    parser.add_argument('--poses', metavar='POSES.csv',
-                        help='poses of the robot flange that carries the camera, in the robot '
-                        'base; also fits the pose of the camera in the flange')
-    parser.add_argument('-o', '--output', type=output_path, metavar='LENS.yaml',
-                        help='lens file to write; covariances are written next to it as '
-                        '.calibrate.json, the report as .calibrate.html; for a rig, a '
-                        'folder: one lens per camera, calibration.html, rig.yaml, rig.json, '
-                        'rig.urdf, tf_static.yaml and camchain.yaml')
+    parser.add_argument(
+        '--lens',
+        metavar='AIR.yaml',
+        type=Path,
+        help='the same camera calibrated in air; with --medium or --port, only '
+        'the place of the port is fitted',
+    )
+    parser.add_argument(
+        '--poses',
+        metavar='POSES.csv',
+        help='poses of the robot flange that carries the camera, in the robot '
+        'base; also fits the pose of the camera in the flange',
+    )
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_path,
+        metavar='LENS.yaml',
+        help='lens file to write; covariances are written next to it as '
+        '.calibrate.json, the report as .calibrate.html; for a rig, a '
+        'folder: one lens per camera, calibration.html, rig.yaml, rig.json, '
+        'rig.urdf, tf_static.yaml and camchain.yaml',
+    )
 
 
 def run(args: argparse.Namespace) -> None:
     """Calibrate, print the parameters, write the lens, or two lenses and the rig."""
     if args.lens and not (args.medium or args.port):
-        raise ParameterError(f'--lens {args.lens} needs --medium (for example water) or --port: '
-                             'what the camera looked through')
+        raise ParameterError(
+            f'--lens {args.lens} needs --medium (for example water) or --port: '
+            'what the camera looked through'
+        )
     observations, sizes = read_input(args.observations, args)
     sizes = _known_sizes(args, observations, sizes)
     if args.output:
@@ -105,8 +131,10 @@ def run(args: argparse.Namespace) -> None:
         found[camera] = _calibrate_camera(table, args, size, name)
     rig = None
     if len(found) > 1:
-        rig = fit_rig(_join_tables([one.table for one in found.values()]),
-                      {camera: one.lens for camera, one in found.items()})
+        rig = fit_rig(
+            _join_tables([one.table for one in found.values()]),
+            {camera: one.lens for camera, one in found.items()},
+        )
     if rig and not args.poses:  # the robot's transforms are those of the lenses as they are
         for camera, lens in zip(rig.cameras, rig.lenses, strict=True):
             found[camera] = found[camera].with_lens(lens)
@@ -121,8 +149,11 @@ def run(args: argparse.Namespace) -> None:
                 paths[camera] = args.output if alone else args.output / f'{camera}.yaml'
                 save_lens(one.lens, paths[camera])
                 write_json(paths[camera].with_suffix('.calibrate.json'), _document(one))
-            report = (args.output / 'calibration.html' if len(paths) > 1 else
-                      next(iter(paths.values())).with_suffix('.calibrate.html'))
+            report = (
+                args.output / 'calibration.html'
+                if len(paths) > 1
+                else next(iter(paths.values())).with_suffix('.calibrate.html')
+            )
             write_calibration_report(report, found, _next_command(args, paths))
             if rig:
                 write_rig(rig, args.output)
@@ -150,8 +181,9 @@ def _known_sizes(args: argparse.Namespace, observations: Observations, sizes: Si
     unknown = [name for name in observations.cameras if not {name, ''} & set(sizes)]
     if unknown:
         head = f'{unknown[0]}=' if unknown[0] and sizes else ''
-        raise ParameterError(f'{args.observations}: the image size is unknown; add --image-size '
-                             f'{head}1280x800')
+        raise ParameterError(
+            f'{args.observations}: the image size is unknown; add --image-size {head}1280x800'
+        )
     return sizes
 
 
@@ -162,26 +194,34 @@ def _check_output(args: argparse.Namespace, table: Observations) -> None:
     if len(table.cameras) == 1:
         return
     if args.output.suffix in ('.yaml', '.yml'):
-        raise ParameterError(f'-o {args.output}: the lenses of {", ".join(table.cameras)} and '
-                             'their rig are written to a folder; use -o '
-                             f'{args.output.with_suffix("")}')
+        raise ParameterError(
+            f'-o {args.output}: the lenses of {", ".join(table.cameras)} and '
+            'their rig are written to a folder; use -o '
+            f'{args.output.with_suffix("")}'
+        )
     check_names(table, args.observations)
 
 
 def _join_tables(tables: Sequence[Observations]) -> Observations:
     """Return the rows of several tables of the same cameras."""
-    rows: dict[str, Any] = {name: np.concatenate([getattr(table, name) for table in tables])
-            for name in ('frame', 'landmark', 'uv', 'xyz', 'camera', 'board', 't', 'sigma')}
+    rows: dict[str, Any] = {
+        name: np.concatenate([getattr(table, name) for table in tables])
+        for name in ('frame', 'landmark', 'uv', 'xyz', 'camera', 'board', 't', 'sigma')
+    }
     return replace(tables[0], **rows)
 
 
 def _next_command(args: argparse.Namespace, paths: Mapping[str, Path]) -> str:
     """Return the command that says what is wrong with the lenses, as a shell takes it."""
-    lenses = [word for camera, path in paths.items()
-              for word in ('--lens', f'{camera}={path}' if len(paths) > 1 else str(path))]
+    lenses = [
+        word
+        for camera, path in paths.items()
+        for word in ('--lens', f'{camera}={path}' if len(paths) > 1 else str(path))
+    ]
     search = search_options(args) if args.board else ()
-    return shlex.join(['fisheye-svp', 'diagnose', args.observations, *search, *lenses,
-                       '-o', 'diagnosis'])
+    return shlex.join(
+        ['fisheye-svp', 'diagnose', args.observations, *search, *lenses, '-o', 'diagnosis']
+    )
 
 
 def _calibrate_camera(
@@ -216,8 +256,10 @@ def _calibrate_camera(
         with stages(f'{values}; computing their standard errors'):
             trusted = assess_lens(kept, result.adjusted.lens, result.adjusted.names)
     except np.linalg.LinAlgError as cause:
-        raise GeometryError(f'{table.source}: the fitted lens has no rays to some of the observed '
-                            f'points ({cause}); check --port and --medium') from cause
+        raise GeometryError(
+            f'{table.source}: the fitted lens has no rays to some of the observed '
+            f'points ({cause}); check --port and --medium'
+        ) from cause
     lens = with_covariance(result.adjusted.lens, trusted)
     return CalibratedCamera(lens, result, trusted, kept, args.model, hand_eye)
 
@@ -229,13 +271,17 @@ def _print(found: CalibratedCamera) -> None:
         f'{lens.name}: {figures["observations"]} points in {figures["frames"]} frames, '
         f'rms {figures["rms_px"]:.4f} px',
         ('parameter', 'value', 'std. error', *(['with any target'] if open_ones else []), 'unit'),
-        [(name, value, error, *([range_] if open_ones else []), unit)
-         for name, value, error, range_, unit in found.parameter_rows()],
+        [
+            (name, value, error, *([range_] if open_ones else []), unit)
+            for name, value, error, range_, unit in found.parameter_rows()
+        ],
     )
     if open_ones:
         print('  with any target: 95 %, with shape, scale and boards of the target estimated too')
-    print(f'  max_incidence_deg {np.degrees(lens.max_incidence):.2f}, image points up to '
-          f'{np.degrees(found.result.reached):.2f}; {STANDARD_ERRORS}')
+    print(
+        f'  max_incidence_deg {np.degrees(lens.max_incidence):.2f}, image points up to '
+        f'{np.degrees(found.result.reached):.2f}; {STANDARD_ERRORS}'
+    )
     if found.hand_eye:
         print_table(hand_eye_sentence(found.hand_eye), ROBOT_HEADER, hand_eye_rows(found.hand_eye))
 
@@ -274,10 +320,12 @@ def fit_rig(table: Observations, lenses: Mapping[str, Lens]) -> RigCalibration |
         largest = max(groups, key=len)
         for group in groups:
             if group != largest:
-                say(f'rig: {" and ".join(group)} cannot be related to {", ".join(largest)}: no '
+                say(
+                    f'rig: {" and ".join(group)} cannot be related to {", ".join(largest)}: no '
                     'frame shows the target in both; photograph it where two cameras see it, or '
                     'turn the rig while each sees a board of its own, and give simultaneous '
-                    'photographs the same frame number')
+                    'photographs the same frame number'
+                )
         if len(largest) < 2:
             return None
         found = calibrate_rig(table, lenses, rig_cameras(largest) or largest)
@@ -299,16 +347,25 @@ def _warnings(
         yield found.reason
     own = max((lenses[name].calibration or {}).get('rms_px', np.inf) for name in found.cameras)
     if found.total_rms_px > MAX_RIG_RATIO * own:
-        yield (f'rms {found.total_rms_px:.2f} px with a rigid rig, at most {own:.2f} px for each '
-               'camera alone: the cameras moved, their photographs were not simultaneous, or a '
-               'lens is wrong')
+        yield (
+            f'rms {found.total_rms_px:.2f} px with a rigid rig, at most {own:.2f} px for each '
+            'camera alone: the cameras moved, their photographs were not simultaneous, or a '
+            'lens is wrong'
+        )
     for name, shared in zip(found.cameras, found.shared.tolist(), strict=True):
         if shared < MIN_SHARED_FRAMES:
             one = shared == 1
-            what = (f'relate{"s" if one else ""} {name} to the others'
-                    if len(found.cameras) > 2 else 'is shared' if one else 'are shared')
-            yield (f'only {counted(shared, "frame")} {what}, and it is assumed that all '
-                   'cameras saw one target; take more photographs of it with two cameras at once')
+            what = (
+                f'relate{"s" if one else ""} {name} to the others'
+                if len(found.cameras) > 2
+                else 'is shared'
+                if one
+                else 'are shared'
+            )
+            yield (
+                f'only {counted(shared, "frame")} {what}, and it is assumed that all '
+                'cameras saw one target; take more photographs of it with two cameras at once'
+            )
             if len(found.cameras) == 2:
                 return
 
@@ -317,19 +374,30 @@ def write_rig(found: RigCalibration, folder: Path) -> None:
     """Write a rig as tools read it, its lenses apart."""
     save_rig(found.steps(), folder / 'rig.yaml', found.cameras)
     turns = quaternion_from_rotation(found.rig.rotation)
-    write_json(folder / 'rig.json', {  # cameras in the first one, with covariances
-        'frame': found.cameras[0], 'frames': len(found.frame), 'sigma_px': found.sigma_px,
-        'left_out': list(found.left_out),
-        'cameras': {name: {
-            'position': found.rig.position[i].tolist(), 'quaternion': turns[i].tolist(),
-            'covariance': found.covariance[i - 1].tolist() if i else None,
-            'rms_px': float(found.rms_px[i]), 'frames': int(found.shared[i]),
-            'board': found.boards[i] if found.boards else 0,
-        } for i, name in enumerate(found.cameras)},
-    })
+    write_json(
+        folder / 'rig.json',
+        {  # cameras in the first one, with covariances
+            'frame': found.cameras[0],
+            'frames': len(found.frame),
+            'sigma_px': found.sigma_px,
+            'left_out': list(found.left_out),
+            'cameras': {
+                name: {
+                    'position': found.rig.position[i].tolist(),
+                    'quaternion': turns[i].tolist(),
+                    'covariance': found.covariance[i - 1].tolist() if i else None,
+                    'rms_px': float(found.rms_px[i]),
+                    'frames': int(found.shared[i]),
+                    'board': found.boards[i] if found.boards else 0,
+                }
+                for i, name in enumerate(found.cameras)
+            },
+        },
+    )
     write_text(folder / 'rig.urdf', transforms.urdf_text(found.cameras, found.rig))
-    write_text(folder / 'tf_static.yaml',
-               transforms.static_transforms_text(found.cameras, found.rig))
+    write_text(
+        folder / 'tf_static.yaml', transforms.static_transforms_text(found.cameras, found.rig)
+    )
     try:
         write_text(folder / 'camchain.yaml', kalibr.write_chain(found.lenses, found.steps()))
     except FisheyeSvpError as cause:
@@ -340,21 +408,37 @@ def print_rig(found: RigCalibration) -> None:
     """Print a rig."""
     if len(found.cameras) == 2:
         x, y, z = 1000 * found.steps()[0].position
-        print(f'rig: camera {found.cameras[0]} in {found.cameras[1]} at {x:.3f}, '
-              f'{y:.3f}, {z:.3f} mm, from {len(found.frame)} frames, '
-              f'rms {found.total_rms_px:.4f} px')
+        print(
+            f'rig: camera {found.cameras[0]} in {found.cameras[1]} at {x:.3f}, '
+            f'{y:.3f}, {z:.3f} mm, from {len(found.frame)} frames, '
+            f'rms {found.total_rms_px:.4f} px'
+        )
     if found.boards:
-        each = [' and '.join(name for name, board in zip(found.cameras, found.boards, strict=True)
-                             if board == one) for one in sorted(set(found.boards))]
-        print('rig: boards apart, related by the motion of the rig: one seen by '
-              f'{", another by ".join(each)}')
+        each = [
+            ' and '.join(
+                name
+                for name, board in zip(found.cameras, found.boards, strict=True)
+                if board == one
+            )
+            for one in sorted(set(found.boards))
+        ]
+        print(
+            'rig: boards apart, related by the motion of the rig: one seen by '
+            f'{", another by ".join(each)}'
+        )
     sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
     rows = []
     for i, name in enumerate(found.cameras):
         place = [f'{1e3 * value:.3f}' for value in found.rig.position[i]]
-        error = (f'{1e3 * sigma[i - 1, :3].max():.3f}', f'{np.degrees(sigma[i - 1, 3:].max()):.4f}'
-                 ) if i else ('', '')
+        error = (
+            (f'{1e3 * sigma[i - 1, :3].max():.3f}', f'{np.degrees(sigma[i - 1, 3:].max()):.4f}')
+            if i
+            else ('', '')
+        )
         rows.append((name, *place, *error, str(found.shared[i]), f'{found.rms_px[i]:.4f}'))
-    print_table(f'rig: cameras in {found.cameras[0]}, from {len(found.frame)} frames that several '
-                'cameras see', ('camera', 'x, mm', 'y, mm', 'z, mm', '±, mm', '±, deg', 'frames',
-                                'rms, px'), rows)
+    print_table(
+        f'rig: cameras in {found.cameras[0]}, from {len(found.frame)} frames that several '
+        'cameras see',
+        ('camera', 'x, mm', 'y, mm', 'z, mm', '±, mm', '±, deg', 'frames', 'rms, px'),
+        rows,
+    )

@@ -50,14 +50,32 @@ _PATIENCE = 900.0  # s; only a hang takes this long
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('-o', '--output', type=output_folder, default=Path('demo'), metavar='DIR',
-                        help='folder to write the recording (replaces an earlier one), demo.json, '
-                        'table.csv, table.parquet and pictures to; default: demo')
-    parser.add_argument('--lenses', nargs='+', default=list(LENSES), choices=LENSES,
-                        metavar='LENS', help=f"the paper's lenses to run: {' '.join(LENSES)}")
-    parser.add_argument('--radii', nargs='+', type=float, default=list(RADII), choices=RADII,
-                        metavar='M', help="the paper's landmark distances to run, m: "
-                        + ' '.join(map(str, RADII)))
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_folder,
+        default=Path('demo'),
+        metavar='DIR',
+        help='folder to write the recording (replaces an earlier one), demo.json, '
+        'table.csv, table.parquet and pictures to; default: demo',
+    )
+    parser.add_argument(
+        '--lenses',
+        nargs='+',
+        default=list(LENSES),
+        choices=LENSES,
+        metavar='LENS',
+        help=f"the paper's lenses to run: {' '.join(LENSES)}",
+    )
+    parser.add_argument(
+        '--radii',
+        nargs='+',
+        type=float,
+        default=list(RADII),
+        choices=RADII,
+        metavar='M',
+        help="the paper's landmark distances to run, m: " + ' '.join(map(str, RADII)),
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -68,8 +86,9 @@ def run(args: argparse.Namespace) -> None:
     lenses, radii = list(dict.fromkeys(args.lenses)), list(dict.fromkeys(args.radii))
     bag = args.output / _RECORDING
     if reason := missing_rclpy():
-        print(f'  ROS 2 is missing ({reason}): the same scenarios run in one process, without '
-              'nodes.')
+        print(
+            f'  ROS 2 is missing ({reason}): the same scenarios run in one process, without nodes.'
+        )
         columns, fields = compute_demo(lenses, radii)
     else:
         with progress('running the nodes'):
@@ -82,16 +101,23 @@ def run(args: argparse.Namespace) -> None:
         apart = rows_left(pair)
     with write_together():
         write_columns(args.output / 'table', columns)
-        write_json(args.output / 'demo.json', {
-            'recording': None if reason else str(bag), 'rows': [row._asdict() for row in rows],
-            'rectified': remaining_document(apart),
-        })
+        write_json(
+            args.output / 'demo.json',
+            {
+                'recording': None if reason else str(bag),
+                'rows': [row._asdict() for row in rows],
+                'rectified': remaining_document(apart),
+            },
+        )
         _draw(args.output, rows, fields)
         draw_pair(args.output / 'rectified.png', *images)
     note_formats()
     _print(rows)
-    print_remaining(f'A pair of {lenses[0]}, rectified at {range_text(pair.left.range)}: '
-                    'difference between the rows of left and right', apart)
+    print_remaining(
+        f'A pair of {lenses[0]}, rectified at {range_text(pair.left.range)}: '
+        'difference between the rows of left and right',
+        apart,
+    )
     print(f'  {"" if reason else "recording, "}table, pictures: {args.output}')
 
 
@@ -108,7 +134,10 @@ def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float])
         for task in TASKS:
             cameras.append(f'camera_{task.name}')
             start_in_step(
-                processes, cameras[-1], [task.node], ['-r', f'__ns:=/{task.name}'],
+                processes,
+                cameras[-1],
+                [task.node],
+                ['-r', f'__ns:=/{task.name}'],
                 values(**camera_parameters(task, lenses, radii)),
             )
         processes.wait(cameras, _PATIENCE)
@@ -121,8 +150,20 @@ def _print(rows: Sequence[DemoRow]) -> None:
     for task in TASKS:
         mine = [row for row in rows if row.task == task.name]
         axis = () if task.name == 'depth' else ('axis deg', 'published')
-        print_table(task.title, ('lens', 'radius m', task.swept, 'error mm', 'published', *axis,
-                                 'image px', 'published'), map(_cells, mine))
+        print_table(
+            task.title,
+            (
+                'lens',
+                'radius m',
+                task.swept,
+                'error mm',
+                'published',
+                *axis,
+                'image px',
+                'published',
+            ),
+            map(_cells, mine),
+        )
 
 
 def _cells(row: DemoRow) -> tuple[str, ...]:
@@ -135,9 +176,14 @@ def _cells(row: DemoRow) -> tuple[str, ...]:
 
     axis = map(number, np.degrees([row.axis_error, row.published_axis_error]))
     return (
-        row.lens, f'{row.radius:g}', row.where,
-        number(1e3 * row.error), span(row.published_error, 1e3),
-        *(() if row.task == 'depth' else axis), number(row.pixels), span(row.published_pixels, 1),
+        row.lens,
+        f'{row.radius:g}',
+        row.where,
+        number(1e3 * row.error),
+        span(row.published_error, 1e3),
+        *(() if row.task == 'depth' else axis),
+        number(row.pixels),
+        span(row.published_pixels, 1),
     )
 
 

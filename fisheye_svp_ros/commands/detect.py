@@ -43,17 +43,28 @@ _UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('photographs', nargs='+', metavar='PHOTOS',
-                        help='image files or folders (left/ and right/ for a rig), videos, '
-                        'rosbag2 recordings with Image or CompressedImage')
+    parser.add_argument(
+        'photographs',
+        nargs='+',
+        metavar='PHOTOS',
+        help='image files or folders (left/ and right/ for a rig), videos, '
+        'rosbag2 recordings with Image or CompressedImage',
+    )
     add_board_arguments(parser, required=True)
-    parser.add_argument('-o', '--output', type=output_file, metavar='OBS.csv',
-                        help='observations to write; the details by photograph are written next '
-                        'to them as .detect.json')
-    parser.add_argument('--overlays', type=partial(output_folder, option='--overlays'),
-                        metavar='DIR',
-                        help='folder to write each photograph with its corners to, and a map of '
-                        'the coverage')
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_file,
+        metavar='OBS.csv',
+        help='observations to write; the details by photograph are written next '
+        'to them as .detect.json',
+    )
+    parser.add_argument(
+        '--overlays',
+        type=partial(output_folder, option='--overlays'),
+        metavar='DIR',
+        help='folder to write each photograph with its corners to, and a map of the coverage',
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -69,35 +80,45 @@ def run(args: argparse.Namespace) -> None:
         if args.overlays:
             from fisheye_svp_ros.reporting.overlays import write_coverage, write_overlays
 
-            write_overlays(find_photographs(args.photographs, args.every), detection,
-                           args.overlays)
+            write_overlays(
+                find_photographs(args.photographs, args.every), detection, args.overlays
+            )
             write_coverage(detection, args.overlays / 'coverage.png')
 
 
 def _print(detection: Detection, board: str) -> None:
     table, found = detection.observations, [one for one in detection.searched if one.points]
-    print(f'{board}: found in {len(found)} of {len(detection.searched)} photographs, '
-          f'{len(table)} points'
-          + ('' if np.isnan(table.sigma).any() else f', sigma {np.median(table.sigma):.3f} px'))
+    print(
+        f'{board}: found in {len(found)} of {len(detection.searched)} photographs, '
+        f'{len(table)} points'
+        + ('' if np.isnan(table.sigma).any() else f', sigma {np.median(table.sigma):.3f} px')
+    )
     pairing, cameras = detection.pairing, detection.observations.cameras
     if len(cameras) > 1:
         both = len({one.key for i, one in enumerate(detection.searched) if i not in pairing.alone})
         apart = f', {1e3 * pairing.apart:.3g} ms apart at most' if pairing.way == 'stamp' else ''
-        print(f'  cameras {", ".join(cameras)}: {both} simultaneous pairs, matched by '
-              f'{pairing.way}{apart}; {len(pairing.alone)} photographs without a partner')
+        print(
+            f'  cameras {", ".join(cameras)}: {both} simultaneous pairs, matched by '
+            f'{pairing.way}{apart}; {len(pairing.alone)} photographs without a partner'
+        )
     sure = detection.certainty[[one.points is not None for one in detection.searched]]
     if np.isnan(sure).any():
-        print('  the board looks the same when turned; too few photographs to determine its '
-              'orientation')
+        print(
+            '  the board looks the same when turned; too few photographs to determine its '
+            'orientation'
+        )
     elif (sure < 1).any():
-        print('  the board looks the same when turned; orientations were chosen by their '
-              f'residuals: {100 * sure.mean():.1f} % sure on average, {100 * sure.min():.0f} % at '
-              'worst')
+        print(
+            '  the board looks the same when turned; orientations were chosen by their '
+            f'residuals: {100 * sure.mean():.1f} % sure on average, {100 * sure.min():.0f} % at '
+            'worst'
+        )
 
 
 def _document(detection: Detection, board: str) -> dict[str, Any]:
-    rows = zip(detection.searched, detection.frames.tolist(), detection.certainty.tolist(),
-               strict=True)
+    rows = zip(
+        detection.searched, detection.frames.tolist(), detection.certainty.tolist(), strict=True
+    )
     return {
         'board': board,
         'image_size': list(detection.image_size),
@@ -105,12 +126,16 @@ def _document(detection: Detection, board: str) -> dict[str, Any]:
         'pairing': detection.pairing.way,
         'photographs': [
             {
-                'name': one.name, 'camera': one.camera, 'frame': frame,
+                'name': one.name,
+                'camera': one.camera,
+                'frame': frame,
                 'points': len(one.points.ids) if one.points else 0,
-                'reason': one.reason, 'notes': list(one.notes),
+                'reason': one.reason,
+                'notes': list(one.notes),
                 'blur_px': one.points.blur if one.points else None,
                 'sigma_px': float(one.points.sigma.mean()) if one.points else None,
-                'full_scale': one.bright, 'order_certainty': sure if one.points else None,
+                'full_scale': one.bright,
+                'order_certainty': sure if one.points else None,
             }
             for one, frame, sure in rows
         ],
@@ -119,18 +144,35 @@ def _document(detection: Detection, board: str) -> dict[str, Any]:
 
 def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False) -> None:
     """Declare what a search for a board in photographs needs."""
-    parser.add_argument('--board', required=required, metavar='SPEC',
-                        help='the board in the photographs: chessboard:9x6:24.23mm (inner '
-                        'corners), charuco:7x5:30mm:22mm:DICT_5X5_100, '
-                        'aprilgrid:target.yaml, circles:7x5:20mm[:asymmetric], '
-                        'squares:3x4:30mm:30mm (side, gap)')
-    parser.add_argument('--detector', choices=DETECTORS, default='',
-                        help='detector; default: the most accurate one for the board')
-    parser.add_argument('--every', type=positive_count, default=1, metavar='N',
-                        help='use every Nth photograph or video frame')
-    parser.add_argument('--sync', type=_seconds, metavar='TIME',
-                        help='for a rig: largest difference between the stamps of simultaneous '
-                        'images (of messages, or in file names); default: 5ms')
+    parser.add_argument(
+        '--board',
+        required=required,
+        metavar='SPEC',
+        help='the board in the photographs: chessboard:9x6:24.23mm (inner '
+        'corners), charuco:7x5:30mm:22mm:DICT_5X5_100, '
+        'aprilgrid:target.yaml, circles:7x5:20mm[:asymmetric], '
+        'squares:3x4:30mm:30mm (side, gap)',
+    )
+    parser.add_argument(
+        '--detector',
+        choices=DETECTORS,
+        default='',
+        help='detector; default: the most accurate one for the board',
+    )
+    parser.add_argument(
+        '--every',
+        type=positive_count,
+        default=1,
+        metavar='N',
+        help='use every Nth photograph or video frame',
+    )
+    parser.add_argument(
+        '--sync',
+        type=_seconds,
+        metavar='TIME',
+        help='for a rig: largest difference between the stamps of simultaneous '
+        'images (of messages, or in file names); default: 5ms',
+    )
 
 
 def search_options(args: argparse.Namespace) -> tuple[str, ...]:
@@ -143,9 +185,12 @@ def search_options(args: argparse.Namespace) -> tuple[str, ...]:
 
 def add_observation_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare OBS, and what a search needs where these are photographs."""
-    parser.add_argument('observations', metavar='OBS',
-                        help='observations (CSV file, folder of ORPC files, recording), or '
-                        'photographs, with --board')
+    parser.add_argument(
+        'observations',
+        metavar='OBS',
+        help='observations (CSV file, folder of ORPC files, recording), or '
+        'photographs, with --board',
+    )
     add_board_arguments(parser)
 
 
@@ -162,8 +207,10 @@ def read_input(path: str, args: argparse.Namespace) -> tuple[Observations, Sizes
         detection = search([path], args)
         return detection.observations, detection.image_sizes
     if is_photographs(Path(path)):
-        raise ParameterError(f'{path}: these are photographs; name their board, for example '
-                             '--board chessboard:9x6:24mm')
+        raise ParameterError(
+            f'{path}: these are photographs; name their board, for example '
+            '--board chessboard:9x6:24mm'
+        )
     table = read_observations(path)
     return replace(table, photographs=photographs_beside(Path(path), table.cameras)), {}
 
@@ -174,7 +221,8 @@ def image_sizes(text: str) -> Sizes:
     sizes = {camera.strip(): image_size(size) for camera, _, size in parts}
     if len(sizes) < len(parts):
         raise argparse.ArgumentTypeError(
-            f'{text!r} has two sizes for one camera; use left=1280x960,right=640x480')
+            f'{text!r} has two sizes for one camera; use left=1280x960,right=640x480'
+        )
     return sizes
 
 
@@ -203,11 +251,19 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     for line in doubtful_folders(paths):
         say(line)
     with progress('searching', count) as done:
-        detection = detect(find_photographs(paths, args.every), pattern, args.detector,
-                           progress=done, source=', '.join(paths), sync=args.sync)
-    odd = [f'{one.name}: {"; ".join(filter(None, (one.reason, *one.notes)))}'
-           for one in sorted(detection.searched, key=lambda one: not one.reason)
-           if one.reason or one.notes]
+        detection = detect(
+            find_photographs(paths, args.every),
+            pattern,
+            args.detector,
+            progress=done,
+            source=', '.join(paths),
+            sync=args.sync,
+        )
+    odd = [
+        f'{one.name}: {"; ".join(filter(None, (one.reason, *one.notes)))}'
+        for one in sorted(detection.searched, key=lambda one: not one.reason)
+        if one.reason or one.notes
+    ]
     for line in odd[:_MAX_LISTED]:
         say(line)
     if len(odd) > _MAX_LISTED:
@@ -215,13 +271,17 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     _note_alone(detection)
     unsure = int((detection.certainty < _UNCERTAIN).sum())
     if unsure:
-        say(f'{unsure} photographs: their orientation is less than {100 * _UNCERTAIN:.0f} % sure, '
-            f'since {args.board} looks the same when turned')
+        say(
+            f'{unsure} photographs: their orientation is less than {100 * _UNCERTAIN:.0f} % sure, '
+            f'since {args.board} looks the same when turned'
+        )
     found = sum(one.points is not None for one in detection.searched)
     larger = sum(LARGER_BOARD in one.notes for one in detection.searched)
     if larger and larger >= _MIN_LARGER_SHARE * found:
-        say(f'{larger} of {found} boards look larger than {args.board}; count its inner corners '
-            'again, otherwise photographs may number different corners alike')
+        say(
+            f'{larger} of {found} boards look larger than {args.board}; count its inner corners '
+            'again, otherwise photographs may number different corners alike'
+        )
     _note_tags(detection, pattern)
     if 2 * found < len(detection.searched):
         counted = ' (inner corners)' if pattern.kind == 'chessboard' else ''
@@ -234,21 +294,27 @@ def _note_tags(detection: Detection, pattern: Pattern) -> None:
     seen, beyond = np.sum([one.tags for one in detection.searched], axis=0).tolist()
     if beyond > _MIN_BEYOND_SHARE * seen:
         words = 'tagCols and tagRows' if pattern.kind == 'aprilgrid' else 'its columns and rows'
-        say(f'{beyond} of {seen} tags have ids beyond the {pattern.columns}x{pattern.rows} board; '
-            f'check {words}')
+        say(
+            f'{beyond} of {seen} tags have ids beyond the {pattern.columns}x{pattern.rows} board; '
+            f'check {words}'
+        )
 
 
 def _note_alone(detection: Detection) -> None:
     """Say which photographs of a rig have no partner of the same moment."""
     alone = [detection.searched[i].name for i in detection.pairing.alone]
     if len(alone) == len(detection.searched):
-        say(f'no photographs of two cameras are simultaneous, by {detection.pairing.way}; give '
+        say(
+            f'no photographs of two cameras are simultaneous, by {detection.pairing.way}; give '
             'simultaneous ones the same name or number, or name them by their stamps and raise '
-            '--sync')
+            '--sync'
+        )
     elif alone:
         more = f' and {len(alone) - _MAX_LISTED} more' if len(alone) > _MAX_LISTED else ''
-        say(f'{len(alone)} of {len(detection.searched)} photographs have no simultaneous partner, '
-            f'by {detection.pairing.way}: {", ".join(alone[:_MAX_LISTED])}{more}')
+        say(
+            f'{len(alone)} of {len(detection.searched)} photographs have no simultaneous partner, '
+            f'by {detection.pairing.way}: {", ".join(alone[:_MAX_LISTED])}{more}'
+        )
 
 
 def _seconds(text: str) -> float:

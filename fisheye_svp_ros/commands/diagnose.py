@@ -47,41 +47,91 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     add_observation_arguments(parser)
     add_lens_argument(parser, 'the simulation: ')
-    parser.add_argument('--poses', metavar='POSES.csv',
-                        help='poses of the camera (of a rig: the right one), or of the robot '
-                        'flange that carries it; the data tell which; default: unknown, and '
-                        'fitted')
-    parser.add_argument('--free', choices=['intrinsics'],
-                        help='fit the intrinsics too; a lens from `calibrate` always does')
-    parser.add_argument('--held-out', metavar='TEST',
-                        help='other observations of the same camera and target, to measure the '
-                        'gain on; default: cross-validation on OBS')
-    parser.add_argument('--against', metavar='OTHER',
-                        help='other observations of the same camera, with another target or of '
-                        'another day; causes in the lens must hold there too')
-    parser.add_argument('--with', dest='included', action='append', default=[], metavar='NAME',
-                        help='an effect that is known to be present: fit it without a test')
-    parser.add_argument('--without', dest='left_out', action='append', default=[], metavar='NAME',
-                        help='an effect that is known to be absent: do not test it')
+    parser.add_argument(
+        '--poses',
+        metavar='POSES.csv',
+        help='poses of the camera (of a rig: the right one), or of the robot '
+        'flange that carries it; the data tell which; default: unknown, and '
+        'fitted',
+    )
+    parser.add_argument(
+        '--free',
+        choices=['intrinsics'],
+        help='fit the intrinsics too; a lens from `calibrate` always does',
+    )
+    parser.add_argument(
+        '--held-out',
+        metavar='TEST',
+        help='other observations of the same camera and target, to measure the '
+        'gain on; default: cross-validation on OBS',
+    )
+    parser.add_argument(
+        '--against',
+        metavar='OTHER',
+        help='other observations of the same camera, with another target or of '
+        'another day; causes in the lens must hold there too',
+    )
+    parser.add_argument(
+        '--with',
+        dest='included',
+        action='append',
+        default=[],
+        metavar='NAME',
+        help='an effect that is known to be present: fit it without a test',
+    )
+    parser.add_argument(
+        '--without',
+        dest='left_out',
+        action='append',
+        default=[],
+        metavar='NAME',
+        help='an effect that is known to be absent: do not test it',
+    )
     add_dome_arguments(parser)
-    parser.add_argument('--quick', action='store_true',
-                        help='a first answer in seconds: one round on 1500 to 3000 points, '
-                        'selection without held-out frames')
-    parser.add_argument('--range', type=float, metavar='M', dest='range_m',
-                        help='state the ray errors at this distance too, m, besides 0.3, 1 and 5 '
-                        'm')
-    parser.add_argument('--next', type=view_count, default=0, metavar='N', dest='count',
-                        help='list the N photographs to take next: those that separate the '
-                        'confounded causes best')
-    parser.add_argument('--for', dest='number', metavar='NAME',
-                        help='with --next: minimize the error of one number (e0, fx, ...)')
-    parser.add_argument('--room', type=float, nargs=2, metavar='M',
-                        help='with --next: nearest and furthest distance at which the board is '
-                        'sharp; default: slightly beyond the distances in OBS')
-    parser.add_argument('-o', '--output', type=output_folder, metavar='DIR',
-                        help='folder to write report.html and its pictures, diagnosis.json, '
-                        'extended_lens.yaml and residuals.csv to; for a rig, also rig.yaml '
-                        'and a subfolder for the lens of each camera')
+    parser.add_argument(
+        '--quick',
+        action='store_true',
+        help='a first answer in seconds: one round on 1500 to 3000 points, '
+        'selection without held-out frames',
+    )
+    parser.add_argument(
+        '--range',
+        type=float,
+        metavar='M',
+        dest='range_m',
+        help='state the ray errors at this distance too, m, besides 0.3, 1 and 5 m',
+    )
+    parser.add_argument(
+        '--next',
+        type=view_count,
+        default=0,
+        metavar='N',
+        dest='count',
+        help='list the N photographs to take next: those that separate the confounded causes best',
+    )
+    parser.add_argument(
+        '--for',
+        dest='number',
+        metavar='NAME',
+        help='with --next: minimize the error of one number (e0, fx, ...)',
+    )
+    parser.add_argument(
+        '--room',
+        type=float,
+        nargs=2,
+        metavar='M',
+        help='with --next: nearest and furthest distance at which the board is '
+        'sharp; default: slightly beyond the distances in OBS',
+    )
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_folder,
+        metavar='DIR',
+        help='folder to write report.html and its pictures, diagnosis.json, '
+        'extended_lens.yaml and residuals.csv to; for a rig, also rig.yaml '
+        'and a subfolder for the lens of each camera',
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -110,9 +160,12 @@ def run(args: argparse.Namespace) -> None:
         check_number(args.number, observations, lens, names)
     with stages('diagnosing') as progress:
         settings: dict[str, Any] = {
-            'free_intrinsics': free, 'poses': poses, 'held_out': held_out,
+            'free_intrinsics': free,
+            'poses': poses,
+            'held_out': held_out,
             'options': DiagnosisOptions(
-                tuple(args.included), effects_left_out(args), args.quick, args.range_m, stated),
+                tuple(args.included), effects_left_out(args), args.quick, args.range_m, stated
+            ),
             'progress': progress,
         }
         try:
@@ -142,17 +195,22 @@ def _check_options(args: argparse.Namespace) -> None:
         raise ParameterError('--for and --room need --next N')
     for name in args.included:
         if name in args.left_out:
-            raise ParameterError(f'--with {name} and --without {name} contradict each other; '
-                                 'remove one of them')
+            raise ParameterError(
+                f'--with {name} and --without {name} contradict each other; remove one of them'
+            )
 
 
 def _fit_error(args: argparse.Namespace, cause: Exception) -> GeometryError:
     """Return what says that views cannot be fitted, and what to check."""
-    poses_too = (f' Check that the poses of {args.poses} are those of the camera in the world.'
-                 if args.poses else '')
+    poses_too = (
+        f' Check that the poses of {args.poses} are those of the camera in the world.'
+        if args.poses
+        else ''
+    )
     return GeometryError(
         f'{args.observations}: its views cannot be fitted with this lens: {cause}; check camera '
-        f'and image size of the lens; `localize` lists the residual of each view.{poses_too}')
+        f'and image size of the lens; `localize` lists the residual of each view.{poses_too}'
+    )
 
 
 def _plan_next_views(
@@ -163,8 +221,9 @@ def _plan_next_views(
 
     room = None if args.room is None else view_limits(args.room)
     try:
-        return next_photographs(diagnosis.model, diagnosis.causes, diagnosis.noise_px, args.count,
-                                args.number, room), None
+        return next_photographs(
+            diagnosis.model, diagnosis.causes, diagnosis.noise_px, args.count, args.number, room
+        ), None
     except FisheyeSvpError as why:
         return None, why
 
@@ -200,7 +259,9 @@ def _read(
 
 
 def _print(
-    diagnosis: Diagnosis, known: Mapping[str, Comparison], args: argparse.Namespace,
+    diagnosis: Diagnosis,
+    known: Mapping[str, Comparison],
+    args: argparse.Namespace,
     wanted: NextViews | None,
 ) -> None:
     """Print what the first screen of the report says, and the photographs to take next."""
@@ -211,15 +272,23 @@ def _print(
     from fisheye_svp_ros.reporting.terminal import print_lines, print_table
 
     command = command_to_go_on(diagnosis, _inputs(args, bool(diagnosis.intrinsics)))
-    print_lines([
-        *terminal_lines(first_screen(diagnosis, args.observations, known),
-                        command if args.output else ''),
-        *(f'{one.title}: {one.sentence}' for one in external_text.sections(diagnosis))])
+    print_lines(
+        [
+            *terminal_lines(
+                first_screen(diagnosis, args.observations, known), command if args.output else ''
+            ),
+            *(f'{one.title}: {one.sentence}' for one in external_text.sections(diagnosis)),
+        ]
+    )
     if wanted:
         from fisheye_svp_ros.reporting import shot_list
 
-        print_table(f'photographs to take next, {shot_list.purpose(wanted)}', shot_list.HEADER,
-                    shot_list.rows(wanted), words=shot_list.TEXT_COLUMNS)
+        print_table(
+            f'photographs to take next, {shot_list.purpose(wanted)}',
+            shot_list.HEADER,
+            shot_list.rows(wanted),
+            words=shot_list.TEXT_COLUMNS,
+        )
     if args.output:
         files = ['report.html', 'diagnosis.json']
         if diagnosis.offers_extended:
@@ -232,20 +301,36 @@ def _inputs(args: argparse.Namespace, free: bool) -> ReportInputs:
     from fisheye_svp_ros.reporting.next_steps import ReportInputs
 
     return ReportInputs(
-        args.observations, tuple(args.lens), args.poses, args.held_out, args.output or Path(),
-        free, search_options(args) if args.board else (), _settings(args), bool(args.count))
+        args.observations,
+        tuple(args.lens),
+        args.poses,
+        args.held_out,
+        args.output or Path(),
+        free,
+        search_options(args) if args.board else (),
+        _settings(args),
+        bool(args.count),
+    )
 
 
 def _settings(args: argparse.Namespace) -> tuple[str, ...]:
     """Return the options with which another diagnosis solves the same problem."""
-    named = [('--poses', args.poses), ('--free', args.free), ('--medium', args.medium),
-             ('--port', args.port), *(('--with', name) for name in args.included),
-             *(('--without', name) for name in args.left_out)]
+    named = [
+        ('--poses', args.poses),
+        ('--free', args.free),
+        ('--medium', args.medium),
+        ('--port', args.port),
+        *(('--with', name) for name in args.included),
+        *(('--without', name) for name in args.left_out),
+    ]
     return tuple(word for option, value in named if value for word in (option, value))
 
 
 def _write(
-    args: argparse.Namespace, diagnosis: Diagnosis, known: Mapping[str, Comparison], free: bool,
+    args: argparse.Namespace,
+    diagnosis: Diagnosis,
+    known: Mapping[str, Comparison],
+    free: bool,
     wanted: NextViews | None,
 ) -> None:
     from fisheye_svp_ros.reporting.diagnosis_plots import point_residuals
@@ -271,14 +356,33 @@ def _write_residuals(path: Path, points: PointResiduals, table: Observations) ->
     cameras = np.array(table.cameras)[points.camera]
     named = {'camera': cameras} if len(table.cameras) > 1 else {}
     names = photograph_names(table)
-    photographs = {'photograph': np.array([
-        names.get(view, '') for view in zip(points.frame.tolist(), cameras.tolist(), strict=True)
-    ])} if names else {}
-    write_table(path, {
-        'frame': points.frame, **named, 'landmark': points.landmark,
-        'u': points.uv[:, 0], 'v': points.uv[:, 1],
-        'du_before': points.before[:, 0], 'dv_before': points.before[:, 1],
-        'du_after': points.after[:, 0], 'dv_after': points.after[:, 1],
-        'theta': points.theta, 'range': points.range, 'outlier': points.outlier.astype(int),
-        **photographs,
-    })
+    photographs = (
+        {
+            'photograph': np.array(
+                [
+                    names.get(view, '')
+                    for view in zip(points.frame.tolist(), cameras.tolist(), strict=True)
+                ]
+            )
+        }
+        if names
+        else {}
+    )
+    write_table(
+        path,
+        {
+            'frame': points.frame,
+            **named,
+            'landmark': points.landmark,
+            'u': points.uv[:, 0],
+            'v': points.uv[:, 1],
+            'du_before': points.before[:, 0],
+            'dv_before': points.before[:, 1],
+            'du_after': points.after[:, 0],
+            'dv_after': points.after[:, 1],
+            'theta': points.theta,
+            'range': points.range,
+            'outlier': points.outlier.astype(int),
+            **photographs,
+        },
+    )

@@ -33,21 +33,44 @@ fisheye-svp diagnose observations.csv --lens lens.yaml -o diagnosis
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('-o', '--output', type=output_folder, required=True, metavar='DIR',
-                        help='folder to write the photographs, the truth and a README to')
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_folder,
+        required=True,
+        metavar='DIR',
+        help='folder to write the photographs, the truth and a README to',
+    )
 
 
 def run(args: argparse.Namespace) -> None:
     """Render the photographs, write the truth and a README."""
-    lens = Lens('example', 480, 450, 160.3, 160.5, 240.4, 223.7,
-                KannalaBrandt(-0.010, 0.004, -0.0015, 0.0), np.radians(94.0), Gennery(e0=0.004))
+    lens = Lens(
+        'example',
+        480,
+        450,
+        160.3,
+        160.5,
+        240.4,
+        223.7,
+        KannalaBrandt(-0.010, 0.004, -0.0015, 0.0),
+        np.radians(94.0),
+        Gennery(e0=0.004),
+    )
     printed = Print(9, 6, 0.025)
     printed = Print(9, 6, 0.025, bow=parabola(printed.corners, 0.0015))
     poses = board_views(lens, printed, 14, (0.10, 0.30), np.random.default_rng(1))
     truth = args.output / 'truth'
     with write_together():
-        write_photographs({'': (lens, identity())}, board(printed), poses, Exposure(), 0,
-                          args.output / 'photographs', truth)
+        write_photographs(
+            {'': (lens, identity())},
+            board(printed),
+            poses,
+            Exposure(),
+            0,
+            args.output / 'photographs',
+            truth,
+        )
         save_lens(lens, truth / 'lens.yaml')
         write_text(args.output / 'README.md', _README)
     print(f'{args.output}: photographs and README.md, which lists three commands to try on them')

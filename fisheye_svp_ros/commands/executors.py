@@ -39,8 +39,10 @@ def process_pool(count: int) -> Iterator[Workers]:
         try:
             yield Workers(executor, _TASKS_PER_WORKER * count)
         except BrokenExecutor as cause:
-            raise SweepError('a worker process died (out of memory?); finished parts are kept; '
-                             'continue with --resume and fewer --workers') from cause
+            raise SweepError(
+                'a worker process died (out of memory?); finished parts are kept; '
+                'continue with --resume and fewer --workers'
+            ) from cause
         except (KeyboardInterrupt, SystemExit):
             # Nobody waits any longer for what they are at.
             for process in multiprocessing.active_children():
@@ -58,8 +60,7 @@ class _Processes(ProcessPoolExecutor):
     """
 
     def __init__(self, count: int, folder: str) -> None:
-        super().__init__(
-            count, multiprocessing.get_context('spawn'), initializer=_end_with_parent)
+        super().__init__(count, multiprocessing.get_context('spawn'), initializer=_end_with_parent)
         self._folder = folder
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -95,8 +96,9 @@ def dask(address: str) -> Iterator[Workers]:
         import distributed
         from distributed.comm import CommClosedError
     except ModuleNotFoundError as cause:
-        raise SweepError('dask.distributed is not installed; install the extra `dask` of this '
-                         'package') from cause
+        raise SweepError(
+            'dask.distributed is not installed; install the extra `dask` of this package'
+        ) from cause
     try:
         client = distributed.Client(address, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError) as cause:
@@ -110,8 +112,10 @@ def dask(address: str) -> Iterator[Workers]:
         try:
             yield Workers(client.get_executor(pure=False), ahead)
         except (distributed.KilledWorker, CommClosedError) as cause:
-            raise SweepError(f'the Dask cluster gave up ({cause}); finished parts are kept; '
-                             'continue with --resume') from cause
+            raise SweepError(
+                f'the Dask cluster gave up ({cause}); finished parts are kept; '
+                'continue with --resume'
+            ) from cause
 
 
 def _end_with_parent() -> None:

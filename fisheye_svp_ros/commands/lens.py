@@ -33,15 +33,26 @@ _VISIBLE_PX = 5e-4  # px
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('lens', metavar='LENS',
-                        help='lens file of this package or of another tool (FILE#cam1: another '
-                        'camera than the first), or the name of a lens of this package')
+    parser.add_argument(
+        'lens',
+        metavar='LENS',
+        help='lens file of this package or of another tool (FILE#cam1: another '
+        'camera than the first), or the name of a lens of this package',
+    )
     parser.add_argument('-o', '--output', type=output_file, metavar='FILE', help='file to write')
-    parser.add_argument('--format', choices=WRITABLE,
-                        help='format of the file to write; default: a lens file of this package')
-    parser.add_argument('--range', type=float, metavar='M', dest='range_m',
-                        help='range, m or inf, at which a format with a single viewpoint is '
-                        'fitted to a lens whose viewpoint moves')
+    parser.add_argument(
+        '--format',
+        choices=WRITABLE,
+        help='format of the file to write; default: a lens file of this package',
+    )
+    parser.add_argument(
+        '--range',
+        type=float,
+        metavar='M',
+        dest='range_m',
+        help='range, m or inf, at which a format with a single viewpoint is '
+        'fitted to a lens whose viewpoint moves',
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -59,23 +70,31 @@ def run(args: argparse.Namespace) -> None:
         return
     lens = load_with_notes(path)
     if several := cameras_in(path):
-        say(f'{path}: it holds {", ".join(several)}; the first is shown; use '
-            f'{args.lens}#{several[1]} for another')
-    print(f'{lens.name}: {lens.width}x{lens.height} px, up to {np.degrees(lens.max_incidence):.2f}'
-          ' deg')
+        say(
+            f'{path}: it holds {", ".join(several)}; the first is shown; use '
+            f'{args.lens}#{several[1]} for another'
+        )
+    print(
+        f'{lens.name}: {lens.width}x{lens.height} px, up to {np.degrees(lens.max_incidence):.2f}'
+        ' deg'
+    )
     for name, value in lens.parameters.items():
         print(f'  {name:<18}{value:.10g}')
     for name, entry in lens.corrections.items():
         for parameter, value in entry.get('parameters', {}).items():
             print(f'  {f"{name} {parameter}":<18} {value:.10g}')
     if lens.image_field is not None:
-        print(f'  {IMAGE_FIELD:<18}{lens.image_field.rms:.3g} px rms, splines of '
-              f'{" x ".join(map(str, lens.image_field.values.shape[1::-1]))} nodes')
+        print(
+            f'  {IMAGE_FIELD:<18}{lens.image_field.rms:.3g} px rms, splines of '
+            f'{" x ".join(map(str, lens.image_field.values.shape[1::-1]))} nodes'
+        )
     if foreign is not None:
         for camera, worst in foreign.worst_px.items():
             if worst > 0:
-                print(f'  {camera}: kannala_brandt fitted to {foreign.form}, at most {worst:.2g} '
-                      'px off')
+                print(
+                    f'  {camera}: kannala_brandt fitted to {foreign.form}, at most {worst:.2g} '
+                    'px off'
+                )
     _print_rig(rigs_of_lenses(path))
     if args.output and args.format:
         _convert(lens, args)
@@ -93,8 +112,10 @@ def _convert(lens: Lens, args: argparse.Namespace) -> None:
     elif args.range_m is not None:
         given, worst = nearest_svp_lens(lens, args.range_m)
         ranges = tuple(sorted({*_RANGES, args.range_m}))
-        print(f'  one viewpoint, fitted at {range_text(args.range_m)}: {worst:.2g} px off there '
-              'at most')
+        print(
+            f'  one viewpoint, fitted at {range_text(args.range_m)}: {worst:.2g} px off there '
+            'at most'
+        )
     text = write_foreign(given, args.format)
     write_text(args.output, text)
     written = read_foreign(args.output, text)
@@ -104,8 +125,11 @@ def _convert(lens: Lens, args: argparse.Namespace) -> None:
 
 def _print_rig(steps: Sequence[Pose]) -> None:
     for number, rig in enumerate(steps):
-        print(f'  camera {number} in camera {number + 1} at '
-              + ', '.join(f'{1000 * value:.3f}' for value in rig.position) + ' mm')
+        print(
+            f'  camera {number} in camera {number + 1} at '
+            + ', '.join(f'{1000 * value:.3f}' for value in rig.position)
+            + ' mm'
+        )
 
 
 def _print_loss(lens: Lens, written: Lens, ranges: Sequence[float], as_it_stands: bool) -> None:
@@ -118,24 +142,29 @@ def _print_loss(lens: Lens, written: Lens, ranges: Sequence[float], as_it_stands
     named = [name for name in (*port, *own, *field, *lens.target) if name != LANDMARKS]
     shift = lens.viewpoint_shift
     if shift is not None and written.viewpoint_shift != shift:
-        constant = (isinstance(shift, Gennery)
-                    and written.viewpoint_shift == replace(shift, s0=0.0))
+        constant = isinstance(shift, Gennery) and written.viewpoint_shift == replace(shift, s0=0.0)
         named.insert(0, 's0 of the viewpoint shift' if constant else 'the viewpoint shift')
     if named:
         print(f'left out: {", ".join(named)}')
     angles = [angle for angle in _ANGLES if np.radians(angle) < lens.max_incidence]
     theta = np.radians(angles)[:, None]
     sin = np.sin(theta)
-    around = np.stack(np.broadcast_arrays(
-        sin * np.cos(_AZIMUTHS), sin * np.sin(_AZIMUTHS), np.cos(theta)), axis=-1)
+    around = np.stack(
+        np.broadcast_arrays(sin * np.cos(_AZIMUTHS), sin * np.sin(_AZIMUTHS), np.cos(theta)),
+        axis=-1,
+    )
     distance = np.minimum(ranges, MAX_RANGE)
     points = distance[:, None, None] * around[:, None]
     off = np.linalg.norm(project(lens, points).uv - project(written, points).uv, axis=-1)
     worst = np.fmax.reduce(off, axis=-1)
     if np.fmax.reduce(worst, axis=None) > _VISIBLE_PX:
-        print_table('largest error of image points without it, px',
-                    ('deg', *map(range_text, ranges)),
-                    [(str(angle), *('-' if np.isnan(value) else f'{value:.3f}' for value in row))
-                     for angle, row in zip(angles, worst, strict=True)])
+        print_table(
+            'largest error of image points without it, px',
+            ('deg', *map(range_text, ranges)),
+            [
+                (str(angle), *('-' if np.isnan(value) else f'{value:.3f}' for value in row))
+                for angle, row in zip(angles, worst, strict=True)
+            ],
+        )
         if as_it_stands and 'the viewpoint shift' in named:
             print('  --range M fits the curve at one range, without error there')

@@ -24,10 +24,15 @@ _FORMS = 'flat, flat:5mm:1.49 (glass and its index), dome:60mm, dome:60mm:4mm:1.
 
 def add_lens_argument(parser: argparse.ArgumentParser, purpose: str = '') -> None:
     """Declare --lens, which may be given once a camera."""
-    parser.add_argument('--lens', required=True, action='append', metavar='[CAMERA=]LENS',
-                        help=f'{purpose}lens file, also of other tools, or the name of a lens of '
-                        'this package; for a rig, left=LENS and right=LENS, or a file or '
-                        'folder that holds both')
+    parser.add_argument(
+        '--lens',
+        required=True,
+        action='append',
+        metavar='[CAMERA=]LENS',
+        help=f'{purpose}lens file, also of other tools, or the name of a lens of '
+        'this package; for a rig, left=LENS and right=LENS, or a file or '
+        'folder that holds both',
+    )
 
 
 def load_with_notes(path: str | Path) -> Lens:
@@ -40,18 +45,24 @@ def load_with_notes(path: str | Path) -> Lens:
 def note_odd(lens: Lens, path: str | Path, worst: float) -> None:
     """Say where a lens may not be what is meant; worst: px from what another tool's file says."""
     if not (-0.5 <= lens.cx <= lens.width - 0.5 and -0.5 <= lens.cy <= lens.height - 0.5):
-        say(f'{path}: the principal point ({lens.cx:.1f}, {lens.cy:.1f}) lies outside the image '
-            f'of {lens.width}x{lens.height} px; check cx, cy and the image size')
+        say(
+            f'{path}: the principal point ({lens.cx:.1f}, {lens.cy:.1f}) lies outside the image '
+            f'of {lens.width}x{lens.height} px; check cx, cy and the image size'
+        )
     limit = np.degrees(lens.max_incidence)
     shift = float(lens.shift_at(np.asarray(lens.max_incidence)))
     if abs(shift) > _MAX_SHIFT:
-        say(f'{path}: the viewpoint shift is {shift:.2g} m at {limit:.3g} deg; its '
-            'coefficients are in m')
+        say(
+            f'{path}: the viewpoint shift is {shift:.2g} m at {limit:.3g} deg; its '
+            'coefficients are in m'
+        )
     if limit < _MIN_FIELD_DEG:
         say(f'{path}: max_incidence_deg is {limit:.3g}; it is in degrees')
     if worst > LARGE_DEVIATION:
-        say(f'{path}: the nearest lens is {worst:.2g} px off the model of this file; calibrate '
-            'again from its photographs')
+        say(
+            f'{path}: the nearest lens is {worst:.2g} px off the model of this file; calibrate '
+            'again from its photographs'
+        )
 
 
 class Lenses(dict[str, 'Lens']):
@@ -74,9 +85,11 @@ def load_lenses(given: Sequence[str]) -> Lenses:
         if not equals or is_there(Path(without_camera(text)[0])):
             camera, path = '', text
         if camera in lenses:
-            raise LensError(f'--lens {text}: a lens '
-                            f'{"of camera " + camera if camera else "without a camera"} is '
-                            'already given')
+            raise LensError(
+                f'--lens {text}: a lens '
+                f'{"of camera " + camera if camera else "without a camera"} is '
+                'already given'
+            )
         file = lens_path(path)
         lenses[camera] = load_with_notes(file)
         if not camera:
@@ -95,16 +108,20 @@ def lenses_of(cameras: Sequence[str], lenses: Lenses) -> dict[str, Lens]:
     if len(lenses) == 1 and len(lenses.in_file) > 1:
         if any(cameras):
             return _in_order(cameras, lenses)
-        say(f'{lenses.file}: it holds {", ".join(lenses.names)}, and no camera is named; the lens '
-            f'of {lenses.names[0]} is used; use {lenses.file}#{lenses.names[1]} for another')
+        say(
+            f'{lenses.file}: it holds {", ".join(lenses.names)}, and no camera is named; the lens '
+            f'of {lenses.names[0]} is used; use {lenses.file}#{lenses.names[1]} for another'
+        )
     unknown = [camera for camera in lenses if camera and camera not in cameras]
     if unknown:
         held = ', '.join(filter(None, cameras)) or 'one camera without a name'
         raise LensError(f'--lens {unknown[0]}=...: the observations hold {held}')
     for camera in cameras:
         if camera not in lenses and '' not in lenses:
-            raise LensError(f'camera {camera or "without a name"} has no lens; add '
-                            f'--lens {camera + "=" if camera else ""}LENS')
+            raise LensError(
+                f'camera {camera or "without a name"} has no lens; add '
+                f'--lens {camera + "=" if camera else ""}LENS'
+            )
     return {camera: lenses.get(camera) or lenses[''] for camera in cameras}
 
 
@@ -113,20 +130,26 @@ def _in_order(cameras: Sequence[str], lenses: Lenses) -> dict[str, Lens]:
     if set(cameras) <= set(named):
         return {camera: named[camera] for camera in cameras}
     if len(cameras) != len(named):
-        raise LensError(f'{lenses.file}: it holds {", ".join(named)}, the observations '
-                        f'{", ".join(cameras)}; assign them: --lens '
-                        f'{cameras[0]}={lenses.file}#{lenses.names[0]} ...')
+        raise LensError(
+            f'{lenses.file}: it holds {", ".join(named)}, the observations '
+            f'{", ".join(cameras)}; assign them: --lens '
+            f'{cameras[0]}={lenses.file}#{lenses.names[0]} ...'
+        )
     return dict(zip(sorted(cameras), lenses.in_file, strict=True))
 
 
 def add_port_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare --medium and --port."""
-    parser.add_argument('--medium', metavar='MEDIUM',
-                        help='medium between port and target: ' + ', '.join(MEDIA)
-                        + ' or a refractive index')
-    parser.add_argument('--port', metavar='SPEC',
-                        help=f'what the camera looked through: {_FORMS}; default: flat, its glass '
-                        'counted as air')
+    parser.add_argument(
+        '--medium',
+        metavar='MEDIUM',
+        help='medium between port and target: ' + ', '.join(MEDIA) + ' or a refractive index',
+    )
+    parser.add_argument(
+        '--port',
+        metavar='SPEC',
+        help=f'what the camera looked through: {_FORMS}; default: flat, its glass counted as air',
+    )
 
 
 def port_of(args: argparse.Namespace) -> Port | None:
@@ -140,8 +163,9 @@ def port_of(args: argparse.Namespace) -> Port | None:
     try:
         index = MEDIA.get(medium) or float(medium)
     except ValueError as cause:
-        raise ParameterError(f'--medium {medium}: known are {", ".join(MEDIA)}, and refractive '
-                             'indices') from cause
+        raise ParameterError(
+            f'--medium {medium}: known are {", ".join(MEDIA)}, and refractive indices'
+        ) from cause
     kind, *numbers = (args.port or 'flat').split(':')
     try:
         if kind == 'flat' and len(numbers) <= 2:
@@ -152,8 +176,10 @@ def port_of(args: argparse.Namespace) -> Port | None:
             raise ValueError
     except ValueError as cause:
         raise ParameterError(f'--port {args.port}: it must be of the form {_FORMS}') from cause
-    for option, given in ((f'--medium {args.medium}', FlatGlass(0.0, index)),
-                          (f'--port {args.port}', port)):
+    for option, given in (
+        (f'--medium {args.medium}', FlatGlass(0.0, index)),
+        (f'--port {args.port}', port),
+    ):
         if wrong := given.check():
             raise ParameterError(f'{option}: {wrong}')
     return port
@@ -161,12 +187,16 @@ def port_of(args: argparse.Namespace) -> Port | None:
 
 def add_dome_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare --medium and --port of a diagnosis: a dome in air."""
-    parser.add_argument('--medium', metavar='MEDIUM',
-                        help='with --port dome: air; other media are always tested')
-    parser.add_argument('--port', metavar='SPEC',
-                        help='dome in front of the camera: dome:60mm:4mm:1.5 (inner radius, '
-                        'glass, index), or dome for 50 mm with 4 mm of glass; the offset of its '
-                        'center from the axis is estimated')
+    parser.add_argument(
+        '--medium', metavar='MEDIUM', help='with --port dome: air; other media are always tested'
+    )
+    parser.add_argument(
+        '--port',
+        metavar='SPEC',
+        help='dome in front of the camera: dome:60mm:4mm:1.5 (inner radius, '
+        'glass, index), or dome for 50 mm with 4 mm of glass; the offset of its '
+        'center from the axis is estimated',
+    )
 
 
 def dome_of(args: argparse.Namespace, lenses: Mapping[str, Lens]) -> tuple[DomePortEffect, ...]:
@@ -180,16 +210,23 @@ def dome_of(args: argparse.Namespace, lenses: Mapping[str, Lens]) -> tuple[DomeP
     port = port_of(args)
     if port is None:
         return ()
-    option = ' '.join(f'--{name} {value}' for name, value in (
-        ('medium', args.medium), ('port', args.port)) if value)
+    option = ' '.join(
+        f'--{name} {value}'
+        for name, value in (('medium', args.medium), ('port', args.port))
+        if value
+    )
     if not isinstance(port, DomeGlass):
         raise ParameterError(f'{option}: a flat port is always tested; leave the option out')
     if port.medium_index != MEDIA['air']:
-        raise ParameterError(f'{option}: a dome is diagnosed in air, with --medium air; in water '
-                             '`calibrate --lens AIR.yaml` with the same options fits it')
+        raise ParameterError(
+            f'{option}: a dome is diagnosed in air, with --medium air; in water '
+            '`calibrate --lens AIR.yaml` with the same options fits it'
+        )
     if not port.thickness:
-        raise ParameterError(f'{option}: glass of no thickness bends nothing in air; state it, as '
-                             'in --port dome:60mm:4mm')
+        raise ParameterError(
+            f'{option}: glass of no thickness bends nothing in air; state it, as '
+            'in --port dome:60mm:4mm'
+        )
     if len(lenses) > 1 or any(lens.port is not None for lens in lenses.values()):
         raise ParameterError(f'{option}: one lens without a port of its own is needed')
     return (DomePortEffect(port.radius, port.thickness, port.glass_index),)

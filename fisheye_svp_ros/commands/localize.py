@@ -39,17 +39,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     add_observation_arguments(parser)
     add_lens_argument(parser)
-    parser.add_argument('--model-error', action='store_true',
-                        help='include in the covariances the errors stated in the lens file: of '
-                        'its parameters, and unexplained (extended_lens.yaml)')
-    parser.add_argument('--rig', metavar='RIG',
-                        help='poses of the cameras of a rig: rig.yaml from `calibrate`, its '
-                        'folder, or a camchain; gives one pose per frame from all cameras, '
-                        'that of the first camera')
-    parser.add_argument('-o', '--output', type=output_folder, metavar='DIR',
-                        help='folder to write localize.json, poses.csv, residuals.csv and '
-                        'covariance.csv to; for several cameras without --rig, one subfolder '
-                        'each')
+    parser.add_argument(
+        '--model-error',
+        action='store_true',
+        help='include in the covariances the errors stated in the lens file: of '
+        'its parameters, and unexplained (extended_lens.yaml)',
+    )
+    parser.add_argument(
+        '--rig',
+        metavar='RIG',
+        help='poses of the cameras of a rig: rig.yaml from `calibrate`, its '
+        'folder, or a camchain; gives one pose per frame from all cameras, '
+        'that of the first camera',
+    )
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_folder,
+        metavar='DIR',
+        help='folder to write localize.json, poses.csv, residuals.csv and '
+        'covariance.csv to; for several cameras without --rig, one subfolder '
+        'each',
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -105,14 +116,21 @@ def _print(
     table: Observations, measured: MeasuredPoses, uncertainty: _Parts | None, source: str
 ) -> None:
     views, residual = measured.views, measured.inlier_residual
-    labels = [(frame_name(table, frame).removeprefix('frame '), str(count)) for frame, count in
-              zip(views.frame[:_MAX_ROWS].tolist(), views.used.sum(axis=1), strict=False)]
+    labels = [
+        (frame_name(table, frame).removeprefix('frame '), str(count))
+        for frame, count in zip(
+            views.frame[:_MAX_ROWS].tolist(), views.used.sum(axis=1), strict=False
+        )
+    ]
     _print_poses(
         f'{source}: {int(views.used.sum())} points in {len(views.frame)} frames, '
         f'rms {rms_px(residual):.4f} px',
-        labels, [rms_px(one) for one in residual[:_MAX_ROWS]], measured.result.pose,
+        labels,
+        [rms_px(one) for one in residual[:_MAX_ROWS]],
+        measured.result.pose,
         measured.result.covariance,
-        noise_text(measured.sigma) if uncertainty is None else _parts_text(uncertainty))
+        noise_text(measured.sigma) if uncertainty is None else _parts_text(uncertainty),
+    )
 
 
 def _print_rig(table: Observations, cameras: tuple[str, ...], found: RigLocalization) -> None:
@@ -126,24 +144,54 @@ def _print_rig(table: Observations, cameras: tuple[str, ...], found: RigLocaliza
         f'{table.source}: {cameras[0]} in the world, from {int(data.views.used.sum())} points of '
         f'{len(found.table.cameras)} cameras in {len(found.frame)} frames, rms '
         f'{rms_px(found.residual):.4f} px',
-        labels, rms, found.pose, found.covariance, noise_text(found.sigma))
+        labels,
+        rms,
+        found.pose,
+        found.covariance,
+        noise_text(found.sigma),
+    )
 
 
 def _print_poses(
-    title: str, labels: Sequence[tuple[str, ...]], rms: Sequence[float], pose: Pose,
-    covariance: Array, errors: str,
+    title: str,
+    labels: Sequence[tuple[str, ...]],
+    rms: Sequence[float],
+    pose: Pose,
+    covariance: Array,
+    errors: str,
 ) -> None:
     """Print poses (F,), the first with labels: frame, cameras of a rig, number of points."""
-    worst = [np.sqrt(np.linalg.eigvalsh(covariance[:, part, part])[:, -1])
-             for part in (slice(0, 3), slice(3, 6))]
+    worst = [
+        np.sqrt(np.linalg.eigvalsh(covariance[:, part, part])[:, -1])
+        for part in (slice(0, 3), slice(3, 6))
+    ]
     rows = [
-        (*label, f'{rms[i]:.4f}', *(f'{1000 * value:.3f}' for value in pose.position[i]),
-         f'{1000 * worst[0][i]:.3f}', f'{np.degrees(worst[1][i]):.4f}')
+        (
+            *label,
+            f'{rms[i]:.4f}',
+            *(f'{1000 * value:.3f}' for value in pose.position[i]),
+            f'{1000 * worst[0][i]:.3f}',
+            f'{np.degrees(worst[1][i]):.4f}',
+        )
         for i, label in enumerate(labels)
     ]
     cameras = ('cameras',) if len(labels[0]) > 2 else ()
-    print_table(title, ('frame', *cameras, 'points', 'rms px', 'x mm', 'y mm', 'z mm',
-                        'std. error mm', 'std. error deg'), rows, words=cameras)
+    print_table(
+        title,
+        (
+            'frame',
+            *cameras,
+            'points',
+            'rms px',
+            'x mm',
+            'y mm',
+            'z mm',
+            'std. error mm',
+            'std. error deg',
+        ),
+        rows,
+        words=cameras,
+    )
     if more := len(pose.position) - len(rows):
         print(f'  and {more} more frames')
     print(f'  {errors}, largest over all directions')
@@ -151,9 +199,14 @@ def _print_poses(
 
 def _parts_text(uncertainty: _Parts) -> str:
     by = uncertainty['position_m']
-    shares = ', '.join(f'{words} {1000 * by[name]:.3g} mm' for name, words in (
-        ('noise', 'noise'), ('parameters', 'parameters of the lens'),
-        ('misfit', 'unexplained model error')))
+    shares = ', '.join(
+        f'{words} {1000 * by[name]:.3g} mm'
+        for name, words in (
+            ('noise', 'noise'),
+            ('parameters', 'parameters of the lens'),
+            ('misfit', 'unexplained model error'),
+        )
+    )
     return f'standard errors with those of the lens (rms of positions: {shares})'
 
 
@@ -161,12 +214,17 @@ def _write_poses(folder: Path, frame: Index, pose: Pose, covariance: Array) -> N
     """Write poses (F,) and their covariances (F, 6, 6)."""
     write_poses(folder / 'poses.csv', frame, pose)
     names = [f'{a}_{b}' for a in _AXES for b in _AXES]
-    write_table(folder / 'covariance.csv', {
-        'frame': frame, **dict(zip(names, covariance.reshape(-1, 36).T, strict=True))})
+    write_table(
+        folder / 'covariance.csv',
+        {'frame': frame, **dict(zip(names, covariance.reshape(-1, 36).T, strict=True))},
+    )
 
 
 def _write(
-    folder: Path, model: ForwardModel, table: Observations, measured: MeasuredPoses,
+    folder: Path,
+    model: ForwardModel,
+    table: Observations,
+    measured: MeasuredPoses,
     uncertainty: _Parts | None,
 ) -> None:
     views, result = measured.views, measured.result
@@ -174,54 +232,92 @@ def _write(
     used = views.used
     frame = np.broadcast_to(views.frame[:, None], used.shape)
     theta, distance = sight(model, result.pose, views)
-    write_table(folder / 'residuals.csv', {
-        'frame': frame[used], 'landmark': views.landmark[used],
-        'u': views.uv[used][:, 0], 'v': views.uv[used][:, 1],
-        'du': result.residual[used][:, 0], 'dv': result.residual[used][:, 1],
-        'theta': theta[used], 'range': distance[used],
-    })
-    write_json(folder / 'localize.json', {
-        'rms_px': rms_px(measured.inlier_residual),
-        'frames': len(views.frame),
-        'observations': int(used.sum()),
-        'left_out': measured.left_out,
-        'sigma_px': measured.sigma,
-        'gross': [
-            {'frame': int(views.frame[i]), **photograph_entry(table, int(views.frame[i])),
-             'landmark': int(views.landmark[i, j]),
-             'px': float(np.linalg.norm(result.residual[i, j]))}
-            for i, j in np.argwhere(measured.gross)
-        ],
-        'doubtful': [
-            {'frame': int(frame), **photograph_entry(table, int(frame)), 'reason': reason}
-            for frame, reason in zip(views.frame, measured.reasons, strict=True) if reason
-        ],
-        **({} if uncertainty is None else {'uncertainty': uncertainty}),
-    })
+    write_table(
+        folder / 'residuals.csv',
+        {
+            'frame': frame[used],
+            'landmark': views.landmark[used],
+            'u': views.uv[used][:, 0],
+            'v': views.uv[used][:, 1],
+            'du': result.residual[used][:, 0],
+            'dv': result.residual[used][:, 1],
+            'theta': theta[used],
+            'range': distance[used],
+        },
+    )
+    write_json(
+        folder / 'localize.json',
+        {
+            'rms_px': rms_px(measured.inlier_residual),
+            'frames': len(views.frame),
+            'observations': int(used.sum()),
+            'left_out': measured.left_out,
+            'sigma_px': measured.sigma,
+            'gross': [
+                {
+                    'frame': int(views.frame[i]),
+                    **photograph_entry(table, int(views.frame[i])),
+                    'landmark': int(views.landmark[i, j]),
+                    'px': float(np.linalg.norm(result.residual[i, j])),
+                }
+                for i, j in np.argwhere(measured.gross)
+            ],
+            'doubtful': [
+                {'frame': int(frame), **photograph_entry(table, int(frame)), 'reason': reason}
+                for frame, reason in zip(views.frame, measured.reasons, strict=True)
+                if reason
+            ],
+            **({} if uncertainty is None else {'uncertainty': uncertainty}),
+        },
+    )
 
 
 def _write_rig(folder: Path, cameras: tuple[str, ...], found: RigLocalization) -> None:
     data, views, residual = found.data, found.data.views, found.residual
     _write_poses(folder, found.frame, found.pose, found.covariance)
     used = views.used
-    frame, camera = (np.broadcast_to(part[:, None], used.shape)[used]
-                     for part in (views.frame, data.camera_of))
-    write_table(folder / 'residuals.csv', {
-        'frame': frame, 'camera': np.array(found.table.cameras)[camera],
-        'landmark': views.landmark[used], 'u': views.uv[used][:, 0], 'v': views.uv[used][:, 1],
-        'du': residual[used][:, 0], 'dv': residual[used][:, 1],
-    })
-    write_json(folder / 'localize.json', {
-        'rms_px': rms_px(residual), 'frames': len(found.frame), 'observations': int(used.sum()),
-        'left_out': found.left_out, 'sigma_px': found.sigma, 'frame_id': cameras[0],
-        'rig_contradicted': found.contradicted,
-        'cameras': {name: {'rms_px': rms_px(residual[data.camera_of == i]),
-                           'frames': int((data.camera_of == i).sum())}
-                    for i, name in enumerate(found.table.cameras)},
-        'gross': [
-            {'frame': int(found.table.frame[row]),
-             **photograph_entry(found.table, int(found.table.frame[row])),
-             'camera': found.table.cameras[found.table.camera[row]],
-             'landmark': int(found.table.landmark[row]), 'px': float(px), 'why': why}
-            for row, px, why in zip(*found.outliers, strict=True)],
-    })
+    frame, camera = (
+        np.broadcast_to(part[:, None], used.shape)[used] for part in (views.frame, data.camera_of)
+    )
+    write_table(
+        folder / 'residuals.csv',
+        {
+            'frame': frame,
+            'camera': np.array(found.table.cameras)[camera],
+            'landmark': views.landmark[used],
+            'u': views.uv[used][:, 0],
+            'v': views.uv[used][:, 1],
+            'du': residual[used][:, 0],
+            'dv': residual[used][:, 1],
+        },
+    )
+    write_json(
+        folder / 'localize.json',
+        {
+            'rms_px': rms_px(residual),
+            'frames': len(found.frame),
+            'observations': int(used.sum()),
+            'left_out': found.left_out,
+            'sigma_px': found.sigma,
+            'frame_id': cameras[0],
+            'rig_contradicted': found.contradicted,
+            'cameras': {
+                name: {
+                    'rms_px': rms_px(residual[data.camera_of == i]),
+                    'frames': int((data.camera_of == i).sum()),
+                }
+                for i, name in enumerate(found.table.cameras)
+            },
+            'gross': [
+                {
+                    'frame': int(found.table.frame[row]),
+                    **photograph_entry(found.table, int(found.table.frame[row])),
+                    'camera': found.table.cameras[found.table.camera[row]],
+                    'landmark': int(found.table.landmark[row]),
+                    'px': float(px),
+                    'why': why,
+                }
+                for row, px, why in zip(*found.outliers, strict=True)
+            ],
+        },
+    )

@@ -37,8 +37,11 @@ def read_sweep(path: Path) -> Plan:
 def lens_folder(plan: Plan) -> str:
     """Return the folder that the lens files of a sweep lie below; empty where it names none."""
     names = [plan.base.lens, *plan.sweep.lists.get('lens', ())]
-    folders = [str(Path(name).resolve().parent) for name in names
-               if Path(name).suffix in ('.yaml', '.yml')]
+    folders = [
+        str(Path(name).resolve().parent)
+        for name in names
+        if Path(name).suffix in ('.yaml', '.yml')
+    ]
     return os.path.commonpath(folders) if folders else ''
 
 
@@ -51,11 +54,15 @@ def _check_names(pattern: str, values: Mapping[str, Any]) -> None:
     for name in values:
         swept = name.startswith(SWEEP) and CAMERA in nodes  # the camera's own table says more
         if name.startswith(SWEEP) and not swept:
-            raise ParameterError(f'{name}: only parameters of {CAMERA} can be swept, below its '
-                                 f'name; {", ".join(nodes)} takes one value of each of its own')
+            raise ParameterError(
+                f'{name}: only parameters of {CAMERA} can be swept, below its '
+                f'name; {", ".join(nodes)} takes one value of each of its own'
+            )
         if name not in known and not swept:
-            raise ParameterError(f'{name} is not a parameter of {", ".join(nodes)}; known are '
-                                 + ', '.join(sorted(known)))
+            raise ParameterError(
+                f'{name} is not a parameter of {", ".join(nodes)}; known are '
+                + ', '.join(sorted(known))
+            )
 
 
 def values(**parameters: Any) -> list[str]:
@@ -64,8 +71,12 @@ def values(**parameters: Any) -> list[str]:
 
 
 def start_in_step(
-    processes: Processes, camera: str, solvers: Sequence[str], common: Sequence[str],
-    scenarios: Sequence[str] = (), folder: str = '',
+    processes: Processes,
+    camera: str,
+    solvers: Sequence[str],
+    common: Sequence[str],
+    scenarios: Sequence[str] = (),
+    folder: str = '',
 ) -> None:
     """Start solver nodes and a synthetic camera, `camera` by name, that ends after its sweep.
 
@@ -74,15 +85,35 @@ def start_in_step(
     solvers for the camera, which listens to what they answer.
     """
     for node in solvers:
-        processes.start(node, ['run', node, '--ros-args', *common,
-                               *values(wait_for_subscribers=2, patience=_PATIENCE,
-                                       **({'folder': folder} if folder else {}))])
-    processes.start(camera, [
-        'run', 'synthetic_camera', '--ros-args', *common, *scenarios, *values(
-            wait_for_subscribers=len(solvers) + 1, repeat='false',
-            lock_step=' '.join(f'{node}/result' for node in solvers),
+        processes.start(
+            node,
+            [
+                'run',
+                node,
+                '--ros-args',
+                *common,
+                *values(
+                    wait_for_subscribers=2,
+                    patience=_PATIENCE,
+                    **({'folder': folder} if folder else {}),
+                ),
+            ],
         )
-    ])
+    processes.start(
+        camera,
+        [
+            'run',
+            'synthetic_camera',
+            '--ros-args',
+            *common,
+            *scenarios,
+            *values(
+                wait_for_subscribers=len(solvers) + 1,
+                repeat='false',
+                lock_step=' '.join(f'{node}/result' for node in solvers),
+            ),
+        ],
+    )
 
 
 def record_sweep(
@@ -104,8 +135,9 @@ def record_sweep(
 
     with Processes(logs) as processes:
         processes.start('recorder', ['record', '-o', str(bag)])
-        start_in_step(processes, 'camera', solvers, ['--params-file', str(path)],
-                      folder=lens_folder(plan))
+        start_in_step(
+            processes, 'camera', solvers, ['--params-file', str(path)], folder=lens_folder(plan)
+        )
         processes.wait(['camera'], math.inf, look)
         processes.stop('recorder')
         for node in solvers:

@@ -53,15 +53,19 @@ def note_formats() -> None:
 def note_left_out(table: Observations, frames: Sequence[int]) -> None:
     """Name the frames of a table that could not be posed, if there are any."""
     if frames:
-        say('left out, their points do not determine a pose (all near one line, or of another '
-            f'lens?): {list_frames(table, frames)}')
+        say(
+            'left out, their points do not determine a pose (all near one line, or of another '
+            f'lens?): {list_frames(table, frames)}'
+        )
 
 
 def note_copies(table: Observations, frames: Sequence[int]) -> None:
     """Name the frames of a table that are other frames once more, if there are any."""
     if frames:
-        say('left out, their image points repeat those of an earlier frame: '
-            f'{list_frames(table, frames)}')
+        say(
+            'left out, their image points repeat those of an earlier frame: '
+            f'{list_frames(table, frames)}'
+        )
 
 
 def note_huge(table: Observations) -> None:
@@ -77,19 +81,27 @@ def note_gross_errors(table: Observations, gross: Outliers) -> None:
         worst = ', '.join(
             f'{frame_name(table, int(table.frame[gross.rows[i]]))} landmark '
             f'{table.landmark[gross.rows[i]]} '
-            f'({gross.px[i]:.1f} px)' for i in (-gross.px).argsort()[:3])
+            f'({gross.px[i]:.1f} px)'
+            for i in (-gross.px).argsort()[:3]
+        )
         frames = table.frame[gross.rows]
-        whole = [frame for frame in dict.fromkeys(frames.tolist())
-                 if (frames == frame).sum() == (table.frame == frame).sum()]
-        views = (f'; all points of {list_frames(table, whole)} are outliers: check their order'
-                 if whole else '')
-        say(f'{len(gross.rows)} of {len(table)} points are outliers and are rejected, '
-            f'furthest {worst}{views}')
+        whole = [
+            frame
+            for frame in dict.fromkeys(frames.tolist())
+            if (frames == frame).sum() == (table.frame == frame).sum()
+        ]
+        views = (
+            f'; all points of {list_frames(table, whole)} are outliers: check their order'
+            if whole
+            else ''
+        )
+        say(
+            f'{len(gross.rows)} of {len(table)} points are outliers and are rejected, '
+            f'furthest {worst}{views}'
+        )
 
 
-def note_doubtful(
-    table: Observations, frames: Sequence[int], reasons: Sequence[str]
-) -> None:
+def note_doubtful(table: Observations, frames: Sequence[int], reasons: Sequence[str]) -> None:
     """Name the frames of a table whose poses should not be relied on as they are, and why."""
     alike: dict[str, list[tuple[int, str]]] = {}
     for frame, reason in zip(frames, reasons, strict=True):
@@ -109,6 +121,8 @@ def note_unconnected(table: Observations) -> None:
 
     first, *others = connected_cameras(table)
     for group in others:
-        say(f'{" and ".join(group)}: no frame shared with {" and ".join(first)}, so their '
-            'relative pose is not estimated, and no rig.yaml is written')
+        say(
+            f'{" and ".join(group)}: no frame shared with {" and ".join(first)}, so their '
+            'relative pose is not estimated, and no rig.yaml is written'
+        )
         first += group

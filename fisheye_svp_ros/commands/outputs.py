@@ -48,9 +48,12 @@ def check_output(args: argparse.Namespace) -> None:
             continue
         for given, path in _paths(args):
             if path.exists() and any(
-                    one.samefile(output) for one in _files_to_keep(given, path, output, name)):
-                raise OutputError(f'{option} {output}: this would overwrite the input {path}; '
-                                  'choose another name')
+                one.samefile(output) for one in _files_to_keep(given, path, output, name)
+            ):
+                raise OutputError(
+                    f'{option} {output}: this would overwrite the input {path}; '
+                    'choose another name'
+                )
 
 
 def _files_to_keep(given: str, path: Path, output: Path, name: str) -> Iterator[Path]:

@@ -10,9 +10,15 @@ from fisheye_svp_ros.commands.outputs import output_folder
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('-o', '--output', type=output_folder, default=Path('paper'), metavar='DIR',
-                        help='folder to write paper.json, paper.md, paper.html and the pictures '
-                        'to; default: paper')
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_folder,
+        default=Path('paper'),
+        metavar='DIR',
+        help='folder to write paper.json, paper.md, paper.html and the pictures '
+        'to; default: paper',
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -34,8 +40,13 @@ def run(args: argparse.Namespace) -> None:
         f'published ones, {results.agreeing(0.05)} within 5 %',
         ('cell', 'published', 'ours', 'unit', 'difference %'),
         [
-            (f'{cell.lens} {cell.radius} m {cell.row} {cell.quantity}', f'{cell.published:.4f}',
-             f'{cell.ours:.4f}', cell.unit, f'{100 * cell.relative:+.1f}')
+            (
+                f'{cell.lens} {cell.radius} m {cell.row} {cell.quantity}',
+                f'{cell.published:.4f}',
+                f'{cell.ours:.4f}',
+                cell.unit,
+                f'{100 * cell.relative:+.1f}',
+            )
             for cell in results.cells()
             if cell.table < 3 and cell.quantity in ('z', 'residual')
         ],

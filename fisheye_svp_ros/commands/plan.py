@@ -29,28 +29,60 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('--lens', metavar='LENS',
-                        help='a lens of the same type: lens file, or the name of a lens of this '
-                        'package')
-    parser.add_argument('--fov', type=float, metavar='DEG',
-                        help='in place of --lens: field of view over the width of the image; no '
-                        'corner is planned beyond it')
+    parser.add_argument(
+        '--lens',
+        metavar='LENS',
+        help='a lens of the same type: lens file, or the name of a lens of this package',
+    )
+    parser.add_argument(
+        '--fov',
+        type=float,
+        metavar='DEG',
+        help='in place of --lens: field of view over the width of the image; no '
+        'corner is planned beyond it',
+    )
     parser.add_argument('--image-size', metavar='WxH', help='with --fov: 1280x800')
-    parser.add_argument('--board', required=True, metavar='SPEC',
-                        help='the board: chessboard:9x6:25mm, charuco:..., aprilgrid:FILE, ...')
-    parser.add_argument('--room', type=float, nargs=2, required=True, metavar='M',
-                        help='nearest and furthest distance at which the board is sharp and fits '
-                        'into the room')
-    parser.add_argument('--count', type=view_count, default=12, metavar='N',
-                        help='number of photographs; default: 12')
-    parser.add_argument('--for', dest='number', metavar='NAME',
-                        help='parameter to determine best: e0, fx, cx, k1, ...; default: the '
-                        'whole lens')
-    parser.add_argument('--noise', type=float, default=0.1, metavar='PX',
-                        help='standard deviation of u and of v of a corner; default: 0.1')
-    parser.add_argument('-o', '--output', type=output_folder, metavar='DIR',
-                        help='folder to write plan.pdf (to print), plan.json and poses.csv (for '
-                        '`render`) to')
+    parser.add_argument(
+        '--board',
+        required=True,
+        metavar='SPEC',
+        help='the board: chessboard:9x6:25mm, charuco:..., aprilgrid:FILE, ...',
+    )
+    parser.add_argument(
+        '--room',
+        type=float,
+        nargs=2,
+        required=True,
+        metavar='M',
+        help='nearest and furthest distance at which the board is sharp and fits into the room',
+    )
+    parser.add_argument(
+        '--count',
+        type=view_count,
+        default=12,
+        metavar='N',
+        help='number of photographs; default: 12',
+    )
+    parser.add_argument(
+        '--for',
+        dest='number',
+        metavar='NAME',
+        help='parameter to determine best: e0, fx, cx, k1, ...; default: the whole lens',
+    )
+    parser.add_argument(
+        '--noise',
+        type=float,
+        default=0.1,
+        metavar='PX',
+        help='standard deviation of u and of v of a corner; default: 0.1',
+    )
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_folder,
+        metavar='DIR',
+        help='folder to write plan.pdf (to print), plan.json and poses.csv (for `render`) to',
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -62,21 +94,35 @@ def run(args: argparse.Namespace) -> None:
     if not args.noise > 0:
         raise ParameterError('--noise must be above 0')
     lens, pattern = _lens(args), parse_pattern(args.board)
-    planned = plan(lens, pattern.points, view_limits(args.room), args.count, args.number,
-                   args.noise)
+    planned = plan(
+        lens, pattern.points, view_limits(args.room), args.count, args.number, args.noise
+    )
     wanted = planned.wanted
     if args.output:
         with write_together():
             shot_list.draw_shots(args.output / 'plan.pdf', ForwardModel(lens), wanted)
-            write_poses(args.output / 'poses.csv', np.arange(len(wanted.shots.distance)),
-                        wanted.shots.camera)
-            write_json(args.output / 'plan.json',
-                       {'photographs': wanted.to_list(), 'stderr': planned.stderr})
-    print_table(f'{lens.name}, {pattern.spec}: photographs to take, {shot_list.purpose(wanted)}',
-                shot_list.HEADER, shot_list.rows(wanted), words=shot_list.TEXT_COLUMNS)
-    print('  expected standard errors: '
-          + ', '.join(f'{name} {error:.2g} {UNITS.get(name, "")}'.rstrip()
-                      for name, error in planned.stderr.items()))
+            write_poses(
+                args.output / 'poses.csv',
+                np.arange(len(wanted.shots.distance)),
+                wanted.shots.camera,
+            )
+            write_json(
+                args.output / 'plan.json',
+                {'photographs': wanted.to_list(), 'stderr': planned.stderr},
+            )
+    print_table(
+        f'{lens.name}, {pattern.spec}: photographs to take, {shot_list.purpose(wanted)}',
+        shot_list.HEADER,
+        shot_list.rows(wanted),
+        words=shot_list.TEXT_COLUMNS,
+    )
+    print(
+        '  expected standard errors: '
+        + ', '.join(
+            f'{name} {error:.2g} {UNITS.get(name, "")}'.rstrip()
+            for name, error in planned.stderr.items()
+        )
+    )
     _note_guessed(lens, wanted)
     if args.output:
         print(f'{args.output}: plan.pdf, plan.json, poses.csv')
@@ -86,8 +132,9 @@ def view_count(text: str) -> int:
     """Return the number of views to plan, of a text."""
     count = positive_count(text)
     if count > MAX_VIEWS:
-        raise argparse.ArgumentTypeError(f'{text!r} photographs are too many; at most '
-                                         f'{MAX_VIEWS} can be planned at once')
+        raise argparse.ArgumentTypeError(
+            f'{text!r} photographs are too many; at most {MAX_VIEWS} can be planned at once'
+        )
     return count
 
 
@@ -97,8 +144,9 @@ def view_limits(given: Sequence[float]) -> ViewLimits:
 
     near, far = given
     if not 0 < near < far < float('inf'):
-        raise ParameterError(f'--room {near:g} {far:g}: give two distances above 0, m, the nearer '
-                             'first')
+        raise ParameterError(
+            f'--room {near:g} {far:g}: give two distances above 0, m, the nearer first'
+        )
     return ViewLimits(near, far)
 
 
@@ -111,9 +159,11 @@ def _note_guessed(lens: Lens, wanted: NextViews) -> None:
     further = [str(i + 1) for i in np.flatnonzero(angle > lens.calibrated_angle)]
     if further:
         edge = np.degrees(lens.calibrated_angle)
-        say(f'lens {lens.name!r} was calibrated up to {edge:.0f} degrees off the axis; views '
+        say(
+            f'lens {lens.name!r} was calibrated up to {edge:.0f} degrees off the axis; views '
             f'{", ".join(further)} reach up to {np.degrees(angle.max()):.0f}, where the drawn '
-            'place of the board may be wrong')
+            'place of the board may be wrong'
+        )
 
 
 def _lens(args: argparse.Namespace) -> Lens:

@@ -29,10 +29,20 @@ _TABLES = ('.csv', '.parquet')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('source', type=Path, metavar='SOURCE',
-                        help='rosbag2 recording, table (.csv or .parquet), or folder of a sweep')
-    parser.add_argument('-o', '--output', type=output_folder, default=Path('plots'), metavar='DIR',
-                        help='folder to write the pictures (PNG) to; default: plots')
+    parser.add_argument(
+        'source',
+        type=Path,
+        metavar='SOURCE',
+        help='rosbag2 recording, table (.csv or .parquet), or folder of a sweep',
+    )
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_folder,
+        default=Path('plots'),
+        metavar='DIR',
+        help='folder to write the pictures (PNG) to; default: plots',
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -47,8 +57,10 @@ def run(args: argparse.Namespace) -> None:
         else:
             files = _of_bag(args)
     if not files:
-        raise OutputError(f'{args.source}: nothing to draw; it needs residuals, or results of '
-                          'different scenarios')
+        raise OutputError(
+            f'{args.source}: nothing to draw; it needs residuals, or results of '
+            'different scenarios'
+        )
     for path in files:
         print(path)
 
@@ -73,13 +85,20 @@ def _of_bag(args: argparse.Namespace) -> list[Path]:
         # Rows of the namespace with most of them: others have other metrics.
         names = columns[NAMESPACE]
         most = max(set(names), key=names.count, default=None)
-        files = draw_table({
-            name: [cell for cell, of in zip(cells, names, strict=True) if of == most]
-            for name, cells in columns.items()}, args.output)
+        files = draw_table(
+            {
+                name: [cell for cell, of in zip(cells, names, strict=True) if of == most]
+                for name, cells in columns.items()
+            },
+            args.output,
+        )
         if found:
             files.append(args.output / 'residuals.png')
-            draw_residuals([one.points for one in found],
-                           [one.tags.get('lens', '') for one in found], files[-1])
+            draw_residuals(
+                [one.points for one in found],
+                [one.tags.get('lens', '') for one in found],
+                files[-1],
+            )
             files += _fields(found, args.output / 'residual_fields.png')
     return files
 

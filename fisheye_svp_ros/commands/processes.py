@@ -55,8 +55,9 @@ def prepare_ros() -> None:
     """
     if reason := missing_rclpy():
         version = '.'.join(map(str, sys.version_info[:2]))
-        raise GraphError(f'nodes need ROS 2, which Python {version} does not have ({reason}); '
-                         f'{_WAYS}')
+        raise GraphError(
+            f'nodes need ROS 2, which Python {version} does not have ({reason}); {_WAYS}'
+        )
     if not _ENVIRONMENT & os.environ.keys():
         os.environ[_RANGE] = _LOCALHOST
 
@@ -92,7 +93,11 @@ class Processes:
         command = [sys.executable, '-m', 'fisheye_svp_ros.cli', *arguments]
         with self._log(name).open('wb') as log:
             self._running[name] = subprocess.Popen(
-                command, env=self._environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                command,
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
                 preexec_fn=_end_with_parent,
             )
 
@@ -112,8 +117,10 @@ class Processes:
                 waiting.discard(name)
                 del self._running[name]
             if time.monotonic() > end:
-                raise GraphError(f'{", ".join(sorted(waiting))} took more than '
-                                      f'{patience:g} s: {self._last_line(min(waiting))}')
+                raise GraphError(
+                    f'{", ".join(sorted(waiting))} took more than '
+                    f'{patience:g} s: {self._last_line(min(waiting))}'
+                )
             look()
             time.sleep(_POLL)
 
@@ -184,8 +191,12 @@ def remove_orphans(before: Set[str]) -> None:
 def _locked_inodes() -> set[int]:
     """Return the inodes of all files that processes of this namespace hold locked."""
     with suppress(OSError):  # of Linux
-        return {int(inode) for inode in re.findall(
-            r'FLOCK .* [0-9a-f]+:[0-9a-f]+:(\d+) ', Path('/proc/locks').read_text())}
+        return {
+            int(inode)
+            for inode in re.findall(
+                r'FLOCK .* [0-9a-f]+:[0-9a-f]+:(\d+) ', Path('/proc/locks').read_text()
+            )
+        }
     return set()
 
 

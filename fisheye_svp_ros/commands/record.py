@@ -23,16 +23,31 @@ TOPICS = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('-o', '--output', type=output_path, required=True, metavar='BAG',
-                        help='folder to create; it must not exist')
-    parser.add_argument('--topics', type=_pattern, default=TOPICS, metavar='REGEX',
-                        help='pattern of full topic names; default: all topics of the nodes '
-                        'except markers and diagnostics')
-    parser.add_argument('--sweep', metavar='FILE',
-                        help='sweep file, or the name of one in config/sweeps: start the nodes, '
-                        'record them in lock-step through the sweep, and end')
-    parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
-                        help='as for `ros2 run`')
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_path,
+        required=True,
+        metavar='BAG',
+        help='folder to create; it must not exist',
+    )
+    parser.add_argument(
+        '--topics',
+        type=_pattern,
+        default=TOPICS,
+        metavar='REGEX',
+        help='pattern of full topic names; default: all topics of the nodes '
+        'except markers and diagnostics',
+    )
+    parser.add_argument(
+        '--sweep',
+        metavar='FILE',
+        help='sweep file, or the name of one in config/sweeps: start the nodes, '
+        'record them in lock-step through the sweep, and end',
+    )
+    parser.add_argument(
+        '--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...', help='as for `ros2 run`'
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -69,16 +84,21 @@ def _record(args: argparse.Namespace) -> None:
         from fisheye_svp_ros.nodes.recorder import Recorder
         from fisheye_svp_ros.nodes.session import ros_session
 
-    with (ros_session(args.ros_args) as signals, BagWriter(args.output) as bag,
-          suppress(KeyboardInterrupt)):
+    with (
+        ros_session(args.ros_args) as signals,
+        BagWriter(args.output) as bag,
+        suppress(KeyboardInterrupt),
+    ):
         signals.begin()
         recorder = Recorder(bag, args.topics)
         recorder.spin(signals)
         recorder.destroy_node()
     if not bag.count:
         rmtree(args.output)
-        raise BagError(f'{args.output}: no message arrived on a recorded topic, so nothing is '
-                       'kept; compare `ros2 topic list` with --topics')
+        raise BagError(
+            f'{args.output}: no message arrived on a recorded topic, so nothing is '
+            'kept; compare `ros2 topic list` with --topics'
+        )
     say(f'{bag.count} messages on {len(recorder.topics)} topics are in {args.output}')
 
 
@@ -86,5 +106,6 @@ def _pattern(text: str) -> re.Pattern[str]:
     try:
         return re.compile(text)
     except re.error as cause:
-        raise argparse.ArgumentTypeError(f'{text!r} is not a regular expression: '
-                                         f'{cause}') from cause
+        raise argparse.ArgumentTypeError(
+            f'{text!r} is not a regular expression: {cause}'
+        ) from cause

@@ -35,31 +35,71 @@ _MIN_SIZE = 10.0  # px of the corners in sight; in millimetres, poses are a thou
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('--lens', required=True, metavar='LENS',
-                        help='lens file, or the name of a lens of this package; for a rig, a '
-                        'folder or file with its lenses and their relative poses')
-    parser.add_argument('--board', required=True, metavar='SPEC',
-                        help='the board: chessboard:9x6:25mm (inner corners)')
-    parser.add_argument('--target', choices=('board', 'cube', 'room'), default='board',
-                        help='one board, or six boards: on the faces of a cube, or on the walls '
-                        'of a room')
-    parser.add_argument('-o', '--output', type=output_folder, required=True, metavar='DIR',
-                        help='folder to write the photographs (of a rig, one subfolder per '
-                        'camera), observations.csv (the true corners) and poses.csv to')
-    parser.add_argument('--poses', metavar='POSES.csv',
-                        help='poses of the camera (of a rig, the first one) in the frame of the '
-                        'board or target; default: random')
-    parser.add_argument('--count', type=int, metavar='N',
-                        help='number of photographs from random poses; default: 30')
-    parser.add_argument('--ranges', type=float, nargs=2, metavar='M',
-                        help='nearest and furthest distance of random poses, m; of a cube, to its '
-                        'center; default: 0.12 0.35')
-    parser.add_argument('--bow', type=float, default=0.0, metavar='MM',
-                        help='height of the middle of the board above its ends, mm')
-    parser.add_argument('--blur', type=float, default=0.6, metavar='PX',
-                        help='blur of the lens, px; default: 0.6')
-    parser.add_argument('--noise', type=float, default=1.5, metavar='LEVELS',
-                        help='noise of a pixel, gray levels of 255; default: 1.5')
+    parser.add_argument(
+        '--lens',
+        required=True,
+        metavar='LENS',
+        help='lens file, or the name of a lens of this package; for a rig, a '
+        'folder or file with its lenses and their relative poses',
+    )
+    parser.add_argument(
+        '--board',
+        required=True,
+        metavar='SPEC',
+        help='the board: chessboard:9x6:25mm (inner corners)',
+    )
+    parser.add_argument(
+        '--target',
+        choices=('board', 'cube', 'room'),
+        default='board',
+        help='one board, or six boards: on the faces of a cube, or on the walls of a room',
+    )
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_folder,
+        required=True,
+        metavar='DIR',
+        help='folder to write the photographs (of a rig, one subfolder per '
+        'camera), observations.csv (the true corners) and poses.csv to',
+    )
+    parser.add_argument(
+        '--poses',
+        metavar='POSES.csv',
+        help='poses of the camera (of a rig, the first one) in the frame of the '
+        'board or target; default: random',
+    )
+    parser.add_argument(
+        '--count',
+        type=int,
+        metavar='N',
+        help='number of photographs from random poses; default: 30',
+    )
+    parser.add_argument(
+        '--ranges',
+        type=float,
+        nargs=2,
+        metavar='M',
+        help='nearest and furthest distance of random poses, m; of a cube, to its '
+        'center; default: 0.12 0.35',
+    )
+    parser.add_argument(
+        '--bow',
+        type=float,
+        default=0.0,
+        metavar='MM',
+        help='height of the middle of the board above its ends, mm',
+    )
+    parser.add_argument(
+        '--blur', type=float, default=0.6, metavar='PX', help='blur of the lens, px; default: 0.6'
+    )
+    parser.add_argument(
+        '--noise',
+        type=float,
+        default=1.5,
+        metavar='LEVELS',
+        help='noise of a pixel, gray levels of 255; default: 1.5',
+    )
     parser.add_argument('--seed', type=int, default=0, help='seed of poses and noise; default: 0')
 
 
@@ -70,27 +110,39 @@ def run(args: argparse.Namespace) -> None:
         raise ParameterError(f'--board {args.board}: only chessboards can be rendered')
     count, ranges = _of_random_poses(args)
     if not all(0 <= value < np.inf for value in (args.blur, args.noise, args.seed, abs(args.bow))):
-        raise ParameterError('--blur, --noise and --seed must be finite and not below 0, --bow '
-                             'finite')
+        raise ParameterError(
+            '--blur, --noise and --seed must be finite and not below 0, --bow finite'
+        )
     cameras, rng = _cameras(args.lens), np.random.default_rng(args.seed)
     printed = Print(pattern.columns, pattern.rows, pattern.size)
     if args.bow:
-        printed = Print(pattern.columns, pattern.rows, pattern.size,
-                        bow=parabola(printed.corners, 1e-3 * args.bow))
+        printed = Print(
+            pattern.columns,
+            pattern.rows,
+            pattern.size,
+            bow=parabola(printed.corners, 1e-3 * args.bow),
+        )
     boards = TARGETS.get(args.target, board)(printed)
     if args.poses:
         poses = _read_poses(args.poses, cameras, boards)
     else:
         poses = _random_poses(cameras, boards, args.target, count, ranges, rng)
     with write_together():
-        count = write_photographs(cameras, boards, poses,
-                                  Exposure(blur=args.blur, noise=args.noise), args.seed,
-                                  args.output, args.output)
+        count = write_photographs(
+            cameras,
+            boards,
+            poses,
+            Exposure(blur=args.blur, noise=args.noise),
+            args.seed,
+            args.output,
+            args.output,
+        )
     others = sum(len(list((args.output / name).glob('*.png'))) for name in cameras) - count
     if others:
         say(f'{args.output}: {others} other photographs are in it too; `detect` takes them all')
-    print(f'{args.output}: {count} photographs, observations.csv with their true corners, '
-          'poses.csv')
+    print(
+        f'{args.output}: {count} photographs, observations.csv with their true corners, poses.csv'
+    )
 
 
 def _of_random_poses(args: argparse.Namespace) -> tuple[int, Ranges]:
@@ -99,13 +151,16 @@ def _of_random_poses(args: argparse.Namespace) -> tuple[int, Ranges]:
         if args.poses and given is not None:
             raise ParameterError(f'{option} is of random poses; leave out {option} or --poses')
     if args.target == 'room' and args.ranges:
-        raise ParameterError('--ranges is of one board or a cube; the poses in a room are inside '
-                             'it: leave --ranges out')
+        raise ParameterError(
+            '--ranges is of one board or a cube; the poses in a room are inside '
+            'it: leave --ranges out'
+        )
     count = _COUNT if args.count is None else args.count
     near, far = args.ranges or _RANGES
     if count < 1 or not 0 < near <= far < np.inf:
-        raise ParameterError('--count must be above 0, --ranges two distances above 0, the nearer '
-                             'first')
+        raise ParameterError(
+            '--count must be above 0, --ranges two distances above 0, the nearer first'
+        )
     return count, (near, far)
 
 
@@ -117,11 +172,14 @@ def _cameras(given: str) -> Cameras:
     if not names:
         return {'': (load_with_notes(path), identity())}
     if len(rigs) + 1 != len(names):
-        raise LensError(f'{path}: it holds {", ".join(names)} but not their relative poses; add '
-                        f'rig.yaml, or name one camera, {path}#{names[0]}')
+        raise LensError(
+            f'{path}: it holds {", ".join(names)} but not their relative poses; add '
+            f'rig.yaml, or name one camera, {path}#{names[0]}'
+        )
     places = cameras_in_first(rigs)
-    return {name: (load_with_notes(f'{path}#{name}'), places.take(i))
-            for i, name in enumerate(names)}
+    return {
+        name: (load_with_notes(f'{path}#{name}'), places.take(i)) for i, name in enumerate(names)
+    }
 
 
 def _read_poses(path: str, cameras: Cameras, boards: tuple[BoardPose, ...]) -> Pose:
@@ -133,13 +191,19 @@ def _read_poses(path: str, cameras: Cameras, boards: tuple[BoardPose, ...]) -> P
             if seen.any() and np.ptp(uv[seen], axis=0).max() > _MIN_SIZE:
                 return poses
     nearest = np.linalg.norm(poses.position, axis=-1).min()
-    raise GeometryError(f'{path}: from none of its poses the target is seen larger than '
-                        f'{_MIN_SIZE:g} px, the nearest is {nearest:.3g} m from its origin; poses '
-                        'of the camera in the frame of the target, in m, are needed')
+    raise GeometryError(
+        f'{path}: from none of its poses the target is seen larger than '
+        f'{_MIN_SIZE:g} px, the nearest is {nearest:.3g} m from its origin; poses '
+        'of the camera in the frame of the target, in m, are needed'
+    )
 
 
 def _random_poses(
-    cameras: Cameras, boards: tuple[BoardPose, ...], target: str, count: int, ranges: Ranges,
+    cameras: Cameras,
+    boards: tuple[BoardPose, ...],
+    target: str,
+    count: int,
+    ranges: Ranges,
     rng: np.random.Generator,
 ) -> Pose:
     """Return poses (P,) of the first camera; the cameras of a rig look at the target in turn."""
@@ -163,8 +227,13 @@ def parabola(corners: Array, height: float) -> Field:
 
 
 def write_photographs(
-    cameras: Cameras, boards: tuple[BoardPose, ...], poses: Pose, exposure: Exposure, seed: int,
-    folder: Path, truth: Path,
+    cameras: Cameras,
+    boards: tuple[BoardPose, ...],
+    poses: Pose,
+    exposure: Exposure,
+    seed: int,
+    folder: Path,
+    truth: Path,
 ) -> int:
     """Write photographs from poses (P,) of the first camera, and the truth; return how many.
 
@@ -172,9 +241,17 @@ def write_photographs(
     truth: folder for the true corners, observations.csv, and poses.csv.
     """
     count = len(poses.position)
-    uv, seen = (np.stack(part) for part in zip(*(
-        visible(lens, boards, poses.take(frame).compose(place))
-        for frame in range(count) for lens, place in cameras.values()), strict=True))
+    uv, seen = (
+        np.stack(part)
+        for part in zip(
+            *(
+                visible(lens, boards, poses.take(frame).compose(place))
+                for frame in range(count)
+                for lens, place in cameras.values()
+            ),
+            strict=True,
+        )
+    )
     in_sight = np.asarray(seen.reshape(count, len(cameras), -1).any(axis=-1))
     if len(cameras) == 1:
         in_sight[:] = True
@@ -183,15 +260,25 @@ def write_photographs(
             rays = pixel_rays(lens)
             for number in np.flatnonzero(in_sight[:, camera]).tolist():
                 rng = np.random.default_rng([seed, number, *([camera] if camera else [])])
-                image = render(lens, boards, poses.take(number).compose(place), exposure, rng,
-                               rays=rays)
+                image = render(
+                    lens, boards, poses.take(number).compose(place), exposure, rng, rays=rays
+                )
                 write_png(folder / name / f'{number:03d}.png', image)
                 done()
     view, board, corner = np.nonzero(seen)
     frame, camera_of = np.divmod(view, len(cameras))
     points = np.stack([one.pose.transform(one.printed.corners) for one in boards])
-    write_observations(truth / 'observations.csv', make_observations(
-        frame, board * points.shape[1] + corner, uv[view, board, corner],
-        points[board, corner], board=board, camera=camera_of, cameras=tuple(cameras)))
+    write_observations(
+        truth / 'observations.csv',
+        make_observations(
+            frame,
+            board * points.shape[1] + corner,
+            uv[view, board, corner],
+            points[board, corner],
+            board=board,
+            camera=camera_of,
+            cameras=tuple(cameras),
+        ),
+    )
     write_poses(truth / 'poses.csv', np.arange(count), poses)
     return int(in_sight.sum())

@@ -14,10 +14,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('node', choices=NODES, metavar='NODE', help=', '.join(NODES))
     parser.add_argument(
-        'arguments', nargs=argparse.REMAINDER, metavar='[NODE ...] --ros-args ...',
+        'arguments',
+        nargs=argparse.REMAINDER,
+        metavar='[NODE ...] --ros-args ...',
         help='more nodes for the same process; then arguments as for `ros2 run`: -p NAME:=VALUE, '
         '--params-file FILE, -r FROM:=TO, -r __ns:=/NAMESPACE; --help lists the parameters '
-        'of the nodes'
+        'of the nodes',
     )
 
 
@@ -26,16 +28,20 @@ def run(args: argparse.Namespace) -> None:
     with executables.ending_quietly():
         prepare_ros()
     more = list(takewhile(NODES.__contains__, args.arguments))
-    nodes, arguments = [args.node, *more], args.arguments[len(more):]
+    nodes, arguments = [args.node, *more], args.arguments[len(more) :]
     if {'-h', '--help'} & set(arguments):
         for node in nodes:
             executables.print_parameters(node)
         return
     first, names = next(iter(arguments), '--ros-args'), ' '.join(nodes)
     if first != '--ros-args':
-        raise ParameterError(f'run {names}: {first!r} comes before --ros-args; ROS arguments '
-                             f'follow it: fisheye-svp run {names} --ros-args ...')
+        raise ParameterError(
+            f'run {names}: {first!r} comes before --ros-args; ROS arguments '
+            f'follow it: fisheye-svp run {names} --ros-args ...'
+        )
     if len({*nodes}) < len(nodes):
-        raise ParameterError(f'run {names}: a node is listed twice, and both would share their '
-                             'topics; start one process for each namespace')
+        raise ParameterError(
+            f'run {names}: a node is listed twice, and both would share their '
+            'topics; start one process for each namespace'
+        )
     raise SystemExit(executables.run(*nodes, args=arguments))

@@ -33,21 +33,36 @@ _MARK = 'sweep.txt'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('file', type=Path, metavar='FILE',
-                        help='ROS parameter file in which sweep.PARAMETER is a list, or the name '
-                        'of one in config/sweeps')
-    parser.add_argument('-o', '--output', type=output_folder, default=Path('sweep'), metavar='DIR',
-                        help='folder to write sweep.parquet, sweep.csv and sweep.json to; '
-                        'default: sweep')
+    parser.add_argument(
+        'file',
+        type=Path,
+        metavar='FILE',
+        help='ROS parameter file in which sweep.PARAMETER is a list, or the name '
+        'of one in config/sweeps',
+    )
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_folder,
+        default=Path('sweep'),
+        metavar='DIR',
+        help='folder to write sweep.parquet, sweep.csv and sweep.json to; default: sweep',
+    )
     where = parser.add_mutually_exclusive_group()
-    where.add_argument('--workers', type=_count, default=0, metavar='N',
-                       help='number of worker processes; default: none, all in this one')
-    where.add_argument('--dask', metavar='ADDRESS',
-                       help='address of a Dask scheduler: run on its cluster')
-    parser.add_argument('--resume', action='store_true',
-                        help='continue an interrupted run in DIR')
-    parser.add_argument('--large', action='store_true',
-                        help=f'allow more than {_MAX_SCENARIOS} scenarios')
+    where.add_argument(
+        '--workers',
+        type=_count,
+        default=0,
+        metavar='N',
+        help='number of worker processes; default: none, all in this one',
+    )
+    where.add_argument(
+        '--dask', metavar='ADDRESS', help='address of a Dask scheduler: run on its cluster'
+    )
+    parser.add_argument('--resume', action='store_true', help='continue an interrupted run in DIR')
+    parser.add_argument(
+        '--large', action='store_true', help=f'allow more than {_MAX_SCENARIOS} scenarios'
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -56,20 +71,26 @@ def run(args: argparse.Namespace) -> None:
     plan = read_sweep(path)
     if len(plan.sweep) > _MAX_SCENARIOS and not args.large:
         lengths = ' x '.join(f'{len(v)} {name}' for name, v in plan.sweep.lists.items())
-        raise ParameterError(f'{path}: {len(plan.sweep)} scenarios ({lengths}); add --large to '
-                             'run them all')
+        raise ParameterError(
+            f'{path}: {len(plan.sweep)} scenarios ({lengths}); add --large to run them all'
+        )
     parts = TableParts(args.output / _PARTS, column_types(plan))
     mine = fingerprint(plan)
     summary = args.output / _SUMMARY
-    if args.resume and summary.exists() and (
-            read_json(summary, OutputError).get('fingerprint') == mine):
+    if (
+        args.resume
+        and summary.exists()
+        and (read_json(summary, OutputError).get('fingerprint') == mine)
+    ):
         say(f'{args.output} already holds this sweep')
     else:
         engine = _claim(parts, mine, args.resume, work(plan))
         _solve(args, plan, parts, engine)
         if missing := {numbers.start for numbers in tasks(plan)} - parts.numbers():
-            raise OutputError(f'{parts.folder}: {len(missing)} parts of the sweep are missing; '
-                              'compute them again with --resume')
+            raise OutputError(
+                f'{parts.folder}: {len(missing)} parts of the sweep are missing; '
+                'compute them again with --resume'
+            )
         with write_together():
             parts.join(args.output / 'sweep')
             _report(path, args.output, plan, mine)
@@ -88,12 +109,16 @@ def _claim(parts: TableParts, mine: str, resume: bool, points: int) -> str:
         write_text(mark, f'{mine} {engine}')
         return engine
     if not resume:
-        raise OutputError(f'{parts.folder}: it holds an interrupted sweep; continue with '
-                          '--resume, or remove the folder')
+        raise OutputError(
+            f'{parts.folder}: it holds an interrupted sweep; continue with '
+            '--resume, or remove the folder'
+        )
     theirs, _, engine = read_text(mark, OutputError).partition(' ')
     if theirs != mine:
-        raise OutputError(f'{parts.folder}: it holds another, interrupted sweep; choose another '
-                          '-o, or remove the folder')
+        raise OutputError(
+            f'{parts.folder}: it holds another, interrupted sweep; choose another '
+            '-o, or remove the folder'
+        )
     return engine
 
 
@@ -115,21 +140,27 @@ def _solve(args: argparse.Namespace, plan: Plan, parts: TableParts, engine: str)
 def _report(path: Path, folder: Path, plan: Plan, mine: str) -> None:
     """Print and write what came out, metric by metric."""
     table = read_columns(written(folder / 'sweep.csv'))
-    metrics = [name for name, kind in column_types(plan).items()
-               if kind is float and '.' in name]
+    metrics = [name for name, kind in column_types(plan).items() if kind is float and '.' in name]
     found = {name: summarise(as_numbers(table[name])) for name in metrics}
     count = len(plan.sweep)
     print_table(
         f'{path}: {counted(count, "scenario")}',
         ('metric', 'sets', 'not solved', 'median', 'mean', 'largest'),
-        [(name, str(s.solved), str(s.missing), *(f'{v:.6g}' for v in s[2:]))
-         for name, s in found.items()],
+        [
+            (name, str(s.solved), str(s.missing), *(f'{v:.6g}' for v in s[2:]))
+            for name, s in found.items()
+        ],
     )
-    write_json(folder / _SUMMARY, {
-        'fingerprint': mine, 'file': str(path), 'scenarios': count,
-        'swept': {name: list(values) for name, values in plan.sweep.lists.items()},
-        'metrics': {name: s._asdict() for name, s in found.items()},
-    })
+    write_json(
+        folder / _SUMMARY,
+        {
+            'fingerprint': mine,
+            'file': str(path),
+            'scenarios': count,
+            'swept': {name: list(values) for name, values in plan.sweep.lists.items()},
+            'metrics': {name: s._asdict() for name, s in found.items()},
+        },
+    )
 
 
 def _count(text: str) -> int:

@@ -21,10 +21,16 @@ _MAX_ROWS = 40  # rows for people
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('bag', metavar='BAG',
-                        help='rosbag2 recording: its folder, or its .mcap or .db3 file')
-    parser.add_argument('-o', '--output', type=output_folder, metavar='DIR',
-                        help='folder to write table.csv, table.parquet and table.json to')
+    parser.add_argument(
+        'bag', metavar='BAG', help='rosbag2 recording: its folder, or its .mcap or .db3 file'
+    )
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_folder,
+        metavar='DIR',
+        help='folder to write table.csv, table.parquet and table.json to',
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -36,16 +42,23 @@ def run(args: argparse.Namespace) -> None:
     if bag.damage:
         say(f'{args.bag}: {bag.damage}')
     if not rows:
-        raise BagError(f'{args.bag}: it holds neither scenarios nor results; record them with '
-                       '`fisheye-svp record` or `ros2 bag record`')
+        raise BagError(
+            f'{args.bag}: it holds neither scenarios nor results; record them with '
+            '`fisheye-svp record` or `ros2 bag record`'
+        )
     _print(args.bag, columns)
     if args.output:
         with write_together():
             write_columns(args.output / 'table', columns)
-            write_json(args.output / 'table.json', {
-                'bag': str(args.bag), 'rows': rows, 'columns': list(columns),
-                'damage': bag.damage,
-            })
+            write_json(
+                args.output / 'table.json',
+                {
+                    'bag': str(args.bag),
+                    'rows': rows,
+                    'columns': list(columns),
+                    'damage': bag.damage,
+                },
+            )
         note_formats()
 
 
@@ -64,12 +77,17 @@ def _print(bag: str, columns: Columns) -> None:
     if len(tags) > 1:
         tags.pop(STAMP, None)  # the scenario says it more readably
     for block in _blocks(tags, metrics):
-        print_table('', list(block), zip(*block.values(), strict=True),
-                    words=[name for name in block if name.endswith('.note')])
+        print_table(
+            '',
+            list(block),
+            zip(*block.values(), strict=True),
+            words=[name for name in block if name.endswith('.note')],
+        )
 
 
 def _blocks(tags: Cells, metrics: Cells) -> Iterator[Cells]:
     """Yield the tags and as many of the metrics as a line has room for, until all are told."""
+
     def total_width(columns: Cells) -> int:
         return sum(3 + max(map(len, (name, *cells))) for name, cells in columns.items())
 

@@ -48,34 +48,69 @@ _PICTURES = ('mask.png', 'shift.png')  # of each camera, beside its photographs
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('inputs', nargs='*', metavar='LENS PHOTOS',
-                        help='lens file, also of other tools, or the name of a lens of this '
-                        'package; for a stereo pair, a file or folder with both lenses and '
-                        'the rig; then photographs: files, folders (left/ and right/ for a '
-                        'rig), videos, recordings; without photographs, only the maps are '
-                        'written')
-    parser.add_argument('--lens', action='append', metavar='CAMERA=LENS',
-                        help='left=LENS and right=LENS, in place of the argument LENS')
-    parser.add_argument('--rig', metavar='FILE',
-                        help='pose of the left camera in the right one: a file, or a folder with '
-                        'rig.yaml; if the lens files do not hold it')
-    parser.add_argument('-o', '--output', type=output_folder, required=True, metavar='DIR',
-                        help='folder to write the photographs, maps.npz and maps.yml (map1 and '
-                        'map2 for cv2.remap, mask, K, R, P), mask.png, camera_info.yaml, '
-                        'pictures of the remaining errors and undistort.json to; for a rig, '
-                        'one subfolder per camera')
-    parser.add_argument('--as', choices=PROJECTIONS, default=PROJECTIONS[0], dest='projection',
-                        help='projection of the rectified camera; fisheye: equidistant; default: '
-                        'pinhole')
-    parser.add_argument('--fov', type=float, metavar='DEG',
-                        help='its field of view over the width; default: 90 for a pinhole '
-                        'and for a cylindrical pair, otherwise that of the lens')
-    parser.add_argument('--size', type=image_size, metavar='WxH',
-                        help='size of the rectified images, px; default: that of the photographs')
-    parser.add_argument('--range', type=float, default=RANGE, metavar='M', dest='range_m',
-                        help='range at which the maps of a lens with a moving viewpoint are '
-                        'exact, m or inf; of a pair, from the middle of the baseline; '
-                        f'default: {RANGE:g}')
+    parser.add_argument(
+        'inputs',
+        nargs='*',
+        metavar='LENS PHOTOS',
+        help='lens file, also of other tools, or the name of a lens of this '
+        'package; for a stereo pair, a file or folder with both lenses and '
+        'the rig; then photographs: files, folders (left/ and right/ for a '
+        'rig), videos, recordings; without photographs, only the maps are '
+        'written',
+    )
+    parser.add_argument(
+        '--lens',
+        action='append',
+        metavar='CAMERA=LENS',
+        help='left=LENS and right=LENS, in place of the argument LENS',
+    )
+    parser.add_argument(
+        '--rig',
+        metavar='FILE',
+        help='pose of the left camera in the right one: a file, or a folder with '
+        'rig.yaml; if the lens files do not hold it',
+    )
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_folder,
+        required=True,
+        metavar='DIR',
+        help='folder to write the photographs, maps.npz and maps.yml (map1 and '
+        'map2 for cv2.remap, mask, K, R, P), mask.png, camera_info.yaml, '
+        'pictures of the remaining errors and undistort.json to; for a rig, '
+        'one subfolder per camera',
+    )
+    parser.add_argument(
+        '--as',
+        choices=PROJECTIONS,
+        default=PROJECTIONS[0],
+        dest='projection',
+        help='projection of the rectified camera; fisheye: equidistant; default: pinhole',
+    )
+    parser.add_argument(
+        '--fov',
+        type=float,
+        metavar='DEG',
+        help='its field of view over the width; default: 90 for a pinhole '
+        'and for a cylindrical pair, otherwise that of the lens',
+    )
+    parser.add_argument(
+        '--size',
+        type=image_size,
+        metavar='WxH',
+        help='size of the rectified images, px; default: that of the photographs',
+    )
+    parser.add_argument(
+        '--range',
+        type=float,
+        default=RANGE,
+        metavar='M',
+        dest='range_m',
+        help='range at which the maps of a lens with a moving viewpoint are '
+        'exact, m or inf; of a pair, from the middle of the baseline; '
+        f'default: {RANGE:g}',
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -84,32 +119,44 @@ def run(args: argparse.Namespace) -> None:
     with write_together(), progress('undistorting', count_photographs(paths)) as done:
         counts = _write_photographs(sides, pair, paths, args.output, done)
         if paths and not any(counts.values()):
-            raise ObservationError(f'{", ".join(paths)}: no photograph can be read; images are '
-                                   f'{" ".join(IMAGES)}')
+            raise ObservationError(
+                f'{", ".join(paths)}: no photograph can be read; images are {" ".join(IMAGES)}'
+            )
         left = {name: shift_left(side) for name, side in sides.items() if not side.lens.is_svp}
         rows = rows_left(pair) if pair and left else None
         document: dict[str, Any] = {
-            'as': args.projection, 'range_m': args.range_m,
-            'cameras': {name or side.lens.name: _write_camera(
-                side, name, left.get(name), args.output / name) | {'photographs': counts[name]}
-                for name, side in sides.items()}}
+            'as': args.projection,
+            'range_m': args.range_m,
+            'cameras': {
+                name or side.lens.name: _write_camera(
+                    side, name, left.get(name), args.output / name
+                )
+                | {'photographs': counts[name]}
+                for name, side in sides.items()
+            },
+        }
         if pair:
-            document |= {'baseline_m': pair.baseline,
-                         'rows': remaining_document(rows) if rows else None}
+            document |= {
+                'baseline_m': pair.baseline,
+                'rows': remaining_document(rows) if rows else None,
+            }
         if pair and rows:
             draw_remaining(args.output / 'rows.png', pair.left, rows, 'difference of rows')
         write_json(args.output / 'undistort.json', document)
     for name, side in sides.items():
         _print_camera(side, name, left.get(name))
     if pair and rows:
-        print_remaining(f'baseline {1000 * pair.baseline:.2f} mm; difference between the rows of '
-                        'left and right', rows)
+        print_remaining(
+            f'baseline {1000 * pair.baseline:.2f} mm; difference between the rows of '
+            'left and right',
+            rows,
+        )
         print(f'  {tolerated_text(rows)}')
     print(f'{args.output}: {sum(counts.values())} photographs, maps for cv2.remap')
 
 
 def _rectifications(
-    args: argparse.Namespace
+    args: argparse.Namespace,
 ) -> tuple[dict[str, Rectification], RectifiedPair | None, list[str]]:
     """Return the rectifications by camera, of a rig also as a pair, and the photographs."""
     if not (args.lens or args.inputs):
@@ -126,8 +173,10 @@ def _rectifications(
     if rig is None:
         if len(lenses.in_file or lenses) > 1 and args.projection in STEREO_PROJECTIONS:
             _note_unrectified(list(by_camera))
-        sides = {name: Rectification(lens, camera_for([lens], *wanted), args.range_m)
-                 for name, lens in by_camera.items()}
+        sides = {
+            name: Rectification(lens, camera_for([lens], *wanted), args.range_m)
+            for name, lens in by_camera.items()
+        }
         return sides, None, paths
     left, right = by_camera.values()
     camera = camera_for([left, right], *wanted, along_baseline=True)
@@ -145,8 +194,10 @@ def _by_camera(photographed: Sequence[str], lenses: Lenses) -> dict[str, Lens]:
 def _rig(args: argparse.Namespace, lenses: dict[str, Lens]) -> Pose | None:
     if args.rig:
         if len(lenses) != 2:
-            raise ParameterError(f'--rig {args.rig}: a rig of two cameras needs two lenses, got '
-                                 f'{len(lenses)}; give --lens left=LENS --lens right=LENS')
+            raise ParameterError(
+                f'--rig {args.rig}: a rig of two cameras needs two lenses, got '
+                f'{len(lenses)}; give --lens left=LENS --lens right=LENS'
+            )
         return load_pair(args.rig, list(lenses))
     if args.lens or len(lenses) != 2:
         return None
@@ -156,16 +207,23 @@ def _rig(args: argparse.Namespace, lenses: dict[str, Lens]) -> Pose | None:
 def _note_unrectified(cameras: Sequence[str]) -> None:
     """Say why the photographs of several cameras are not rectified as those of a pair."""
     if len(cameras) == 2:
-        say(f'{" and ".join(cameras)} are not rectified as a pair, since no rig is named; add '
-            '--rig FILE')
+        say(
+            f'{" and ".join(cameras)} are not rectified as a pair, since no rig is named; add '
+            '--rig FILE'
+        )
     elif len(cameras) > 2:
-        say(f'{len(cameras)} cameras are not rectified as a pair; name two of them and their rig: '
-            f'--lens {cameras[0]}=LENS --lens {cameras[1]}=LENS --rig FILE')
+        say(
+            f'{len(cameras)} cameras are not rectified as a pair; name two of them and their rig: '
+            f'--lens {cameras[0]}=LENS --lens {cameras[1]}=LENS --rig FILE'
+        )
 
 
 def _write_photographs(
-    sides: dict[str, Rectification], pair: RectifiedPair | None, paths: Sequence[str],
-    folder: Path, done: Any,
+    sides: dict[str, Rectification],
+    pair: RectifiedPair | None,
+    paths: Sequence[str],
+    folder: Path,
+    done: Any,
 ) -> dict[str, int]:
     """Write the rectified photographs, and a picture of the first pair; return how many."""
     counts = dict.fromkeys(sides, 0)
@@ -183,10 +241,14 @@ def _write_photographs(
         path = folder / photograph.camera / f'{key}.png'
         if path in written:
             if path.name in _PICTURES:
-                raise ParameterError(f'{photograph.name}: {path.name} is a result of this command '
-                                     'too; rename the photograph')
-            raise ParameterError(f'{photograph.name}: another photograph is also called {key}; '
-                                 'give one folder at a time')
+                raise ParameterError(
+                    f'{photograph.name}: {path.name} is a result of this command '
+                    'too; rename the photograph'
+                )
+            raise ParameterError(
+                f'{photograph.name}: another photograph is also called {key}; '
+                'give one folder at a time'
+            )
         written.add(path)
         write_png(path, image)
         counts[photograph.camera] += 1
@@ -209,25 +271,37 @@ def _write_camera(
     write_png(folder / 'mask.png', 255 * maps.mask.astype(np.uint8))
     if camera.projection in _CAMERA_INFO:
         model, count = _CAMERA_INFO[camera.projection]
-        write_text(folder / 'camera_info.yaml', camera_info_text(
-            name or side.lens.name, size, side.k, model, [0.0] * count, side.p))
+        write_text(
+            folder / 'camera_info.yaml',
+            camera_info_text(name or side.lens.name, size, side.k, model, [0.0] * count, side.p),
+        )
     if left:
         draw_remaining(folder / 'shift.png', side, left, 'error of image points')
     return {
-        'lens': side.lens.name, 'size': list(size), 'k': side.k.tolist(),
-        'r': side.rotation.tolist(), 'p': side.p.tolist(),
-        'fov_deg': float(np.degrees(camera.field_of_view)), 'reached': float(maps.mask.mean()),
-        'shift': remaining_document(left) if left else None}
+        'lens': side.lens.name,
+        'size': list(size),
+        'k': side.k.tolist(),
+        'r': side.rotation.tolist(),
+        'p': side.p.tolist(),
+        'fov_deg': float(np.degrees(camera.field_of_view)),
+        'reached': float(maps.mask.mean()),
+        'shift': remaining_document(left) if left else None,
+    }
 
 
 def _print_camera(side: Rectification, name: str, left: Remaining | None) -> None:
     camera = side.camera
-    print(f'{name or side.lens.name}: {camera.projection} {camera.width}x{camera.height} px, f '
-          f'{camera.f:.2f} px, {np.degrees(camera.field_of_view):.1f} deg wide; '
-          f'{100 * side.maps.mask.mean():.1f} % of the pixels lie in its field of view')
+    print(
+        f'{name or side.lens.name}: {camera.projection} {camera.width}x{camera.height} px, f '
+        f'{camera.f:.2f} px, {np.degrees(camera.field_of_view):.1f} deg wide; '
+        f'{100 * side.maps.mask.mean():.1f} % of the pixels lie in its field of view'
+    )
     if left is None:
         print('  the lens has one viewpoint: the maps are exact at every range')
         return
-    print_remaining(f'{f"{name}: " * bool(name)}the maps are exact at {range_text(side.range)}; '
-                    'error at other ranges', left)
+    print_remaining(
+        f'{f"{name}: " * bool(name)}the maps are exact at {range_text(side.range)}; '
+        'error at other ranges',
+        left,
+    )
     print(f'  {tolerated_text(left)}')

@@ -21,8 +21,9 @@ _MIN_COLUMNS = 64  # columns: three numbers, and some of the names, which are br
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
-                        help='as for `ros2 run`')
+    parser.add_argument(
+        '--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...', help='as for `ros2 run`'
+    )
 
 
 def run(args: argparse.Namespace) -> None:

@@ -24,8 +24,13 @@ class _CallablePackage(ModuleType):
     """A package that is a function of the library, too: both have the name `detect`."""
 
     def __call__(
-        self, photographs: str | Path | Sequence[str | Path], board: str, *, detector: str = '',
-        every: int = 1, sync: float | None = None,
+        self,
+        photographs: str | Path | Sequence[str | Path],
+        board: str,
+        *,
+        detector: str = '',
+        every: int = 1,
+        sync: float | None = None,
     ) -> Detection:
         """Search photographs (files, folders, videos, recordings) for a board.
 
@@ -44,16 +49,19 @@ class _CallablePackage(ModuleType):
         paths, pattern = [str(path) for path in given], parse_pattern(str(board))
         able = [name for name, (kinds, _) in DETECTORS.items() if pattern.kind in kinds]
         if detector and detector not in able:
-            raise ParameterError(f'detector {detector!r} does not find {pattern.spec}; take one '
-                                 f'of {", ".join(able)}')
+            raise ParameterError(
+                f'detector {detector!r} does not find {pattern.spec}; take one '
+                f'of {", ".join(able)}'
+            )
         if not paths:
             raise ParameterError('no photographs; give at least one file or folder')
         if every < 1:
             raise ParameterError(f'every is {every}; 1 or more is needed')
         if sync is not None and (isinstance(sync, str) or not sync >= 0):
             raise ParameterError(f'sync is {sync!r}; seconds are needed, 0 or more')
-        return detect(find_photographs(paths, every), pattern, detector,
-                      source=', '.join(paths), sync=sync)
+        return detect(
+            find_photographs(paths, every), pattern, detector, source=', '.join(paths), sync=sync
+        )
 
 
 sys.modules[__name__].__class__ = _CallablePackage

@@ -42,9 +42,7 @@ _MAX_RMS = 0.6  # px rms; rough places are off by less, as far as no lens explai
 
 
 @np.errstate(**IN_SILENCE)
-def fit_circles(
-    pixels: Pixels, start: Array, points: Array, censored: bool = True
-) -> Corners:
+def fit_circles(pixels: Pixels, start: Array, points: Array, censored: bool = True) -> Corners:
     """Fit the circles at start (N, 2), px, in an image (H, W); points (N, 3), m: their centres.
 
     censored: light at the end of the scale may have been any beyond it.
@@ -90,8 +88,11 @@ def _bends(points: Array, uv: Array, shape: tuple[int, ...], step: float) -> tup
     right, down = (image[:, 2, 1] - image[:, 0, 1]) / 2, (image[:, 1, 2] - image[:, 1, 0]) / 2
     middle = 2 * image[:, 1, 1]
     both = (image[:, 2, 2] - image[:, 2, 0] - image[:, 0, 2] + image[:, 0, 0]) / 4
-    second = [image[:, 2, 1] + image[:, 0, 1] - middle, both,
-              image[:, 1, 2] + image[:, 1, 0] - middle]
+    second = [
+        image[:, 2, 1] + image[:, 0, 1] - middle,
+        both,
+        image[:, 1, 2] + image[:, 1, 0] - middle,
+    ]
     return np.stack([right, down], axis=1) / step, np.stack(second, axis=1) / step**2
 
 
@@ -105,8 +106,10 @@ def _radius(pixels: Pixels, start: Array, axes: Array, reach: float) -> float:
     cut = windows(pixels, start, float(reach * np.linalg.norm(axes, axis=(1, 2)).max()))
     offset = cut.offset.T - (start - cut.place)[:, None]
     far = np.linalg.norm(_on_board(offset, axes), axis=-1) / reach
-    mine, middle, rim = ((far < end) & (far >= begin) & cut.inside
-                         for begin, end in ((0.0, 1.0), (0.0, 0.2), (0.85, 1.0)))
+    mine, middle, rim = (
+        (far < end) & (far >= begin) & cut.inside
+        for begin, end in ((0.0, 1.0), (0.0, 0.2), (0.85, 1.0))
+    )
     radii = []
     for data, inside, inner, outer in zip(cut.data, mine, middle, rim, strict=True):
         if inner.any() and outer.any():
@@ -117,7 +120,12 @@ def _radius(pixels: Pixels, start: Array, axes: Array, reach: float) -> float:
 
 
 def _fit_circles(
-    pixels: Pixels, start: Array, axes: Array, bend: Array, radius: float, apart: float,
+    pixels: Pixels,
+    start: Array,
+    axes: Array,
+    bend: Array,
+    radius: float,
+    apart: float,
     censored: bool,
 ) -> Corners:
     reach = radius + _WINDOW_SHARE * (apart - 2 * radius)
@@ -135,8 +143,10 @@ def _fit_circles(
     blur = np.sqrt(np.maximum(np.exp(2 * values[:, 5]) - PIXEL, 0.0))
     least = 1 / np.linalg.norm(_matrix(values), ord=2, axis=(1, 2))
     ok = (
-        judged.settled & (np.linalg.norm(uv - start, axis=1) < 1 + 0.7 * least)
-        & (blur < 2 * least) & (least > _MIN_HALF_AXIS)
+        judged.settled
+        & (np.linalg.norm(uv - start, axis=1) < 1 + 0.7 * least)
+        & (blur < 2 * least)
+        & (least > _MIN_HALF_AXIS)
         & (np.abs(contrast) > CONTRAST * judged.noise)
         & ((problem.weight * cut.inside).sum(axis=1) > 0.95 * problem.weight.sum(axis=1))
     )
@@ -172,8 +182,7 @@ class _Problem(WindowProblem):
         return self.fit_brightness(values, 6)
 
     def outside_domain(self, values: Array) -> Mask:
-        return np.asarray((np.abs(values[:, 5]) > 3)
-                          | (np.linalg.det(_matrix(values)) <= 0))
+        return np.asarray((np.abs(values[:, 5]) > 3) | (np.linalg.det(_matrix(values)) <= 0))
 
     def model(self, values: Array, index: Index) -> tuple[Array, Array]:
         offset = self.cut.offset.T - values[:, None, :2]
@@ -188,8 +197,9 @@ class _Problem(WindowProblem):
         rise = contrast * light * _ROOT * np.exp(-0.5 * distance * distance)
         slope = by_distance * (rise / blur)[..., None]
         jacobian = np.empty((*shape.shape, _UNKNOWNS))
-        jacobian[..., :2] = (-(slope[..., None, :2] @ by_place)[..., 0, :]
-                             - face[..., None] * values[:, None, 8:])
+        jacobian[..., :2] = (
+            -(slope[..., None, :2] @ by_place)[..., 0, :] - face[..., None] * values[:, None, 8:]
+        )
         jacobian[..., 2:5] = slope[..., 2:]
         jacobian[..., 5] = -rise * distance
         jacobian[..., 6], jacobian[..., 7] = light, shape * light
@@ -225,8 +235,12 @@ def _distance(place: Array, matrix: Array) -> tuple[Array, Array]:
     for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
         both = 0.5 if i == j else 1.0
         by_x = x[..., i] * place[..., j] + x[..., j] * place[..., i]
-        by_y = (y[..., i] * x[..., j] + y[..., j] * x[..., i]
-                + z[..., i] * place[..., j] + z[..., j] * place[..., i])
+        by_y = (
+            y[..., i] * x[..., j]
+            + y[..., j] * x[..., i]
+            + z[..., i] * place[..., j]
+            + z[..., j] * place[..., i]
+        )
         derivatives[..., 2 + k] = both * (by_far * by_x + by_steep * by_y)
     return far * (far - 1) / steep, derivatives
 

@@ -40,7 +40,11 @@ class Corners(NamedTuple):
 
 @np.errstate(**IN_SILENCE)
 def fit_corners(
-    pixels: Array, start: Array, axes: Array, clearance: Array, square: bool = False,
+    pixels: Array,
+    start: Array,
+    axes: Array,
+    clearance: Array,
+    square: bool = False,
     censored: bool = True,
 ) -> Corners:
     """Fit corners in an image (H, W) of any brightness scale.
@@ -62,8 +66,10 @@ def fit_corners(
     uv, contrast = values[:, :2] + PIXEL * values[:, 10:] + cut.place, values[:, 9]
     blur = np.sqrt(np.maximum(np.exp(2 * values[:, 6:8]).max(axis=1) - PIXEL, 0.0))
     ok = (
-        judged.settled & (np.linalg.norm(uv - start, axis=1) < 0.7 * radius)
-        & (blur < 0.7 * radius) & (np.abs(contrast) > CONTRAST * judged.noise)
+        judged.settled
+        & (np.linalg.norm(uv - start, axis=1) < 0.7 * radius)
+        & (blur < 0.7 * radius)
+        & (np.abs(contrast) > CONTRAST * judged.noise)
         & (np.abs(np.sin(values[:, 2] - values[:, 3])) > 0.17)
         & (problem.weight.sum(axis=1) > 0.7 * np.pi * radius**2)
     )
@@ -102,9 +108,7 @@ class _Problem(WindowProblem):
     def model(self, values: Array, index: Index) -> tuple[Array, Array]:
         du = self.cut.offset[0] - values[:, :1]
         dv = self.cut.offset[1] - values[:, 1:2]
-        edges = [
-            _edge(du, dv, *(values[:, k + i:k + i + 1] for k in (2, 4, 6))) for i in (0, 1)
-        ]
+        edges = [_edge(du, dv, *(values[:, k + i : k + i + 1] for k in (2, 4, 6))) for i in (0, 1)]
         corner = _blurred_l if self._square else _cross
         between = values[:, 2:3] - values[:, 3:4]
         shape, *by_edge, by_cosine = corner(edges[0][0], edges[1][0], np.cos(between))
@@ -115,7 +119,8 @@ class _Problem(WindowProblem):
         slope = [contrast * light * by_edge[i] for i in (0, 1)]
         for axis in (0, 1):
             jacobian[..., axis] = (
-                slope[0] * edges[0][1 + axis] + slope[1] * edges[1][1 + axis]
+                slope[0] * edges[0][1 + axis]
+                + slope[1] * edges[1][1 + axis]
                 - face * values[:, 10 + axis, None]
             )
         for i in (0, 1):
@@ -152,8 +157,12 @@ def _blurred_l(a: Array, b: Array, alike: Array) -> tuple[Array, Array, Array, A
     """Return a blurred L (A, P), -1 to 1, and its derivatives: the X and both edges, halved."""
     shape, by_a, by_b, by_alike = _cross(a, b, alike)
     edges = [(erf(d / np.sqrt(2)), _ROOT * np.exp(-0.5 * d * d)) for d in (a, b)]
-    return ((shape + edges[0][0] + edges[1][0] - 1) / 2,
-            (by_a + edges[0][1]) / 2, (by_b + edges[1][1]) / 2, by_alike / 2)
+    return (
+        (shape + edges[0][0] + edges[1][0] - 1) / 2,
+        (by_a + edges[0][1]) / 2,
+        (by_b + edges[1][1]) / 2,
+        by_alike / 2,
+    )
 
 
 def _edge(du: Array, dv: Array, angle: Array, bend: Array, size: Array) -> tuple[Array, ...]:
@@ -168,6 +177,10 @@ def _edge(du: Array, dv: Array, angle: Array, bend: Array, size: Array) -> tuple
     sharp, lean = (across + 0.5 * bend * along * along) / blur, bend * along
     inwards = 0.5 * bend * blur
     return (
-        sharp + inwards, (lean * sin - cos) / blur, -(lean * cos + sin) / blur,
-        along * (1 - bend * across) / blur, 0.5 * (along * along / blur + blur), inwards - sharp,
+        sharp + inwards,
+        (lean * sin - cos) / blur,
+        -(lean * cos + sin) / blur,
+        along * (1 - bend * across) / blur,
+        0.5 * (along * along / blur + blur),
+        inwards - sharp,
     )

@@ -84,8 +84,9 @@ class Detection(NamedTuple):
 
     def __repr__(self) -> str:
         found = sum(one.points is not None for one in self.searched)
-        return (f'Detection(board in {found} of {len(self.searched)} photographs, '
-                f'{self.observations})')
+        return (
+            f'Detection(board in {found} of {len(self.searched)} photographs, {self.observations})'
+        )
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -131,8 +132,9 @@ def detect(
             number = index if numbers is None else numbers[index]
             if isinstance(result, TimedOut):
                 one = begun[number].photograph
-                why = (f'no board within {SECONDS:g} s' if result.timed_out
-                       else 'the search crashed')
+                why = (
+                    f'no board within {SECONDS:g} s' if result.timed_out else 'the search crashed'
+                )
                 result = SearchedPhotograph(one.name, one.key, one.camera, one.t, reason=why)
             results[number] = result
             effort.note(result.points is not None, result.inverted)
@@ -140,17 +142,24 @@ def detect(
                 progress()
 
     search(tasks())
-    postponed = [number for number, task in enumerate(begun)
-                 if task.look is Look.FIRST_SEARCH and results[number].points is None]
+    postponed = [
+        number
+        for number, task in enumerate(begun)
+        if task.look is Look.FIRST_SEARCH and results[number].points is None
+    ]
     if effort.has_found_board:
-        search((begun[number]._replace(look=effort.look(number, True))
-                for number in postponed), postponed)
+        search(
+            (begun[number]._replace(look=effort.look(number, True)) for number in postponed),
+            postponed,
+        )
     searched = _add_notes(_one_size([results[number] for number in sorted(results)]))
     if not any(one.points for one in searched):
         reasons = Counter(one.reason.partition(';')[0] for one in searched).most_common(2)
         said = ', '.join(f'{reason} ({count})' for reason, count in reasons)
-        raise ObservationError(f'{source}: no {pattern.spec} in {len(searched)} photographs: '
-                               f'{said}; {check_of_board(pattern)}')
+        raise ObservationError(
+            f'{source}: no {pattern.spec} in {len(searched)} photographs: '
+            f'{said}; {check_of_board(pattern)}'
+        )
     return _table(*_moments(searched, sync), pattern, source)
 
 
@@ -161,14 +170,17 @@ def _moments(
     t = np.array([one.t for one in searched])
     stamps = [stamp for one in searched if (stamp := stamp_of(one.key)) is not None]
     if len(stamps) == len(searched) and np.isnan(t).all():
-        searched = tuple(replace(one, t=stamp / 1e9)
-                         for one, stamp in zip(searched, stamps, strict=True))
+        searched = tuple(
+            replace(one, t=stamp / 1e9) for one, stamp in zip(searched, stamps, strict=True)
+        )
         # Numbers of s since 1970 are no finer than a quarter of a microsecond.
         t = np.array([stamp - min(stamps) for stamp in stamps]) / 1e9
     pairing = pair_photographs(
-        [one.key for one in searched], [one.camera for one in searched], t, sync)
-    return tuple(replace(one, key=key)
-                 for one, key in zip(searched, pairing.keys, strict=True)), pairing
+        [one.key for one in searched], [one.camera for one in searched], t, sync
+    )
+    return tuple(
+        replace(one, key=key) for one, key in zip(searched, pairing.keys, strict=True)
+    ), pairing
 
 
 def examine(task: _Task) -> SearchedPhotograph:
@@ -192,8 +204,14 @@ def examine(task: _Task) -> SearchedPhotograph:
     if pattern.kind == 'chessboard' and goes_on(pixels, points, pattern):
         notes = (*notes, LARGER_BOARD)
     digest = hashlib.sha1(pixels.tobytes()).hexdigest()
-    return replace(blank, points=points, notes=notes, digest=digest, inverted=inverted,
-                   bright=full_scale_share(pixels, points.uv))
+    return replace(
+        blank,
+        points=points,
+        notes=notes,
+        digest=digest,
+        inverted=inverted,
+        bright=full_scale_share(pixels, points.uv),
+    )
 
 
 def _look(pixels: Pixels, task: _Task) -> tuple[Points | str, bool]:
@@ -208,8 +226,10 @@ def _look(pixels: Pixels, task: _Task) -> tuple[Points | str, bool]:
     points = find_points(pixels, pattern, detector)
     if look is not Look.SAMPLE or isinstance(points, str):
         return points, False
-    own, inverted = (find_points(pixels, pattern, detector, finder=finder) for finder in (
-        FIRST_LOOKS[detector], invert_image(FIRST_LOOKS[detector])))
+    own, inverted = (
+        find_points(pixels, pattern, detector, finder=finder)
+        for finder in (FIRST_LOOKS[detector], invert_image(FIRST_LOOKS[detector]))
+    )
     return points, isinstance(own, str) and isinstance(inverted, Points)
 
 
@@ -228,9 +248,13 @@ def _one_size(searched: list[SearchedPhotograph]) -> list[SearchedPhotograph]:
     }
     usual = {camera: count.most_common(1)[0][0] for camera, count in sizes.items() if count}
     return [
-        one if not one.points or one.size == usual[one.camera] else replace(
-            one, points=None,
-            reason='is {}x{} px; the others are {}x{}'.format(*one.size, *usual[one.camera]))
+        one
+        if not one.points or one.size == usual[one.camera]
+        else replace(
+            one,
+            points=None,
+            reason='is {}x{} px; the others are {}x{}'.format(*one.size, *usual[one.camera]),
+        )
         for one in searched
     ]
 
@@ -253,8 +277,13 @@ def _add_notes(searched: list[SearchedPhotograph]) -> tuple[SearchedPhotograph, 
                 one = replace(one, points=None, reason=f'a copy of {other.name}')
                 break
             if one.key == other.key:
-                one = replace(one, points=None, reason=(
-                    f'the same frame as {other.name}, by name or stamp; rename or remove it'))
+                one = replace(
+                    one,
+                    points=None,
+                    reason=(
+                        f'the same frame as {other.name}, by name or stamp; rename or remove it'
+                    ),
+                )
                 break
             if _is_same_moment(one, other):
                 notes.append(f'from the same viewpoint as {Path(other.name).name}')
@@ -280,8 +309,10 @@ def _table(
     found = [one for one in searched if one.points is not None]
     if '' in cameras and len(cameras) > 1:
         lone = next(one.name for one in found if not one.camera)
-        raise ObservationError(f'{lone}: of no camera, others are of {", ".join(cameras[1:])}; '
-                               'put it into a folder named after its camera')
+        raise ObservationError(
+            f'{lone}: of no camera, others are of {", ".join(cameras[1:])}; '
+            'put it into a folder named after its camera'
+        )
     certainty = np.ones(len(searched))
     if len(pattern.symmetries) > 1:
         found, sure = _agree_on_order(found, pattern, cameras, number, source)
@@ -295,8 +326,11 @@ def _table(
 
 
 def _agree_on_order(
-    found: list[SearchedPhotograph], pattern: Pattern, cameras: tuple[str, ...],
-    number: dict[str, int], source: str,
+    found: list[SearchedPhotograph],
+    pattern: Pattern,
+    cameras: tuple[str, ...],
+    number: dict[str, int],
+    source: str,
 ) -> tuple[list[SearchedPhotograph], Array]:
     """Return the photographs with their corners in one order, and how sure that is."""
     table = _observations(found, pattern, cameras, number, source)
@@ -314,8 +348,10 @@ def _agree_on_order(
         for view, frame in enumerate(views.frame.tolist()):
             used = views.used[view]
             field[mine[frame], views.landmark[view, used]] = board_residuals(
-                views.points[view, used, :2], views.uv[view, used],
-                fitted.adjusted.residual[view, used])
+                views.points[view, used, :2],
+                views.uv[view, used],
+                fitted.adjusted.residual[view, used],
+            )
             for whole, part in zip(poses, fitted.adjusted.pose, strict=True):
                 whole[mine[frame]] = part[view]
     seen = np.isfinite(field).any(axis=(1, 2))
@@ -350,11 +386,16 @@ def _order_by_left(
     posed = set(np.flatnonzero(np.isfinite(poses.position).all(axis=1)).tolist())
     first = {found[i].key: i for i in posed if found[i].camera == cameras[0]}
     for name in cameras[1:]:
-        mine = np.array(sorted(
-            i for i in posed if found[i].camera == name and found[i].key in first), dtype=int)
+        mine = np.array(
+            sorted(i for i in posed if found[i].camera == name and found[i].key in first),
+            dtype=int,
+        )
         theirs = np.array([first[found[i].key] for i in mine], dtype=int)
-        turns = of_rig(poses.take(theirs), poses.take(mine), pattern.points[:, :2],
-                       pattern.symmetries) if len(mine) >= _MIN_RIG_FRAMES else None
+        turns = (
+            of_rig(poses.take(theirs), poses.take(mine), pattern.points[:, :2], pattern.symmetries)
+            if len(mine) >= _MIN_RIG_FRAMES
+            else None
+        )
         if turns is not None:
             leader[mine], own[mine] = theirs, turns
     return leader, own
@@ -363,13 +404,20 @@ def _order_by_left(
 def _turned_points(points: Points, turn: Turn) -> Points:
     where = np.argsort(turn.source)
     order = np.argsort(where[points.ids], kind='stable')
-    return points._replace(ids=where[points.ids][order], uv=points.uv[order],
-                           sigma=points.sigma[order], reach=points.reach[order])
+    return points._replace(
+        ids=where[points.ids][order],
+        uv=points.uv[order],
+        sigma=points.sigma[order],
+        reach=points.reach[order],
+    )
 
 
 def _observations(
-    found: list[SearchedPhotograph], pattern: Pattern, cameras: tuple[str, ...],
-    number: dict[str, int], source: str,
+    found: list[SearchedPhotograph],
+    pattern: Pattern,
+    cameras: tuple[str, ...],
+    number: dict[str, int],
+    source: str,
 ) -> Observations:
     points = [one.points for one in found if one.points is not None]
     count = [len(one.ids) for one in points]
@@ -379,11 +427,16 @@ def _observations(
         return np.repeat(np.array(values, dtype=float), count)
 
     table = make_observations(
-        column([number[one.key] for one in found]).astype(np.int64), index,
-        np.concatenate([one.uv for one in points]), pattern.points[index],
+        column([number[one.key] for one in found]).astype(np.int64),
+        index,
+        np.concatenate([one.uv for one in points]),
+        pattern.points[index],
         camera=column([cameras.index(one.camera) for one in found]).astype(np.int64),
-        t=column([one.t for one in found]), cameras=cameras, source=source,
+        t=column([one.t for one in found]),
+        cameras=cameras,
+        source=source,
         sigma=np.concatenate([one.sigma for one in points]),
     )
-    return replace(table, photographs=tuple(
-        (number[one.key], one.camera, one.name) for one in found))
+    return replace(
+        table, photographs=tuple((number[one.key], one.camera, one.name) for one in found)
+    )

@@ -34,6 +34,7 @@ _SB_HARD = _SB | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
 
 def _at_small_scale(find: Finder) -> Finder:
     """Return a finder that searches large images at a smaller scale."""
+
     def search(image: Grey, pattern: Pattern) -> Found | None:
         scale = _SEARCH_SIZE / max(image.shape)
         if scale >= 1:
@@ -47,6 +48,7 @@ def _at_small_scale(find: Finder) -> Finder:
 
 def _search_scaled(find: Finder) -> Finder:
     """Return a finder that searches large images at a smaller scale first."""
+
     def search(image: Grey, pattern: Pattern) -> Found | None:
         found = _at_small_scale(find)(image, pattern)
         return find(image, pattern) if found is None and max(image.shape) > _SEARCH_SIZE else found
@@ -61,6 +63,7 @@ def invert_image(find: Finder) -> Finder:
 
 def _sharper(find: Finder) -> Finder:
     """Return a finder that looks again, at the sharpened image, where it finds few points."""
+
     def search(image: Grey, pattern: Pattern) -> Found | None:
         found = find(image, pattern)
         if found is not None and len(found[0]) >= _MIN_SHARE * len(pattern.points):
@@ -117,7 +120,8 @@ def charuco(image: Grey, pattern: Pattern) -> Found | None:
             # Before OpenCV 4.6 boards of an even number of rows had their colours the other way.
             board.setLegacyPattern(True)
             corners, ids, _, _ = _ARUCO.CharucoDetector(board).detectBoard(
-                image, markerCorners=tags, markerIds=tag_ids)
+                image, markerCorners=tags, markerIds=tag_ids
+            )
     else:
         board = _ARUCO.CharucoBoard_create(*size, pattern.size, pattern.marker, dictionary)
         tags, tag_ids, _ = _ARUCO.detectMarkers(image, dictionary)
@@ -131,8 +135,11 @@ def charuco(image: Grey, pattern: Pattern) -> Found | None:
 
 def aprilgrid(image: Grey, pattern: Pattern) -> Found | None:
     """Kalibr's AprilGrid: tags 36h11 with a border of two cells, by cv2.aruco."""
-    known = {tag: corners for tag, corners in _tags(image, pattern, 2).items()
-             if tag < pattern.tag_count}
+    known = {
+        tag: corners
+        for tag, corners in _tags(image, pattern, 2).items()
+        if tag < pattern.tag_count
+    }
     if not known:
         return None
     index = np.concatenate([4 * tag + np.arange(4) for tag in known])
@@ -144,9 +151,12 @@ def aprilgrid(image: Grey, pattern: Pattern) -> Found | None:
 def explain_failure(image: Grey, pattern: Pattern) -> str:
     """Return why a board was not found, as far as the image tells."""
     if pattern.kind == 'aprilgrid' and any(
-            tag < pattern.tag_count for tag in _tags(image, pattern, 1)):
-        return ('no board found: its tags have a border of one cell; print the target of Kalibr, '
-                'whose border is two cells')
+        tag < pattern.tag_count for tag in _tags(image, pattern, 1)
+    ):
+        return (
+            'no board found: its tags have a border of one cell; print the target of Kalibr, '
+            'whose border is two cells'
+        )
     return 'no board found'
 
 
@@ -162,8 +172,11 @@ def _tags(image: Grey, pattern: Pattern, border: int) -> dict[int, Array]:
         tags, ids, _ = _ARUCO.ArucoDetector(dictionary, parameters).detectMarkers(image)
     else:
         tags, ids, _ = _ARUCO.detectMarkers(image, dictionary, parameters=parameters)
-    return {} if ids is None else {
-        int(tag): corners for tag, corners in zip(ids.ravel(), tags, strict=True)}
+    return (
+        {}
+        if ids is None
+        else {int(tag): corners for tag, corners in zip(ids.ravel(), tags, strict=True)}
+    )
 
 
 def count_tags(image: Grey, pattern: Pattern) -> tuple[int, int]:
@@ -175,16 +188,20 @@ def count_tags(image: Grey, pattern: Pattern) -> tuple[int, int]:
 
 
 # Which patterns a detector is for, and its finder
-DETECTORS = Registry[tuple[tuple[str, ...], Finder]]('detectors', {
-    'saddle': (('chessboard',), _search_scaled(chessboard)),
-    'quick': (('chessboard',), _search_scaled(classic)),
-    'sb': (('chessboard',), sector_based),
-    'classic': (('chessboard',), classic_subpixel),
-    'charuco': (('charuco',), _sharper(charuco)),
-    'aprilgrid': (('aprilgrid',), _sharper(aprilgrid)),
-    'circles': (('circles', 'asymmetric_circles'), _search_scaled(find_circles)),
-    'squares': (('squares',), find_squares),
-}, tuple)
+DETECTORS = Registry[tuple[tuple[str, ...], Finder]](
+    'detectors',
+    {
+        'saddle': (('chessboard',), _search_scaled(chessboard)),
+        'quick': (('chessboard',), _search_scaled(classic)),
+        'sb': (('chessboard',), sector_based),
+        'classic': (('chessboard',), classic_subpixel),
+        'charuco': (('charuco',), _sharper(charuco)),
+        'aprilgrid': (('aprilgrid',), _sharper(aprilgrid)),
+        'circles': (('circles', 'asymmetric_circles'), _search_scaled(find_circles)),
+        'squares': (('squares',), find_squares),
+    },
+    tuple,
+)
 # What a detector does first, alone
 FIRST_LOOKS: dict[str, Finder] = {'saddle': _at_small_scale(classic)}
 UNFITTED_DETECTORS = ('sb', 'classic')  # keep their own points; the others are fitted
@@ -205,12 +222,16 @@ def _all_corners(ok: bool, corners: Any) -> Found | None:
 def dictionary_of(pattern: Pattern) -> Any:
     """Return the ArUco dictionary of a pattern."""
     if _ARUCO is None:
-        raise ParameterError(f'board {pattern.spec!r}: OpenCV {cv2.__version__} has no markers; '
-                             'install 4.7 or newer, or opencv-contrib')
+        raise ParameterError(
+            f'board {pattern.spec!r}: OpenCV {cv2.__version__} has no markers; '
+            'install 4.7 or newer, or opencv-contrib'
+        )
     named = [name for name in dir(_ARUCO) if name.upper() == pattern.dictionary]
     if not named:
-        raise ParameterError(f'board {pattern.spec!r}: OpenCV {cv2.__version__} has no dictionary '
-                             f'{pattern.dictionary}')
+        raise ParameterError(
+            f'board {pattern.spec!r}: OpenCV {cv2.__version__} has no dictionary '
+            f'{pattern.dictionary}'
+        )
     number = getattr(_ARUCO, named[0])
     if hasattr(_ARUCO, 'getPredefinedDictionary'):
         return _ARUCO.getPredefinedDictionary(number)

@@ -72,8 +72,14 @@ def _ellipses(image: NDArray[np.uint8], bright: bool) -> Ellipses:
     kind = cv2.THRESH_BINARY if bright else cv2.THRESH_BINARY_INV
     contours: list[Any] = []
     for block in _BLOCKS:
-        mask = cv2.adaptiveThreshold(image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, kind, block,
-                                     -_MIN_DARKNESS if bright else _MIN_DARKNESS)
+        mask = cv2.adaptiveThreshold(
+            image,
+            255,
+            cv2.ADAPTIVE_THRESH_MEAN_C,
+            kind,
+            block,
+            -_MIN_DARKNESS if bright else _MIN_DARKNESS,
+        )
         contours += cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
     every = _standing_out(image, _elliptic(contours, _LARGEST * image.size), bright)
     centres, matrices = np.empty((0, 2)), np.empty((0, 2, 2))
@@ -87,8 +93,12 @@ def _ellipses(image: NDArray[np.uint8], bright: bool) -> Ellipses:
 
 def _elliptic(contours: list[Any], largest: float) -> Ellipses:
     """Return those contours that are ellipses, and not too small or too large, px^2."""
-    parts = np.array([[part[name] for name in ('m00', 'm10', 'm01', 'mu20', 'mu11', 'mu02')]
-                      for part in map(cv2.moments, contours)]).reshape(-1, 6)
+    parts = np.array(
+        [
+            [part[name] for name in ('m00', 'm10', 'm01', 'mu20', 'mu11', 'mu02')]
+            for part in map(cv2.moments, contours)
+        ]
+    ).reshape(-1, 6)
     parts = parts[(parts[:, 0] >= _LEAST) & (parts[:, 0] <= largest)]
     # The largest first: a circle larger than the block has a hole.
     area, *rest = parts[np.argsort(-parts[:, 0], kind='stable')].T
@@ -189,8 +199,11 @@ def find_squares(image: NDArray[np.uint8], pattern: Pattern) -> tuple[Index, Arr
 
     Corners go around each square from its corner of least x and y, squares row by row.
     """
-    step = 1 + float(np.linalg.norm(pattern.points[4] - pattern.points[1])
-                     / pattern.size if pattern.columns > 1 else 1)
+    step = 1 + float(
+        np.linalg.norm(pattern.points[4] - pattern.points[1]) / pattern.size
+        if pattern.columns > 1
+        else 1
+    )
     levels = itertools.product(_SQUARE_BLOCKS, _DARKNESS_LEVELS)
     tries = (_quads(image, block, below) for block, below in levels)
     together = np.empty((0, 4, 2))
@@ -214,8 +227,9 @@ def _merge_quads(quads: Array, more: Array) -> Array:
 
 def _quads(image: NDArray[np.uint8], block: int, below: int) -> Array:
     """Return quadrilaterals (Q, 4, 2), px, darker than their surroundings, clockwise as seen."""
-    dark = cv2.adaptiveThreshold(image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV,
-                                 block, below)
+    dark = cv2.adaptiveThreshold(
+        image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, block, below
+    )
     contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     quads = []
     for contour in contours:
@@ -238,8 +252,10 @@ def _grow_squares(quads: Array, first: int, step: float) -> dict[tuple[int, int]
     while waiting:
         column, row = waiting.pop()
         quad = grid[column, row]
-        sides = ((quad[1] + quad[2] - quad[0] - quad[3]) / 2,
-                 (quad[3] + quad[2] - quad[0] - quad[1]) / 2)
+        sides = (
+            (quad[1] + quad[2] - quad[0] - quad[3]) / 2,
+            (quad[3] + quad[2] - quad[0] - quad[1]) / 2,
+        )
         for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
             place = (column + dx, row + dy)
             move = step * (dx * sides[0] + dy * sides[1])
@@ -251,8 +267,9 @@ def _grow_squares(quads: Array, first: int, step: float) -> dict[tuple[int, int]
             if place in grid or nearest in used or far or unlike:
                 continue
             turned = [np.roll(quads[nearest], k, axis=0) for k in range(4)]
-            grid[place] = max(turned, key=lambda q: float((q[1] - q[0]) @ sides[0]
-                                                          + (q[3] - q[0]) @ sides[1]))
+            grid[place] = max(
+                turned, key=lambda q: float((q[1] - q[0]) @ sides[0] + (q[3] - q[0]) @ sides[1])
+            )
             used.add(nearest)
             waiting.append(place)
     return grid

@@ -27,16 +27,21 @@ class _Encoding(NamedTuple):
 
 def _encodings() -> dict[str, _Encoding]:
     """Return all that show brightness; those without an order of colors have OpenCV's."""
-    known = {f'nv{number}': _Encoding(np.uint8, 1, None, planes)
-             for number, planes in (('12', 0.5), ('21', 0.5), ('24', 2.0))}
+    known = {
+        f'nv{number}': _Encoding(np.uint8, 1, None, planes)
+        for number, planes in (('12', 0.5), ('21', 0.5), ('24', 2.0))
+    }
     for name, kind in (('8', np.uint8), ('16', np.uint16)):
-        known |= {f'mono{name}': _Encoding(kind, 1), f'{name}UC1': _Encoding(kind, 1),
-                  f'{name}UC3': _Encoding(kind, 3, cv2.COLOR_BGR2GRAY),
-                  f'{name}UC4': _Encoding(kind, 4, cv2.COLOR_BGRA2GRAY),
-                  f'rgb{name}': _Encoding(kind, 3, cv2.COLOR_RGB2GRAY),
-                  f'bgr{name}': _Encoding(kind, 3, cv2.COLOR_BGR2GRAY),
-                  f'rgba{name}': _Encoding(kind, 4, cv2.COLOR_RGBA2GRAY),
-                  f'bgra{name}': _Encoding(kind, 4, cv2.COLOR_BGRA2GRAY)}
+        known |= {
+            f'mono{name}': _Encoding(kind, 1),
+            f'{name}UC1': _Encoding(kind, 1),
+            f'{name}UC3': _Encoding(kind, 3, cv2.COLOR_BGR2GRAY),
+            f'{name}UC4': _Encoding(kind, 4, cv2.COLOR_BGRA2GRAY),
+            f'rgb{name}': _Encoding(kind, 3, cv2.COLOR_RGB2GRAY),
+            f'bgr{name}': _Encoding(kind, 3, cv2.COLOR_BGR2GRAY),
+            f'rgba{name}': _Encoding(kind, 4, cv2.COLOR_RGBA2GRAY),
+            f'bgra{name}': _Encoding(kind, 4, cv2.COLOR_BGRA2GRAY),
+        }
         # OpenCV calls a pattern by its second row.
         for pattern, grey, bgr in (
             ('rggb', cv2.COLOR_BayerBG2GRAY, cv2.COLOR_BayerBG2BGR),
@@ -47,8 +52,11 @@ def _encodings() -> dict[str, _Encoding]:
             known[f'bayer_{pattern}{name}'] = _Encoding(kind, 1, grey, bgr=bgr)
     uyvy = _Encoding(np.uint8, 2, cv2.COLOR_YUV2GRAY_UYVY, bgr=cv2.COLOR_YUV2BGR_UYVY)
     yuyv = _Encoding(np.uint8, 2, cv2.COLOR_YUV2GRAY_YUY2, bgr=cv2.COLOR_YUV2BGR_YUY2)
-    return known | dict.fromkeys(('yuv422', 'uyvy'), uyvy) | dict.fromkeys(
-        ('yuv422_yuy2', 'yuyv'), yuyv)
+    return (
+        known
+        | dict.fromkeys(('yuv422', 'uyvy'), uyvy)
+        | dict.fromkeys(('yuv422_yuy2', 'yuyv'), yuyv)
+    )
 
 
 _ENCODINGS = _encodings()
@@ -87,9 +95,11 @@ def _samples(message: Any, name: str) -> tuple[_Encoding, NDArray[Any]]:
     data, height, step = bytes(message.data), message.height, message.step
     width = message.width * encoding.channels * dtype.itemsize
     if not 0 < width <= step or not 0 < step * height * (1 + encoding.planes) <= len(data):
-        raise ObservationError(f'{name}: {len(data)} bytes do not hold an image of '
-                               f'{message.width}x{height} {message.encoding}')
-    rows = np.frombuffer(data, np.uint8)[:step * height]
+        raise ObservationError(
+            f'{name}: {len(data)} bytes do not hold an image of '
+            f'{message.width}x{height} {message.encoding}'
+        )
+    rows = np.frombuffer(data, np.uint8)[: step * height]
     rows = np.ascontiguousarray(rows.reshape(height, step)[:, :width])
     pixels: NDArray[Any] = rows.view(dtype).astype(encoding.kind, copy=False)
     if encoding.channels > 1:
@@ -101,5 +111,7 @@ def _encoding_error(encoding: str) -> str:
     reason = 'unknown'
     if encoding.rstrip('0123456789') in _NO_BRIGHTNESS:
         reason = 'not one of brightness'
-    return f'{encoding[:40]!r} is {reason}; have the driver send mono8, bgr8 or another of ' \
-           f'{", ".join(_ENCODINGS)}'
+    return (
+        f'{encoding[:40]!r} is {reason}; have the driver send mono8, bgr8 or another of '
+        f'{", ".join(_ENCODINGS)}'
+    )

@@ -55,8 +55,10 @@ def of_rig(one: Pose, other: Pose, points: Array, turns: tuple[Turn, ...]) -> In
     tried = Pose(*(part[:, :_MAX_FRAMES].reshape(-1, *part.shape[2:]) for part in between))
     cosine = np.einsum('hij,gfij->hgf', tried.rotation, between.rotation) / 2 - 0.5
     away = np.linalg.norm(one.position - [*points.mean(axis=0), 0.0], axis=-1)
-    off = np.arccos(np.clip(cosine, -1, 1)) + np.linalg.norm(
-        tried.position[:, None, None] - between.position, axis=-1) / away
+    off = (
+        np.arccos(np.clip(cosine, -1, 1))
+        + np.linalg.norm(tried.position[:, None, None] - between.position, axis=-1) / away
+    )
     typical = np.median(off.min(axis=1), axis=-1)
     best = int(typical.argmin())
     return off[best].argmin(axis=0) if typical[best] < _MAX_SPREAD else None

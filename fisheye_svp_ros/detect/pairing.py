@@ -39,8 +39,11 @@ def stamp_of(name: str) -> int | None:
     seconds, fraction, *others = match.groups()
     if seconds is not None:
         return int(seconds + fraction.ljust(9, '0'))
-    return next(int(digits) * scale for digits, scale in zip(
-        others, (10**6, 10**3, 1), strict=True) if digits is not None)
+    return next(
+        int(digits) * scale
+        for digits, scale in zip(others, (10**6, 10**3, 1), strict=True)
+        if digits is not None
+    )
 
 
 def pair_photographs(
@@ -62,11 +65,16 @@ def pair_photographs(
     if len(alone) == len(own):
         parts = [key.rpartition('/') for key in own]
         numbers = [['', *_NUMBER.findall(name)][-1] for _, _, name in parts]
-        counted = tuple(f'{path}{slash}{number.lstrip("0") or "0"}'
-                        for (path, slash, _), number in zip(parts, numbers, strict=True))
+        counted = tuple(
+            f'{path}{slash}{number.lstrip("0") or "0"}'
+            for (path, slash, _), number in zip(parts, numbers, strict=True)
+        )
         each = list(zip(cameras, counted, strict=True))
-        if all(0 < len(one) <= _DIGITS for one in numbers) and len({*each}) == len(each) and (
-                len(_count_unpaired(counted, names)) < len(own)):
+        if (
+            all(0 < len(one) <= _DIGITS for one in numbers)
+            and len({*each}) == len(each)
+            and (len(_count_unpaired(counted, names)) < len(own))
+        ):
             own, way, alone = counted, 'number', _count_unpaired(counted, names)
     return Pairing(own, way, 0.0, alone)
 

@@ -22,10 +22,17 @@ _MAX_POINTS = 10_000  # points
 _APRILTAGS = 'DICT_APRILTAG_36H11'
 # Markers of OpenCV's dictionaries, whose names are as good in capitals
 _MARKERS = {
-    **{f'DICT_{bits}X{bits}_{count}': count
-       for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
-    'DICT_ARUCO_ORIGINAL': 1024, 'DICT_ARUCO_MIP_36H12': 250, 'DICT_APRILTAG_16H5': 30,
-    'DICT_APRILTAG_25H9': 35, 'DICT_APRILTAG_36H10': 2320, _APRILTAGS: 587,
+    **{
+        f'DICT_{bits}X{bits}_{count}': count
+        for bits in (4, 5, 6, 7)
+        for count in (50, 100, 250, 1000)
+    },
+    'DICT_ARUCO_ORIGINAL': 1024,
+    'DICT_ARUCO_MIP_36H12': 250,
+    'DICT_APRILTAG_16H5': 30,
+    'DICT_APRILTAG_25H9': 35,
+    'DICT_APRILTAG_36H10': 2320,
+    _APRILTAGS: 587,
 }
 _TAGS = _MARKERS[_APRILTAGS]
 _NEIGHBOURS = 6
@@ -66,8 +73,10 @@ class Pattern:
     @property
     def tag_count(self) -> int:
         """How many tags it has."""
-        return {'aprilgrid': self.columns * self.rows,
-                'charuco': self.columns * self.rows // 2}.get(self.kind, 0)
+        return {
+            'aprilgrid': self.columns * self.rows,
+            'charuco': self.columns * self.rows // 2,
+        }.get(self.kind, 0)
 
     @cached_property
     def turns(self) -> tuple[Turn, ...]:
@@ -106,15 +115,17 @@ def parse_pattern(spec: str) -> Pattern:
     """
     kind, _, rest = spec.partition(':')
     if kind not in PATTERNS:
-        raise ParameterError(f'board {spec!r}: known kinds are {", ".join(PATTERNS)}; for example '
-                             'chessboard:9x6:24mm, which counts inner corners')
+        raise ParameterError(
+            f'board {spec!r}: known kinds are {", ".join(PATTERNS)}; for example '
+            'chessboard:9x6:24mm, which counts inner corners'
+        )
     return PATTERNS[kind](spec, rest.split(':') if rest else [])
 
 
 def local_axes(points: Array, uv: Array) -> Array:
     """Return derivatives (M, 2, 2), px/m, of uv (M, 2) by points (M, 2): rows are the axes."""
     distance = np.linalg.norm(points[:, None] - points, axis=-1)
-    nearest = np.argsort(distance, axis=1, kind='stable')[:, 1:_NEIGHBOURS + 1]
+    nearest = np.argsort(distance, axis=1, kind='stable')[:, 1 : _NEIGHBOURS + 1]
     here, there = points[nearest] - points[:, None], uv[nearest] - uv[:, None]
     weight = 1 / (here**2).sum(axis=-1, keepdims=True)
     transposed = np.swapaxes(here * weight, -1, -2)
@@ -126,8 +137,17 @@ def local_axes(points: Array, uv: Array) -> Array:
 def _chessboard(spec: str, words: list[str]) -> Pattern:
     (columns, rows), (size,) = _numbers(spec, words, 1, least=3)
     points = _grid(columns, rows, size)
-    return Pattern('chessboard', spec, columns, rows, points, size, np.zeros((len(points), 2)),
-                   _checks(columns, rows), size)
+    return Pattern(
+        'chessboard',
+        spec,
+        columns,
+        rows,
+        points,
+        size,
+        np.zeros((len(points), 2)),
+        _checks(columns, rows),
+        size,
+    )
 
 
 def _charuco(spec: str, words: list[str]) -> Pattern:
@@ -136,16 +156,31 @@ def _charuco(spec: str, words: list[str]) -> Pattern:
     if marker >= size:
         raise ParameterError(f'board {spec!r}: the marker must be smaller than its square')
     if dictionary not in _MARKERS:
-        raise ParameterError(f'board {spec!r}: OpenCV has no dictionary {dictionary}; known are '
-                             f'{", ".join(_MARKERS)}')
+        raise ParameterError(
+            f'board {spec!r}: OpenCV has no dictionary {dictionary}; known are '
+            f'{", ".join(_MARKERS)}'
+        )
     needed, there = columns * rows // 2, _MARKERS[dictionary]
     if needed > there:
-        raise ParameterError(f'board {spec!r}: it needs {needed} markers, and {dictionary} has '
-                             f'{there}; choose a larger dictionary')
+        raise ParameterError(
+            f'board {spec!r}: it needs {needed} markers, and {dictionary} has '
+            f'{there}; choose a larger dictionary'
+        )
     points = _grid(columns - 1, rows - 1, size)
     clearance = (size - marker) / np.sqrt(2)  # the corner of a marker is the nearest of it
-    return Pattern('charuco', spec, columns, rows, points, clearance, np.zeros((len(points), 2)),
-                   _checks(columns - 1, rows - 1), size, marker, dictionary)
+    return Pattern(
+        'charuco',
+        spec,
+        columns,
+        rows,
+        points,
+        clearance,
+        np.zeros((len(points), 2)),
+        _checks(columns - 1, rows - 1),
+        size,
+        marker,
+        dictionary,
+    )
 
 
 def _circles(spec: str, words: list[str]) -> Pattern:
@@ -156,40 +191,66 @@ def _circles(spec: str, words: list[str]) -> Pattern:
         row = np.repeat(np.arange(rows), columns)
         points[:, 0] = 2 * points[:, 0] + (row % 2) * size
     kind = 'asymmetric_circles' if asymmetric else 'circles'
-    return Pattern(kind, spec, columns, rows, points, 0.5 * size, np.zeros((len(points), 2)),
-                   np.zeros(len(points)), size)
+    return Pattern(
+        kind,
+        spec,
+        columns,
+        rows,
+        points,
+        0.5 * size,
+        np.zeros((len(points), 2)),
+        np.zeros(len(points)),
+        size,
+    )
 
 
 def _squares(spec: str, words: list[str]) -> Pattern:
     (columns, rows), (side, gap) = _numbers(spec, words, 2, least=1)
     points = _tiles(columns, rows, side + gap, side)
     inward = np.tile(1 - 2 * _CORNERS, (columns * rows, 1))
-    return Pattern('squares', spec, columns, rows, points, min(side, gap), inward,
-                   np.zeros(len(points)), side)
+    return Pattern(
+        'squares', spec, columns, rows, points, min(side, gap), inward, np.zeros(len(points)), side
+    )
 
 
 def _aprilgrid(spec: str, words: list[str]) -> Pattern:
     path = Path(':'.join(words))
     if path == Path():
-        raise ParameterError(f'board {spec!r}: the file of a Kalibr target is needed, as in '
-                             'aprilgrid:target.yaml')
+        raise ParameterError(
+            f'board {spec!r}: the file of a Kalibr target is needed, as in aprilgrid:target.yaml'
+        )
     document = read_yaml(path, ParameterError)
     if document.get('target_type') != 'aprilgrid':
-        raise ParameterError(f'{path}: target_type is {document.get("target_type")!r}; the YAML '
-                             'of a Kalibr aprilgrid is needed')
+        raise ParameterError(
+            f'{path}: target_type is {document.get("target_type")!r}; the YAML '
+            'of a Kalibr aprilgrid is needed'
+        )
     sides = [_positive(document, name, path, _TAGS) for name in ('tagCols', 'tagRows')]
     columns, rows = map(int, sides)
     if sides != [columns, rows] or columns * rows > _TAGS:
-        raise ParameterError(f'{path}: tagCols x tagRows is {sides[0]:g} x {sides[1]:g}; whole '
-                             f'numbers, and at most {_TAGS} tags, are needed')
+        raise ParameterError(
+            f'{path}: tagCols x tagRows is {sides[0]:g} x {sides[1]:g}; whole '
+            f'numbers, and at most {_TAGS} tags, are needed'
+        )
     tag = _positive(document, 'tagSize', path, _MAX_SPACING)
     ratio = _positive(document, 'tagSpacing', path, _MAX_SPACING)
     # As Kalibr has it: x right, y up, tags and the corners of each from the lower left.
     points = _tiles(columns, rows, tag * (1 + ratio), tag)
     # The border of a tag is two of its ten cells: a corner of a cell is nearest.
     clearance = tag * min(ratio, 0.2 * np.sqrt(2))
-    return Pattern('aprilgrid', spec, columns, rows, points, clearance, np.zeros((len(points), 2)),
-                   np.tile([-1.0, 1, -1, 1], columns * rows), tag, tag, _APRILTAGS)
+    return Pattern(
+        'aprilgrid',
+        spec,
+        columns,
+        rows,
+        points,
+        clearance,
+        np.zeros((len(points), 2)),
+        np.tile([-1.0, 1, -1, 1], columns * rows),
+        tag,
+        tag,
+        _APRILTAGS,
+    )
 
 
 PATTERNS: dict[str, Callable[[str, list[str]], Pattern]] = {
@@ -206,12 +267,16 @@ def _numbers(
 ) -> tuple[tuple[int, int], list[float]]:
     size = _SIZE.fullmatch(words[0]) if words else None
     if size is None or len(words) != 1 + lengths:
-        raise ParameterError(f'board {spec!r}: columns x rows and {lengths} '
-                             f'length{"s"[:lengths - 1]} are needed, as in chessboard:9x6:24mm')
+        raise ParameterError(
+            f'board {spec!r}: columns x rows and {lengths} '
+            f'length{"s"[: lengths - 1]} are needed, as in chessboard:9x6:24mm'
+        )
     columns, rows = int(size[1]), int(size[2])
     if min(columns, rows) < least or columns * rows > _MAX_POINTS:
-        raise ParameterError(f'board {spec!r}: {words[0]} points; at least {least} each way and '
-                             f'{_MAX_POINTS} in all are needed')
+        raise ParameterError(
+            f'board {spec!r}: {words[0]} points; at least {least} each way and '
+            f'{_MAX_POINTS} in all are needed'
+        )
     return (columns, rows), [_length(spec, word) for word in words[1:]]
 
 
@@ -222,16 +287,19 @@ def _length(spec: str, word: str) -> float:
     except ValueError:
         value = 0.0
     if not 0 < value < _MAX_SPACING:
-        raise ParameterError(f'board {spec!r}: {word!r} is not a length above 0 and below '
-                             f'{_MAX_SPACING:g} m with its unit, as in 24.23mm')
+        raise ParameterError(
+            f'board {spec!r}: {word!r} is not a length above 0 and below '
+            f'{_MAX_SPACING:g} m with its unit, as in 24.23mm'
+        )
     return value
 
 
 def _positive(document: dict[str, Any], name: str, path: Path, most: float) -> float:
     value = document.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= most:
-        raise ParameterError(f'{path}: {name} is {value!r}; a number above 0 and up to {most:g} '
-                             'is needed')
+        raise ParameterError(
+            f'{path}: {name} is {value!r}; a number above 0 and up to {most:g} is needed'
+        )
     return float(value)
 
 
@@ -243,8 +311,9 @@ def _grid(columns: int, rows: int, size: float) -> Array:
 
 def _tiles(columns: int, rows: int, pitch: float, side: float) -> Array:
     """Return the corners (4 * columns * rows, 3), m, of separate squares, square by square."""
-    return (_grid(columns, rows, pitch)[:, None] + side * np.pad(_CORNERS, ((0, 0), (0, 1)))
-            ).reshape(-1, 3)
+    return (
+        _grid(columns, rows, pitch)[:, None] + side * np.pad(_CORNERS, ((0, 0), (0, 1)))
+    ).reshape(-1, 3)
 
 
 def _checks(columns: int, rows: int) -> Array:
@@ -255,6 +324,8 @@ def _checks(columns: int, rows: int) -> Array:
 
 def check_of_board(pattern: Pattern) -> str:
     """Return what to check where a board is never found."""
-    counted = {'chessboard': ' (inner corners: one less than squares)',
-               'charuco': ' (squares, columns first) and its dictionary'}
+    counted = {
+        'chessboard': ' (inner corners: one less than squares)',
+        'charuco': ' (squares, columns first) and its dictionary',
+    }
     return f'check kind and size of the board{counted.get(pattern.kind, "")}'

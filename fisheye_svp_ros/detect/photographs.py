@@ -34,7 +34,8 @@ _MOST_SCANS = 32  # of a JPEG, each of which may take as long as the whole image
 _PNG = b'\x89PNG\r\n\x1a\n'
 # Tag 0x0112 of type 3 among the twelve-byte entries of an Exif block, in either byte order
 _ORIENTATION = re.compile(
-    rb'Exif\0\0(?:(II)|MM).{8}(?:.{12})*?(?:\x12\x01\x03\0.{4}|\x01\x12\0\x03.{4})(..)', re.DOTALL)
+    rb'Exif\0\0(?:(II)|MM).{8}(?:.{12})*?(?:\x12\x01\x03\0.{4}|\x01\x12\0\x03.{4})(..)', re.DOTALL
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,12 +80,16 @@ def find_photographs(paths: Sequence[str], every: int = 1) -> Iterator[Photograp
             if number % every == 0:
                 name = photograph.camera, photograph.key
                 own.add(name)
-                yield photograph if name not in earlier else replace(
-                    photograph, key=f'{place}/{photograph.key}')
+                yield (
+                    photograph
+                    if name not in earlier
+                    else replace(photograph, key=f'{place}/{photograph.key}')
+                )
         earlier |= own
         if number < 0:
-            raise ObservationError(f'{path}: it and its folders hold no photograph; images are '
-                                   f'{" ".join(IMAGES)}')
+            raise ObservationError(
+                f'{path}: it and its folders hold no photograph; images are {" ".join(IMAGES)}'
+            )
 
 
 def count_photographs(paths: Sequence[str], every: int = 1) -> int | None:
@@ -107,8 +112,10 @@ def doubtful_folders(paths: Sequence[str]) -> Iterator[str]:
     names = {folder: {p.stem for p in _images(folder)} for folder in given if folder.is_dir()}
     for before, after in itertools.pairwise(names):
         if names[before] & names[after]:
-            yield (f'{before}, {after}: photographs of equal names are different frames of one '
-                   'camera; for the cameras of a rig give the folder above')
+            yield (
+                f'{before}, {after}: photographs of equal names are different frames of one '
+                'camera; for the cameras of a rig give the folder above'
+            )
     for folder in given:
         if not folder.is_dir() or is_recording(folder):
             continue
@@ -116,13 +123,17 @@ def doubtful_folders(paths: Sequence[str]) -> Iterator[str]:
         for above in photograph_folders(folder):
             for sub in (p for p in sorted(above.iterdir()) if p.is_dir() and p not in given):
                 if count := sum(len(_images(one)) for one in (sub, *_folders(sub))):
-                    yield (f'{sub}: its {count} images are skipped, since the folder above holds '
-                           'images too; give it alone, or move the others into a subfolder')
+                    yield (
+                        f'{sub}: its {count} images are skipped, since the folder above holds '
+                        'images too; give it alone, or move the others into a subfolder'
+                    )
         named = {p.name: match[1].lower() for p in files if (match := _PREFIX.fullmatch(p.stem))}
         other = next((p.name for p in files if p.name not in named), '')
         if other and len({*named.values()}) > 1:
-            yield (f'{folder}: all images count as those of one camera, since {other} names none, '
-                   f'unlike {next(iter(named))}; rename or remove it')
+            yield (
+                f'{folder}: all images count as those of one camera, since {other} names none, '
+                f'unlike {next(iter(named))}; rename or remove it'
+            )
 
 
 def is_photographs(path: Path) -> bool:
@@ -157,7 +168,8 @@ def decode_image(data: bytes, name: str, color: bool = False) -> Pixels:
     except cv2.error as cause:
         most = int(os.environ.get('OPENCV_IO_MAX_IMAGE_PIXELS', 1 << 30)) / 1e6
         raise ObservationError(
-            f'{name}: larger than {most:.0f} megapixels, or broken; make it smaller') from cause
+            f'{name}: larger than {most:.0f} megapixels, or broken; make it smaller'
+        ) from cause
     if pixels is None:
         raise ObservationError(f'{name}: the image cannot be read; check the file')
     if pixels.dtype not in (np.uint8, np.uint16):
@@ -188,8 +200,8 @@ def _whole_chunks(data: bytes) -> bool:
     """Whether the chunks of a PNG are within it; OpenCV makes room for what they announce."""
     place, kind = len(_PNG), b''
     while place + 12 <= len(data) and kind != b'IEND':
-        kind = data[place + 4:place + 8]
-        place += 12 + int.from_bytes(data[place:place + 4], 'big')
+        kind = data[place + 4 : place + 8]
+        place += 12 + int.from_bytes(data[place : place + 4], 'big')
     return kind == b'IEND' and place <= len(data)
 
 
@@ -239,8 +251,11 @@ def _folder(path: Path) -> Iterator[Photograph]:
         yield from (_file(p, camera) for p in _images(folder))
     named = [_PREFIX.fullmatch(p.stem) for p in files]
     if len({match and match[1] for match in named}) > 1 and all(named):
-        yield from (Photograph(str(p), match[2], match[1].lower(), np.nan, p)
-                    for p, match in zip(files, named, strict=True) if match)
+        yield from (
+            Photograph(str(p), match[2], match[1].lower(), np.nan, p)
+            for p, match in zip(files, named, strict=True)
+            if match
+        )
     else:
         yield from map(_file, files)
 

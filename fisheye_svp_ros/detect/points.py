@@ -59,7 +59,10 @@ class Points(NamedTuple):
 
 
 def find_points(
-    pixels: Pixels, pattern: Pattern, detector: str, near: Array | None = None,
+    pixels: Pixels,
+    pattern: Pattern,
+    detector: str,
+    near: Array | None = None,
     finder: Finder | None = None,
 ) -> Points | str:
     """Return the points of a pattern in a grey image, or why there are none.
@@ -157,8 +160,8 @@ def _complete_tags(pixels: Pixels, index: Index, uv: Array, pattern: Pattern) ->
     image_of, known = None, 0
     while len(new):
         axes, reach = _surroundings(np.append(found, new), np.vstack([where, start]), pattern)
-        narrow = np.minimum(_NARROW * reach, _NARROWEST)[len(found):]
-        corners = fit_corners(pixels, start, axes[len(found):], narrow)
+        narrow = np.minimum(_NARROW * reach, _NARROWEST)[len(found) :]
+        corners = fit_corners(pixels, start, axes[len(found) :], narrow)
         tint = np.sign(corners.contrast) * pattern.tint[new]
         agreed = agreed or np.sign(tint[corners.ok].sum())
         ok = corners.ok & (tint == agreed)
@@ -211,8 +214,14 @@ def _fit_corners(
     soft = np.flatnonzero((~corners.ok | (corners.blur > _SOFT_BLUR)) & (reach > _MAX_CLEARANCE))
     if not len(soft):
         return corners, reach
-    again = fit_corners(halve_image(pixels), (start[soft] + 0.5) / 2 - 0.5, axes[soft] / 2,
-                        reach[soft] / 2, square, censored)
+    again = fit_corners(
+        halve_image(pixels),
+        (start[soft] + 0.5) / 2 - 0.5,
+        axes[soft] / 2,
+        reach[soft] / 2,
+        square,
+        censored,
+    )
     found = soft[again.ok]
     size = {'uv': 2 * again.uv + 0.5, 'sigma': 2 * again.sigma, 'blur': 2 * again.blur}
     for name, whole, part in zip(Corners._fields, corners, again, strict=True):
@@ -242,10 +251,18 @@ def _least_square(uv: Array, pattern: Pattern) -> Array:
     height = _height(sides)
     for _ in range(2):
         first, last = height[:1], height[-1:]
-        height = np.concatenate([first * np.minimum(first / height[1:2], 1), height,
-                                 last * np.minimum(last / height[-2:-1], 1)]).T
-    return np.asarray(np.minimum.reduce(
-        [height[:-1, :-1], height[1:, :-1], height[:-1, 1:], height[1:, 1:]]).ravel())
+        height = np.concatenate(
+            [
+                first * np.minimum(first / height[1:2], 1),
+                height,
+                last * np.minimum(last / height[-2:-1], 1),
+            ]
+        ).T
+    return np.asarray(
+        np.minimum.reduce(
+            [height[:-1, :-1], height[1:, :-1], height[:-1, 1:], height[1:, 1:]]
+        ).ravel()
+    )
 
 
 def _search_near(grey: Grey, pattern: Pattern, finder: Finder, near: Array) -> Found | None:
@@ -258,8 +275,9 @@ def _search_near(grey: Grey, pattern: Pattern, finder: Finder, near: Array) -> F
         return None
     glance = _GLANCE / max(right - left, bottom - top)
     scale = min(glance, 1.0) if pattern.kind == 'chessboard' else 1.0
-    crop = cv2.resize(grey[top:bottom, left:right], None, fx=scale, fy=scale,
-                      interpolation=cv2.INTER_AREA)
+    crop = cv2.resize(
+        grey[top:bottom, left:right], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
+    )
     found = finder(crop, pattern)
     return None if found is None else (found[0], (found[1] + 0.5) / scale - 0.5 + (left, top))
 

@@ -86,27 +86,34 @@ def windows(pixels: Pixels, start: Array, reach: float) -> Windows:
     half = int(np.ceil(reach)) + 1
     height, width = pixels.shape
     place = np.round(start).astype(np.int64)
-    v, u = np.mgrid[-half:half + 1, -half:half + 1].reshape(2, -1)
+    v, u = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
     round_ = np.flatnonzero(np.hypot(u, v) <= half + 0.5)  # no corners of the square
     u, v = u[round_], v[round_]
     columns, rows = place[:, :1] + u, place[:, 1:] + v
-    inside = ((columns >= _RIM) & (columns < width - _RIM)
-              & (rows >= _RIM) & (rows < height - _RIM))
+    inside = (columns >= _RIM) & (columns < width - _RIM) & (rows >= _RIM) & (rows < height - _RIM)
     rows, columns = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
     top, bottom = _smoothing_support(rows)
     left, right = _smoothing_support(columns)
     around, at = pixels[top:bottom, left:right], (rows - top, columns - left)
     smooth = cv2.GaussianBlur(around.astype(np.float32), (0, 0), SMOOTHING)
-    return Windows(smooth[at].astype(float), np.stack([u, v]).astype(float), place, inside,
-                   inside & _clipped_mask(around)[at], 2 * half + 1, round_,
-                   _ROUNDING if pixels.dtype.kind == 'u' else 0.0)
+    return Windows(
+        smooth[at].astype(float),
+        np.stack([u, v]).astype(float),
+        place,
+        inside,
+        inside & _clipped_mask(around)[at],
+        2 * half + 1,
+        round_,
+        _ROUNDING if pixels.dtype.kind == 'u' else 0.0,
+    )
 
 
 def halve_image(pixels: Pixels) -> Pixels:
     """Return an image (H, W) at half its size."""
     height, width = (side // 2 * 2 for side in pixels.shape)
-    half = cv2.resize(pixels[:height, :width], (width // 2, height // 2),
-                      interpolation=cv2.INTER_AREA)
+    half = cv2.resize(
+        pixels[:height, :width], (width // 2, height // 2), interpolation=cv2.INTER_AREA
+    )
     return np.asarray(half)
 
 
@@ -173,7 +180,9 @@ class WindowProblem(ABC):
         gradient = -(transposed @ residual[..., None])[..., 0]
         cost = (weight * residual**2).sum(axis=1)
         return np.where(self.outside_domain(state[0]) | ~np.isfinite(cost), np.inf, cost), (
-            hessian, gradient)
+            hessian,
+            gradient,
+        )
 
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         return (state[0] + step[0],)
@@ -216,7 +225,8 @@ class WindowProblem(ABC):
         moved = np.zeros((len(values), 2, cut.side**2))
         moved[..., cut.round] = gain[:, :2]
         moved = gaussian_filter(
-            moved.reshape(-1, 2, cut.side, cut.side), (0, 0, SMOOTHING, SMOOTHING))
+            moved.reshape(-1, 2, cut.side, cut.side), (0, 0, SMOOTHING, SMOOTHING)
+        )
         gain2 = (moved**2).sum(axis=(1, 2, 3)) / 2
         sigma = np.sqrt(noise2 * gain2)
         # What the fit would still move the point by; a blur may take longer to settle.

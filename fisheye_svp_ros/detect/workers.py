@@ -17,8 +17,10 @@ _START = 60.0  # s a process may take to start
 # bytes; arrays come and go, and memory that glibc gave back would be cleared again, page by page
 _MALLOC_LIMITS = {'MALLOC_MMAP_THRESHOLD_': str(2**25), 'MALLOC_TRIM_THRESHOLD_': str(2**27)}
 # No process of multiprocessing, which would run a caller's script anew from its first line.
-_PROGRAM = ('import sys; sys.path[:] = sys.argv[2:]; '
-            'from fisheye_svp_ros.detect.workers import serve; serve(int(sys.argv[1]))')
+_PROGRAM = (
+    'import sys; sys.path[:] = sys.argv[2:]; '
+    'from fisheye_svp_ros.detect.workers import serve; serve(int(sys.argv[1]))'
+)
 
 
 class TimedOut(NamedTuple):
@@ -37,8 +39,10 @@ class _Worker:
             with theirs:
                 self.process = subprocess.Popen(
                     [sys.executable, '-c', _PROGRAM, str(theirs.fileno()), *sys.path],
-                    env=_MALLOC_LIMITS | os.environ, pass_fds=[theirs.fileno()],
-                    stdin=subprocess.DEVNULL)
+                    env=_MALLOC_LIMITS | os.environ,
+                    pass_fds=[theirs.fileno()],
+                    stdin=subprocess.DEVNULL,
+                )
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         self.pipe.send(function)

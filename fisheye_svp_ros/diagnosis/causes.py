@@ -25,8 +25,13 @@ from fisheye_svp_ros.solve.rig_state import rms_px
 # An effect is confounded with another unless, with it in the model, the other is still needed.
 CONFOUNDED_P = 0.002
 _CONFOUNDED_SHARE = 0.3  # of the statistic, that the other explains by itself
-_PORT_UNITS = {MEDIUM_INDEX: '', 'port_distance': 'm', 'port_tilt_x': 'rad', 'port_tilt_y': 'rad',
-               THICKNESS: 'm'}
+_PORT_UNITS = {
+    MEDIUM_INDEX: '',
+    'port_distance': 'm',
+    'port_tilt_x': 'rad',
+    'port_tilt_y': 'rad',
+    THICKNESS: 'm',
+}
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,10 @@ class UnconfirmedCause:
 
 
 def selected_causes(
-    tests: EffectTests, found: Sequence[PlacedEffect], errors: Array, shares: dict[str, float],
+    tests: EffectTests,
+    found: Sequence[PlacedEffect],
+    errors: Array,
+    shares: dict[str, float],
     held_out: Sequence[tuple[float, float]],
 ) -> list[Cause]:
     """Return the causes that move predictions; held_out: rms and gain once each is in."""
@@ -91,12 +99,19 @@ def selected_causes(
         name = effect.name
         parameters = parameters_of(effect, values, errors[columns])
         alike = confounded_effects(tests, name, columns)
-        causes.append(Cause(
-            effect.key, parameters,
-            tests.test_removal(tests.null.included_columns, columns, effect).p_value,
-            shares[name], _survives(tests, effect, columns), rms, gain, alike,
-            '; '.join([effect.to_separate, *_look_alike_texts(tests, alike, columns)]),
-        ))
+        causes.append(
+            Cause(
+                effect.key,
+                parameters,
+                tests.test_removal(tests.null.included_columns, columns, effect).p_value,
+                shares[name],
+                _survives(tests, effect, columns),
+                rms,
+                gain,
+                alike,
+                '; '.join([effect.to_separate, *_look_alike_texts(tests, alike, columns)]),
+            )
+        )
     return causes
 
 
@@ -112,11 +127,24 @@ def medium_cause(medium: Medium, stderr: dict[str, float], rms: float, gain: flo
         stderr = {**stderr, MEDIUM_INDEX: told}
     parameters = {
         name.removeprefix('port_'): {
-            'value': float(values[name]), 'stderr': stderr.get(name, 0.0), 'unit': unit}
-        for name, unit in _PORT_UNITS.items() if name in (MEDIUM_INDEX, *medium.names)}
+            'value': float(values[name]),
+            'stderr': stderr.get(name, 0.0),
+            'unit': unit,
+        }
+        for name, unit in _PORT_UNITS.items()
+        if name in (MEDIUM_INDEX, *medium.names)
+    }
     return Cause(
-        f'{FlatPortEffect.name}(medium)', parameters, medium.p_value, medium.share, True, rms,
-        gain, [RadialProfileEffect.name] if medium.alike else [], FlatPortEffect.to_separate)
+        f'{FlatPortEffect.name}(medium)',
+        parameters,
+        medium.p_value,
+        medium.share,
+        True,
+        rms,
+        gain,
+        [RadialProfileEffect.name] if medium.alike else [],
+        FlatPortEffect.to_separate,
+    )
 
 
 def _look_alike_texts(tests: EffectTests, alike: Sequence[str], columns: Index) -> list[str]:
@@ -124,7 +152,8 @@ def _look_alike_texts(tests: EffectTests, alike: Sequence[str], columns: Index) 
     return [
         f'{effect.to_separate}; if it is a {effect.name}, a ray error of '
         f'{1e3 * _error_of_imitation(tests, at, columns):.2g} mrad remains'
-        for effect, at in tests.null.look_alikes if effect.name in alike
+        for effect, at in tests.null.look_alikes
+        if effect.name in alike
     ]
 
 
@@ -138,7 +167,8 @@ def _error_of_imitation(tests: EffectTests, true: Index, columns: Index) -> floa
     values = tests.score_beside(rest, true).estimate * null.scale[true]
     border = null.fixed.border
     both = np.append(
-        border[..., null.included_columns], border[..., true] @ values[:, None], axis=-1)
+        border[..., null.included_columns], border[..., true] @ values[:, None], axis=-1
+    )
     both = flat_rows(project_out(both, linear.frame_columns))
     fitted, moved = both[:, :-1], both[:, -1]
     remaining = moved - fitted @ (pseudo_inverse(fitted.T @ fitted) @ (fitted.T @ moved))
@@ -172,11 +202,14 @@ def confounded_effects(tests: EffectTests, name: str, columns: Index) -> list[st
     null = tests.null
     rest = np.setdiff1d(null.included_columns, columns)
     strength = tests.score_beside(rest, columns).statistic
-    others = [(one.effect, null.form_columns(one.form), one.score.statistic)
-              for one in tests.candidates(rest)]
+    others = [
+        (one.effect, null.form_columns(one.form), one.score.statistic)
+        for one in tests.candidates(rest)
+    ]
     if CATALOGUE[name].budget_stage() == 'lens':
-        others += [(effect, at, tests.score_beside(rest, at).statistic)
-                   for effect, at in null.look_alikes]
+        others += [
+            (effect, at, tests.score_beside(rest, at).statistic) for effect, at in null.look_alikes
+        ]
     same: list[str] = []
     for effect, at, statistic in others:
         if null.effect_kinds & set(effect.kinds) or effect.name in (name, *same):
@@ -194,8 +227,9 @@ def _plain_cause(
 ) -> Cause:
     """Return a cause that moves no prediction: it lies in the table or in the noise."""
     parameters = {part: {'value': value, 'stderr': stderr, 'unit': unit}}
-    return Cause(name, parameters, p_value, 0.0, True, float('nan'), 0.0, [],
-                 CATALOGUE[name].to_separate)
+    return Cause(
+        name, parameters, p_value, 0.0, True, float('nan'), 0.0, [], CATALOGUE[name].to_separate
+    )
 
 
 def table_causes(observations: Observations, outliers: Outliers, step: float) -> list[Cause]:
@@ -216,8 +250,11 @@ def growth_cause(growth: NoiseGrowth | None) -> list[Cause]:
     """Return noise that grows with the angle as a cause, if it does."""
     if growth is None:
         return []
-    return [_plain_cause('noise_vs_angle', 'growth', growth.value, growth.stderr, '1/rad^2',
-                         growth.p_value)]
+    return [
+        _plain_cause(
+            'noise_vs_angle', 'growth', growth.value, growth.stderr, '1/rad^2', growth.p_value
+        )
+    ]
 
 
 def outlier_rows(
@@ -229,10 +266,14 @@ def outlier_rows(
         row = outliers.rows[i]
         frame = int(observations.frame[row])
         camera = observations.cameras[observations.camera[row]]
-        found.append({
-            'frame': frame, **photograph_entry(observations, frame, camera),
-            'landmark': int(observations.landmark[row]),
-            'px': float(outliers.px[i]), 'why': where + outliers.why[i],
-            **({'camera': camera} if len(observations.cameras) > 1 else {}),
-        })
+        found.append(
+            {
+                'frame': frame,
+                **photograph_entry(observations, frame, camera),
+                'landmark': int(observations.landmark[row]),
+                'px': float(outliers.px[i]),
+                'why': where + outliers.why[i],
+                **({'camera': camera} if len(observations.cameras) > 1 else {}),
+            }
+        )
     return found

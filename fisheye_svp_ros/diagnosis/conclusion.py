@@ -39,8 +39,10 @@ from fisheye_svp_ros.solve.outliers import FRAME, VIEW, Outliers
 from fisheye_svp_ros.solve.ray_errors import RayError
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
 
-DIAGNOSE_AIR = ('diagnose the photographs in air first, then these with the extended lens of that '
-                'run: the lens already has errors in air')
+DIAGNOSE_AIR = (
+    'diagnose the photographs in air first, then these with the extended lens of that '
+    'run: the lens already has errors in air'
+)
 USE_EXTENDED = 'solve with the extended lens file'
 RETAKE, UNLIKE, TURNED = 'retake', 'unlike', 'turned'
 _OUTSTANDING_RATIO = 2.0  # times the typical one
@@ -79,10 +81,12 @@ def advise(
         advice.append(_vary_views(evaluation.offsets.views))
     advice += _retake_frames(evaluation)
     advice += _check_photographs(
-        selection.null.linear.data.observations, selection.revision.outliers)
+        selection.null.linear.data.observations, selection.revision.outliers
+    )
     advice += _check_held_out(evaluation)
     advice += [
-        Advice(f'{cause.effect}: {cause.to_separate}') for cause in causes
+        Advice(f'{cause.effect}: {cause.to_separate}')
+        for cause in causes
         if cause.stage in ('noise', 'frame') or cause.indistinguishable_from
     ]
     if evaluation.medium is not None:
@@ -93,18 +97,26 @@ def advise(
 
 def turn_advice(turned: Sequence[TurnedFrame]) -> list[Advice]:
     """Return what to do about photographs whose board is numbered from another end."""
-    words = ((True, 'are', 'they were reordered like the others; number them so'),
-             (False, 'may be', 'they were not reordered; check them'))
+    words = (
+        (True, 'are', 'they were reordered like the others; number them so'),
+        (False, 'may be', 'they were not reordered; check them'),
+    )
     advice = []
     for corrected, are, what in words:
         mine = [one for one in turned if one.corrected == corrected]
         if mine:
             least = min(one.odds for one in mine)
             names = [one.photograph for one in mine if not one.photograph.startswith('frame ')]
-            advice.append(Advice(
-                f'corners {are} numbered from another end of the board (odds {least:.2g} to 1 or '
-                f'more): {what}',
-                frames=[one.frame for one in mine], photographs=names, kind=TURNED))
+            advice.append(
+                Advice(
+                    f'corners {are} numbered from another end of the board (odds '
+                    f'{least:.2g} to 1 or '
+                    f'more): {what}',
+                    frames=[one.frame for one in mine],
+                    photographs=names,
+                    kind=TURNED,
+                )
+            )
     return advice
 
 
@@ -116,12 +128,25 @@ def _use_causes(evaluation: Evaluation, causes: Sequence[Cause]) -> list[Advice]
     of_target = [cause for cause in causes if cause.stage == 'target']
     gain = gains['named'].value - max(gains['lens'].value, 0.0)
     if of_target and gain > 0:
-        boards = {int(part[5:]) for cause in of_target for part in cause.members
-                  if part.startswith('board') and part[5:].isdigit()}
-        advice.append(Advice(
-            'measure the board, or flatten or replace it', boards=sorted(boards), gain=gain,
-            landmarks=[int(part) for cause in causes
-                       if cause.effect_class.target_map == 'single' for part in cause.members]))
+        boards = {
+            int(part[5:])
+            for cause in of_target
+            for part in cause.members
+            if part.startswith('board') and part[5:].isdigit()
+        }
+        advice.append(
+            Advice(
+                'measure the board, or flatten or replace it',
+                boards=sorted(boards),
+                gain=gain,
+                landmarks=[
+                    int(part)
+                    for cause in causes
+                    if cause.effect_class.target_map == 'single'
+                    for part in cause.members
+                ],
+            )
+        )
     return advice
 
 
@@ -129,10 +154,16 @@ def _support_boards(evaluation: Evaluation) -> list[Advice]:
     """Return what to do about boards that sag by their own weight."""
     boards = evaluation.null.linear.scene.boards
     sizes = np.linalg.norm(evaluation.fitted.board_sags(), ord=2, axis=(1, 2))
-    return [Advice(
-        f'support the board or hold it upright: it bends by {size:.1f} mm between lying face up '
-        'and upright', boards=[board.id])
-        for board, size in zip(boards, sizes, strict=True) if size > _MIN_SAG]
+    return [
+        Advice(
+            f'support the board or hold it upright: it bends by {size:.1f} mm between '
+            'lying face up '
+            'and upright',
+            boards=[board.id],
+        )
+        for board, size in zip(boards, sizes, strict=True)
+        if size > _MIN_SAG
+    ]
 
 
 def _check_held_out(evaluation: Evaluation) -> list[Advice]:
@@ -140,26 +171,43 @@ def _check_held_out(evaluation: Evaluation) -> list[Advice]:
     test = evaluation.held_out
     if test is None:
         alone = _frame_numbers(evaluation)[~evaluation.counted_frames]
-        return [_about_frames(
-            evaluation.null.linear.data.observations,
-            'take more photographs like these: the others do not predict them. Either only they '
-            'cover a part of the image, or they are wrong; the held-out rms excludes them',
-            alone.tolist(), UNLIKE)] if len(alone) else []
+        return (
+            [
+                _about_frames(
+                    evaluation.null.linear.data.observations,
+                    'take more photographs like these: the others do not predict them. '
+                    'Either only they '
+                    'cover a part of the image, or they are wrong; the held-out rms excludes them',
+                    alone.tolist(),
+                    UNLIKE,
+                )
+            ]
+            if len(alone)
+            else []
+        )
     table = test.data.observations
     advice = _check_photographs(table, test.outliers, 'held-out ')
     if test.another_target:
-        advice.append(Advice(
-            'hold out photographs of the same target: in these, landmarks of the same numbers '
-            'have other coordinates, so errors of the target are not predicted there'))
+        advice.append(
+            Advice(
+                'hold out photographs of the same target: in these, landmarks of the same numbers '
+                'have other coordinates, so errors of the target are not predicted there'
+            )
+        )
     if test.rig_differs:
         views = np.unique(np.stack([table.frame, table.camera]), axis=1)
         frames, count = np.unique(views[0], return_counts=True)
         shared = frames[count > 1].tolist()
-        advice.append(_about_frames(
-            table, 'check these held-out photographs: their relative camera poses differ from the '
-                   'others, so each view has its own pose. Check that the rig was not touched, '
-                   'the cameras are not exchanged, simultaneous photographs have one number, and '
-                   'points are numbered from the same end', shared))
+        advice.append(
+            _about_frames(
+                table,
+                'check these held-out photographs: their relative camera poses differ from the '
+                'others, so each view has its own pose. Check that the rig was not touched, '
+                'the cameras are not exchanged, simultaneous photographs have one number, and '
+                'points are numbered from the same end',
+                shared,
+            )
+        )
     return advice
 
 
@@ -171,9 +219,13 @@ def _calibrate_in_air(medium: Medium, causes: Sequence[Cause]) -> list[Advice]:
     if not told and (medium.moved or len(others) > 1):
         advice.append(Advice(DIAGNOSE_AIR))
     if medium.moved:
-        advice.append(Advice(
-            'the lens was adjusted within the errors of its calibration in air: take photographs '
-            'in air that fill the image, or measure the target better'))
+        advice.append(
+            Advice(
+                'the lens was adjusted within the errors of its calibration in air: take '
+                'photographs '
+                'in air that fill the image, or measure the target better'
+            )
+        )
     return advice
 
 
@@ -184,8 +236,9 @@ def _measure_landmarks(evaluation: Evaluation, gain: float) -> list[Advice]:
         return []
     typical = float(np.median(far[far > 0]))
     order = np.argsort(-far)[:_MAX_LISTED]
-    chosen = [int(evaluation.offsets.landmark[i]) for i in order
-              if far[i] > _OUTSTANDING_RATIO * typical]
+    chosen = [
+        int(evaluation.offsets.landmark[i]) for i in order if far[i] > _OUTSTANDING_RATIO * typical
+    ]
     what = 'measure the landmarks of the target, first those that are displaced most'
     return [Advice(what, landmarks=chosen, gain=gain)] if chosen else []
 
@@ -196,7 +249,8 @@ def _vary_views(views: SimilarViews) -> Advice:
     return Advice(
         'take photographs from more different poses: errors of landmarks repeat in similar '
         f'ones{soon} and do not average out. Check that the paper is flat, nothing reflects, and '
-        'nothing is printed near the corners')
+        'nothing is printed near the corners'
+    )
 
 
 def _retake_frames(evaluation: Evaluation) -> list[Advice]:
@@ -206,10 +260,18 @@ def _retake_frames(evaluation: Evaluation) -> list[Advice]:
     size = squares.sum(axis=1) / np.maximum(used.sum(axis=1), 1)
     bad = np.flatnonzero(size > _OUTSTANDING_RATIO * np.median(size))
     worst = bad[np.argsort(-size[bad])][:_MAX_LISTED]
-    return [_about_frames(
-        evaluation.null.linear.data.observations,
-        'take these photographs again: they scatter more than the others',
-        _frame_numbers(evaluation)[worst].tolist(), RETAKE)] if len(bad) else []
+    return (
+        [
+            _about_frames(
+                evaluation.null.linear.data.observations,
+                'take these photographs again: they scatter more than the others',
+                _frame_numbers(evaluation)[worst].tolist(),
+                RETAKE,
+            )
+        ]
+        if len(bad)
+        else []
+    )
 
 
 def _frame_numbers(evaluation: Evaluation) -> Index:
@@ -220,21 +282,34 @@ def _frame_numbers(evaluation: Evaluation) -> Index:
 
 def _check_photographs(table: Observations, outliers: Outliers, where: str = '') -> list[Advice]:
     """Return the frames of which whole views are outliers, by reason."""
-    off = {reason: sorted({int(table.frame[row]) for row, why in
-                           zip(outliers.rows, outliers.why, strict=True) if why == reason})
-           for reason in (VIEW, FRAME)}
-    return [_about_frames(table, f'check these {where}photographs: {reason}', frames,
-                          '' if where else RETAKE)
-            for reason, frames in off.items() if frames]
+    off = {
+        reason: sorted(
+            {
+                int(table.frame[row])
+                for row, why in zip(outliers.rows, outliers.why, strict=True)
+                if why == reason
+            }
+        )
+        for reason in (VIEW, FRAME)
+    }
+    return [
+        _about_frames(
+            table, f'check these {where}photographs: {reason}', frames, '' if where else RETAKE
+        )
+        for reason, frames in off.items()
+        if frames
+    ]
 
 
-def _about_frames(
-    table: Observations, what: str, frames: list[int], kind: str = ''
-) -> Advice:
+def _about_frames(table: Observations, what: str, frames: list[int], kind: str = '') -> Advice:
     """Return what to do about frames of a table, with the photographs that they are."""
     known = {frame for frame, _, _ in table.photographs}
-    names = [name for frame in dict.fromkeys(frames) if frame in known
-             for name in frame_names(table, frame)]
+    names = [
+        name
+        for frame in dict.fromkeys(frames)
+        if frame in known
+        for name in frame_names(table, frame)
+    ]
     return Advice(what, frames=frames, photographs=names, kind=kind)
 
 
@@ -261,8 +336,10 @@ class Conclusion:
 
     def ray_error_of(self, camera: str) -> dict[str, list[dict[str, float]]]:
         """Return the expected ray errors, mrad, of a camera's lens as given and as extended."""
-        return {side: [one.in_mrad() for one in found]
-                for side, found in self.ray_error.get(camera, {}).items()}
+        return {
+            side: [one.in_mrad() for one in found]
+            for side, found in self.ray_error.get(camera, {}).items()
+        }
 
     def with_ray_error(self, lens: Lens, camera: str) -> Lens:
         """Return the extended lens of a camera with its ray errors in its `uncertainty`."""
@@ -281,31 +358,51 @@ class Conclusion:
 
 
 def conclude(
-    evaluation: Evaluation, causes: Sequence[Cause], components: Sequence[Component],
-    advice: Sequence[Advice], candidates: list[UnconfirmedCause], contradicted: bool,
+    evaluation: Evaluation,
+    causes: Sequence[Cause],
+    components: Sequence[Component],
+    advice: Sequence[Advice],
+    candidates: list[UnconfirmedCause],
+    contradicted: bool,
 ) -> Conclusion:
     """Return what to do; contradicted: whether the cameras of a rig disagree about the target."""
     ray_errors, offset = find_lens_rays(evaluation, evaluation.selection.problem.inputs.lenses)
     file, gain = compare_lens_files(evaluation), evaluation.gains['named']
-    lens = decide_lens(LensFacts(
-        [c.effect for c in causes if c.stage == 'lens'],
-        [c.effect for c in causes if c.stage != 'noise'],
-        bool(evaluation.averaged_model.shifts),
-        (gain.value, gain.low), file, offset if evaluation.free else None,
-        find_bounds(evaluation.null), evaluation.noise_px, evaluation.falling,
-        evaluation.frames))
-    scatter = np.hypot.reduce([part.sd_px for part in components
-                               if part.stage == 'frame' and not part.named_share]
-                              + [evaluation.noise_px])
+    lens = decide_lens(
+        LensFacts(
+            [c.effect for c in causes if c.stage == 'lens'],
+            [c.effect for c in causes if c.stage != 'noise'],
+            bool(evaluation.averaged_model.shifts),
+            (gain.value, gain.low),
+            file,
+            offset if evaluation.free else None,
+            find_bounds(evaluation.null),
+            evaluation.noise_px,
+            evaluation.falling,
+            evaluation.frames,
+        )
+    )
+    scatter = np.hypot.reduce(
+        [part.sd_px for part in components if part.stage == 'frame' and not part.named_share]
+        + [evaluation.noise_px]
+    )
     target = decide_target(_target_facts(evaluation, causes, components, contradicted))
-    photographs = decide_photographs(PhotographsFacts(
-        evaluation.frames, frames_of(advice, RETAKE), frames_of(advice, UNLIKE),
-        evaluation.figures.named.heldout_rms_px, 2**0.5 * float(scatter), lens.say,
-        target.say == 'measure_again' and target.confidence is not None,
-        evaluation.selection.problem.plannable,
-        'view' if is_unpaired(evaluation.null.linear.data) else 'frame'))
-    return Conclusion({'lens': lens, 'target': target, 'photographs': photographs}, file,
-                      ray_errors, candidates)
+    photographs = decide_photographs(
+        PhotographsFacts(
+            evaluation.frames,
+            frames_of(advice, RETAKE),
+            frames_of(advice, UNLIKE),
+            evaluation.figures.named.heldout_rms_px,
+            2**0.5 * float(scatter),
+            lens.say,
+            target.say == 'measure_again' and target.confidence is not None,
+            evaluation.selection.problem.plannable,
+            'view' if is_unpaired(evaluation.null.linear.data) else 'frame',
+        )
+    )
+    return Conclusion(
+        {'lens': lens, 'target': target, 'photographs': photographs}, file, ray_errors, candidates
+    )
 
 
 def advice_on_lens(advice: Sequence[Advice], conclusion: Conclusion) -> list[Advice]:
@@ -318,13 +415,20 @@ def advice_on_lens(advice: Sequence[Advice], conclusion: Conclusion) -> list[Adv
 
 def frames_of(advice: Sequence[Advice], kind: str) -> list[str]:
     """Return the names of the frames of some advice: of their photographs, or their numbers."""
-    return list(dict.fromkeys(
-        name for one in advice if one.kind == kind
-        for name in (one.photographs or [f'frame {n}' for n in one.frames])))
+    return list(
+        dict.fromkeys(
+            name
+            for one in advice
+            if one.kind == kind
+            for name in (one.photographs or [f'frame {n}' for n in one.frames])
+        )
+    )
 
 
 def _target_facts(
-    evaluation: Evaluation, causes: Sequence[Cause], components: Sequence[Component],
+    evaluation: Evaluation,
+    causes: Sequence[Cause],
+    components: Sequence[Component],
     contradicted: bool,
 ) -> TargetFacts:
     mine = [cause for cause in causes if cause.stage == 'target']
@@ -334,18 +438,24 @@ def _target_facts(
         found, sure = gain_and_confidence(*both, evaluation.noise_px)
         gain = found.value, found.low, sure
     of_target = [part for part in components if part.stage == 'target']
-    local = [part for part in of_target
-             if not part.named_share and part.p_value < SIGNIFICANCE]
+    local = [part for part in of_target if not part.named_share and part.p_value < SIGNIFICANCE]
     far = np.linalg.norm(evaluation.offsets.offset, axis=1) if local else np.zeros(1)
 
     def size(parts: Sequence[Component]) -> float:
         return float(np.sqrt(sum(part.sd_px**2 for part in parts)))
 
     return TargetFacts(
-        [cause.effect for cause in mine], _largest_error(evaluation, mine), gain,
-        size([part for part in of_target if part.named_share]), size(local),
-        float(np.sqrt((far**2).mean())), max((p.p_value for p in local), default=0.0),
-        evaluation.noise_px, contradicted, evaluation.frames)
+        [cause.effect for cause in mine],
+        _largest_error(evaluation, mine),
+        gain,
+        size([part for part in of_target if part.named_share]),
+        size(local),
+        float(np.sqrt((far**2).mean())),
+        max((p.p_value for p in local), default=0.0),
+        evaluation.noise_px,
+        contradicted,
+        evaluation.frames,
+    )
 
 
 def _largest_error(evaluation: Evaluation, causes: Sequence[Cause]) -> str:

@@ -69,7 +69,8 @@ class HeldOut(NamedTuple):
     def rms_of(self, rows: Index) -> Array:
         """Return the rms (...), px, of the frames (..., F) that count."""
         return np.asarray(
-            np.sqrt(self.squares[rows].sum(axis=-1) / self.counts[rows].sum(axis=-1)))
+            np.sqrt(self.squares[rows].sum(axis=-1) / self.counts[rows].sum(axis=-1))
+        )
 
     def excess(self, noise: float, rows: Index) -> Array:
         """Mean squares (B,) above what noise leaves once each frame has fitted its pose, px^2.
@@ -100,8 +101,13 @@ class Comparison(NamedTuple):
 
     def to_dict(self) -> dict[str, float]:
         """Return what diagnosis.json holds of an error and its gain."""
-        return {'base': self.before, 'extended': self.after, 'gain': self.value,
-                'low': self.low, 'high': self.high}
+        return {
+            'base': self.before,
+            'extended': self.after,
+            'gain': self.value,
+            'low': self.low,
+            'high': self.high,
+        }
 
 
 def rms_reduction(before: HeldOut, after: HeldOut) -> Comparison:
@@ -111,9 +117,7 @@ def rms_reduction(before: HeldOut, after: HeldOut) -> Comparison:
     return Comparison(before.rms, after.rms, before.rms - after.rms, float(low), float(high))
 
 
-def gain_and_confidence(
-    before: HeldOut, after: HeldOut, noise: float
-) -> tuple[Comparison, float]:
+def gain_and_confidence(before: HeldOut, after: HeldOut, noise: float) -> tuple[Comparison, float]:
     """Return 1 - (held-out variance above noise after) / (before), with a bootstrap interval.
 
     And the share of the bootstrap in which it is above zero.
@@ -131,10 +135,12 @@ def compare_errors(base: Array, extended: Array) -> Comparison:
     known = np.isfinite(base) & np.isfinite(extended)
     both = np.stack([base[known], extended[known]])
     low, high = np.quantile(
-        _reduction(*both[:, _resample_frames(both.shape[1])].mean(axis=-1)), (0.025, 0.975))
+        _reduction(*both[:, _resample_frames(both.shape[1])].mean(axis=-1)), (0.025, 0.975)
+    )
     first, second = both.mean(axis=1)
-    return Comparison(float(first), float(second), float(_reduction(first, second)), float(low),
-                      float(high))
+    return Comparison(
+        float(first), float(second), float(_reduction(first, second)), float(low), float(high)
+    )
 
 
 def _reduction(before: Array, after: Array) -> Array:
@@ -216,7 +222,9 @@ def refit_shared(
 
 
 def cross_validate(
-    null: NullModel, without: Collection[str] = (), offsets: PredictedOffsets | None = None,
+    null: NullModel,
+    without: Collection[str] = (),
+    offsets: PredictedOffsets | None = None,
     held: Collection[str] = (),
 ) -> HeldOut:
     """Predict frames left out one by one by a fit to the others (linear in all parameters).
@@ -235,8 +243,9 @@ def cross_validate(
         _, _, combination = refit_shared(null, information, without, held)
         rows = null.fixed.border if offsets is None else null.leave_one_out.rows
         residual[frame] = rows[frame][:, at] @ combination
-    left = project_out((residual * ratio - repeating)[..., None],
-                       linear.frame_columns * ratio[..., None])
+    left = project_out(
+        (residual * ratio - repeating)[..., None], linear.frame_columns * ratio[..., None]
+    )
     return sum_squares(linear, left[..., 0] / ratio)
 
 
@@ -293,9 +302,14 @@ def valid_state(
 ) -> RigState:
     """Return the state without what trained frames or their target had, and the test has not."""
     t, known = test.observations.t, trained.observations.t
-    return replace(state, terms=tuple(
-        term for term in state.terms if term[0].holds_for(t, known)
-        and not (another_target and term[0].place == 'target')))
+    return replace(
+        state,
+        terms=tuple(
+            term
+            for term in state.terms
+            if term[0].holds_for(t, known) and not (another_target and term[0].place == 'target')
+        ),
+    )
 
 
 def contiguous_blocks(data: RigViews) -> tuple[Index, list[Ends]]:
@@ -308,7 +322,8 @@ def contiguous_blocks(data: RigViews) -> tuple[Index, list[Ends]]:
     of_number = np.arange(len(numbers)) * BLOCKS // len(numbers)
     parts = [numbers[of_number == i] for i in range(BLOCKS)]
     return of_number[place.reshape(-1)], [
-        (int(part[0]), int(part[-1])) for part in parts if len(part)]
+        (int(part[0]), int(part[-1])) for part in parts if len(part)
+    ]
 
 
 def split_frames(
@@ -322,9 +337,15 @@ def split_frames(
     linear, columns = fitted.linear, fitted.random.columns
     height = linear.residual.shape[1]
     row = np.arange(out.size * height).reshape(out.size, height)
-    trained, tested = (columns._replace(
-        group=columns.group[part], offset=columns.offset[part], unit=columns.unit[part],
-        shared=columns.shared[row[part].ravel()]) for part in (~out, out))
+    trained, tested = (
+        columns._replace(
+            group=columns.group[part],
+            offset=columns.offset[part],
+            unit=columns.unit[part],
+            shared=columns.shared[row[part].ravel()],
+        )
+        for part in (~out, out)
+    )
     border = border_of(linear, linear.shared_columns / fitted.scale)
     eq = make_equations(trained, linear.frame_columns[~out], border[~out])
     return factor_equations(eq.with_ridge(1e-9), variances.lam, variances.weight), tested
@@ -371,5 +392,6 @@ def _predict(null: NullModel, information: Array, included: Index) -> Array:
     part = null.restrict_information(information, included, at)
     combination = null.residual_combination(included)[at]
     combination[included] -= np.linalg.lstsq(
-        part[np.ix_(included, included)], part[included, -1], rcond=1e-13)[0]
+        part[np.ix_(included, included)], part[included, -1], rcond=1e-13
+    )[0]
     return np.asarray(combination)

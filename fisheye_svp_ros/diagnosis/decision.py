@@ -143,47 +143,79 @@ def decide_lens(facts: LensFacts) -> Decision:
     file, bounds = facts.file, facts.bounds
     gained = Figure('file_gain', file.gain, '1')
     if not facts.falling:
-        return Decision('undecided', 'the error on the fitted frames rises with the causes in the '
-                                     'model, so nothing is recommended', gained, 0.0, bounds)
+        return Decision(
+            'undecided',
+            'the error on the fitted frames rises with the causes in the '
+            'model, so nothing is recommended',
+            gained,
+            0.0,
+            bounds,
+        )
     if (off := facts.offset) is not None and off.matters(facts.noise_px):
         return Decision(
-            'recalibrate', f'the lens{off.camera and f" of {off.camera}"} as given is off by at '
-                           f'least {off.mrad:.2g} mrad ({off.px:.2g} px) at 1 m, '
-                           f'{off.ratio:.1f} times the combined standard error',
-            Figure('ray_error', off.mrad, 'mrad'), 1 - off.p_value)
+            'recalibrate',
+            f'the lens{off.camera and f" of {off.camera}"} as given is off by at '
+            f'least {off.mrad:.2g} mrad ({off.px:.2g} px) at 1 m, '
+            f'{off.ratio:.1f} times the combined standard error',
+            Figure('ray_error', off.mrad, 'mrad'),
+            1 - off.p_value,
+        )
     if facts.frames < 2 and not facts.causes:
-        return Decision('undecided', f'{_ONE_FRAME}; take {_MIN_FRAMES} frames or more', gained,
-                        None)
+        return Decision(
+            'undecided', f'{_ONE_FRAME}; take {_MIN_FRAMES} frames or more', gained, None
+        )
     if facts.wrong_intrinsics:
         return Decision(
-            'recalibrate', f'the lens as given is wrong in {", ".join(facts.wrong_intrinsics)}',
-            gained, file.sure)
+            'recalibrate',
+            f'the lens as given is wrong in {", ".join(facts.wrong_intrinsics)}',
+            gained,
+            file.sure,
+        )
     borne_out = facts.named_gain[0] > 0 if facts.causes else facts.has_likely_shift
     if borne_out and file.low > 0:
         return Decision(
-            'use_extended', 'on the same corrected target it takes the held-out error from '
-                            f'{file.given_px:.3g} to {file.extended_px:.3g} px', gained, file.sure)
-    return _doubt(facts, gained) or Decision(
-        'keep', _keep_text(bounds, off), gained, 0.95, bounds)
+            'use_extended',
+            'on the same corrected target it takes the held-out error from '
+            f'{file.given_px:.3g} to {file.extended_px:.3g} px',
+            gained,
+            file.sure,
+        )
+    return _doubt(facts, gained) or Decision('keep', _keep_text(bounds, off), gained, 0.95, bounds)
 
 
 def _doubt(facts: LensFacts, gained: Figure) -> Decision | None:
     """Return why nothing can be said of the lens; None where it can."""
     file, bounds = facts.file, facts.bounds
-    hints = sorted((one for one in bounds if one.z > _HINT and one.edge_px > facts.noise_px),
-                   key=lambda one: -one.edge_px)
+    hints = sorted(
+        (one for one in bounds if one.z > _HINT and one.edge_px > facts.noise_px),
+        key=lambda one: -one.edge_px,
+    )
     if facts.causes and file.high < 0 < facts.named_gain[1]:
-        why, sure = (f'held-out error {file.extended_px:.3g} px with the extended lens alone, '
-                     f'{file.given_px:.3g} px with the lens as given; only all causes together '
-                     'reduce it'), 1 - file.sure
+        why, sure = (
+            (
+                f'held-out error {file.extended_px:.3g} px with the extended lens alone, '
+                f'{file.given_px:.3g} px with the lens as given; only all causes together '
+                'reduce it'
+            ),
+            1 - file.sure,
+        )
     elif facts.lens_causes:
-        why, sure = (f'it is not certain that {", ".join(facts.lens_causes)} in the lens reduces '
-                     f'the held-out error ({file.given_px:.3g} → {file.extended_px:.3g} px): its '
-                     f'probability is {100 * file.sure:.0f} %'), file.sure
+        why, sure = (
+            (
+                f'it is not certain that {", ".join(facts.lens_causes)} in the lens reduces '
+                f'the held-out error ({file.given_px:.3g} → {file.extended_px:.3g} px): its '
+                f'probability is {100 * file.sure:.0f} %'
+            ),
+            file.sure,
+        )
     elif hints:
-        why, sure = (f'likely but not confirmed: {" or ".join(one.effect for one in hints)}, '
-                     f'which may cause up to {hints[0].edge_px:.2g} px at the edge'), erf(
-                         hints[0].z / 2**0.5)
+        why, sure = (
+            (
+                f'likely but not confirmed: {" or ".join(one.effect for one in hints)}, '
+                f'which may cause up to {hints[0].edge_px:.2g} px at the edge'
+            ),
+            erf(hints[0].z / 2**0.5),
+        )
     else:
         return None
     return Decision('undecided', why, gained, sure, bounds)
@@ -191,9 +223,14 @@ def _doubt(facts: LensFacts, gained: Figure) -> Decision | None:
 
 def _keep_text(bounds: Sequence[EffectBound], off: LensOffset | None) -> str:
     worst = max(bounds, key=lambda one: one.edge_px, default=None)
-    cost = '' if worst is None else (
-        f'; effects that these data do not exclude cause at most {worst.edge_px:.2g} px '
-        f'({worst.edge_mrad:.2g} mrad) at the edge')
+    cost = (
+        ''
+        if worst is None
+        else (
+            f'; effects that these data do not exclude cause at most {worst.edge_px:.2g} px '
+            f'({worst.edge_mrad:.2g} mrad) at the edge'
+        )
+    )
     fit = '' if off is None else ' and its parameters agree with these data within their errors'
     return f'no cause in the lens is confirmed{fit}{cost}'
 
@@ -224,30 +261,49 @@ class TargetFacts(NamedTuple):
 def decide_target(facts: TargetFacts) -> Decision:
     """Return what to do about the target."""
     gain, low, sure = facts.gain
-    local = (f'landmarks are displaced by {1e3 * facts.local_m:.2g} mm rms, which causes '
-             f'{facts.local_px:.2g} px' if facts.local_m else
-             f'local offsets cause {facts.local_px:.2g} px')
+    local = (
+        f'landmarks are displaced by {1e3 * facts.local_m:.2g} mm rms, which causes '
+        f'{facts.local_px:.2g} px'
+        if facts.local_m
+        else f'local offsets cause {facts.local_px:.2g} px'
+    )
     if facts.contradicted:
-        return Decision('measure_again', 'the cameras contradict each other about its shape',
-                        Figure('local_offsets', facts.local_px, 'px'), None)
+        return Decision(
+            'measure_again',
+            'the cameras contradict each other about its shape',
+            Figure('local_offsets', facts.local_px, 'px'),
+            None,
+        )
     if facts.causes:
         figure = Figure('gain', gain, '1')
         if low > 0 and facts.local_px <= facts.named_px:
-            return Decision('correct', f'{facts.size}; the correction removes {100 * gain:.0f} % '
-                                       'of the squared held-out error', figure, sure)
+            return Decision(
+                'correct',
+                f'{facts.size}; the correction removes {100 * gain:.0f} % '
+                'of the squared held-out error',
+                figure,
+                sure,
+            )
         if not facts.local_px:
-            return Decision('measure_again', f'{facts.size}; the correction does not lower the '
-                                             'held-out error significantly', figure, None)
+            return Decision(
+                'measure_again',
+                f'{facts.size}; the correction does not lower the held-out error significantly',
+                figure,
+                None,
+            )
         return Decision('measure_again', f'{facts.size}; in addition, {local}', figure, sure)
     figure = Figure('local_offsets', facts.local_px, 'px')
     if facts.frames < 2:
         return Decision('keep', f'its errors are unknown: {_ONE_FRAME}', figure, None)
     if facts.local_px > facts.noise_px:
-        return Decision('measure_again', f'{local}, more than the noise of '
-                        f'{facts.noise_px:.2g} px', figure, 1 - facts.local_p)
+        return Decision(
+            'measure_again',
+            f'{local}, more than the noise of {facts.noise_px:.2g} px',
+            figure,
+            1 - facts.local_p,
+        )
     if facts.local_px > 0:
-        return Decision('keep', f'{local}, less than the noise', figure,
-                        1 - facts.local_p)
+        return Decision('keep', f'{local}, less than the noise', figure, 1 - facts.local_p)
     return Decision('keep', 'its errors are below the noise', figure, 0.95)
 
 
@@ -276,10 +332,14 @@ def decide_photographs(facts: PhotographsFacts) -> Decision:
     times = facts.heldout_px / max(facts.scatter_px, 1e-9)
     figure = Figure('held_out_over_noise', times, '1')
     if facts.bad and len(facts.bad) >= _MAX_REJECTED_SHARE * facts.frames:
-        what = ('scatter more than the others or are outliers' if len(facts.bad) > 1 else
-                'scatters more than the others or is an outlier')
-        return Decision('retake', f'{len(facts.bad)} of {facts.frames} {what} as a whole',
-                        figure, None)
+        what = (
+            'scatter more than the others or are outliers'
+            if len(facts.bad) > 1
+            else 'scatters more than the others or is an outlier'
+        )
+        return Decision(
+            'retake', f'{len(facts.bad)} of {facts.frames} {what} as a whole', figure, None
+        )
     if facts.frames < _MIN_FRAMES:
         few = f'one {facts.unit} is' if facts.frames == 1 else f'{facts.frames} {facts.unit}s are'
         return Decision('more', f'{few} too few; take {_MIN_FRAMES} or more', figure, None)
@@ -290,10 +350,19 @@ def decide_photographs(facts: PhotographsFacts) -> Decision:
         return Decision('more', f'the lens is undecided; {how}', figure, None)
     if len(facts.unlike) >= _MAX_REJECTED_SHARE * facts.frames:
         are = 'are' if len(facts.unlike) > 1 else 'is'
-        return Decision('more', f'{len(facts.unlike)} of {facts.frames} {are} not predicted by '
-                                'the others', figure, None)
+        return Decision(
+            'more',
+            f'{len(facts.unlike)} of {facts.frames} {are} not predicted by the others',
+            figure,
+            None,
+        )
     rest = ''
     if facts.is_target_off and times > _TARGET_RATIO:
         rest = '; the target causes the rest'
-    return Decision('enough', f'{facts.frames} {facts.unit}s, held-out error {times:.1f} times '
-                              f'what noise and scatter between frames leave{rest}', figure, None)
+    return Decision(
+        'enough',
+        f'{facts.frames} {facts.unit}s, held-out error {times:.1f} times '
+        f'what noise and scatter between frames leave{rest}',
+        figure,
+        None,
+    )

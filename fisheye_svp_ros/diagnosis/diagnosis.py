@@ -232,8 +232,9 @@ class Diagnosis:
         table = data.observations
         if data.cameras < 3 or has_no_rig(data) or len(connected_cameras(table)) > 1:
             return None
-        return table.cameras, tuple(place.take(i + 1).inverse().compose(place.take(i))
-                                    for i in range(data.cameras - 1))
+        return table.cameras, tuple(
+            place.take(i + 1).inverse().compose(place.take(i)) for i in range(data.cameras - 1)
+        )
 
     def board_maps(self, names: Sequence[str] = ()) -> list[BoardMap]:
         """Return how the target differs from what it is said to be; names: by these effects."""
@@ -244,15 +245,17 @@ class Diagnosis:
     @property
     def scatter_px(self) -> float:
         """Standard deviation of noise and what repeats in similar views, of one coordinate, px."""
-        parts = [part.sd_px for part in self.components
-                 if part.name in ('noise', REPEATED_COMPONENT)]
+        parts = [
+            part.sd_px for part in self.components if part.name in ('noise', REPEATED_COMPONENT)
+        ]
         return float(np.hypot.reduce(parts))
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds (design, section 7)."""
         base, named, lens, extended = (
             {name: value for name, value in asdict(fit).items() if value is not None}
-            for fit in self.figures[:4])
+            for fit in self.figures[:4]
+        )
         external: dict[str, Any] = {}
         if self.cameras:
             external['cameras'] = [pair.to_dict() for pair in self.cameras]
@@ -268,14 +271,18 @@ class Diagnosis:
             'components': [part._asdict() for part in self.components],
             'causes': [{'effect': cause.effect, **asdict(cause)} for cause in self.causes],
             'named': named,
-            'lens': {**lens, 'ray_error_mrad': self.conclusion.ray_error_mrad(),
-                     **self.averaged_model.to_dict(),
-                     **({} if field is None else {'image_field': field.to_dict()})},
+            'lens': {
+                **lens,
+                'ray_error_mrad': self.conclusion.ray_error_mrad(),
+                **self.averaged_model.to_dict(),
+                **({} if field is None else {'image_field': field.to_dict()}),
+            },
             'extended': extended,
             **self.conclusion.to_dict(),
             'photographs': [
                 {'frame': frame, 'camera': camera, 'name': name}
-                for (frame, camera), name in photograph_names(self.problem.observations).items()],
+                for (frame, camera), name in photograph_names(self.problem.observations).items()
+            ],
             'gross': self.gross,
             'advice': [asdict(advice) for advice in self.advice],
             'remaining': {'structure': [s._asdict() for s in self.remaining]},

@@ -51,8 +51,13 @@ def effect_forms(linear: Linearization, left_out: Sequence[str] = ()) -> EffectF
     """Return the columns of the catalogue, without the effects left out."""
     effects, richest, untestable = _catalogue_effects(linear, left_out)
     # Effects that are not tested, of each camera, as others may be mistaken for them.
-    alike = [form for name, kind in CATALOGUE.unlisted.items() if effects and name not in left_out
-             for own in _forms(kind, linear) for form in own]
+    alike = [
+        form
+        for name, kind in CATALOGUE.unlisted.items()
+        if effects and name not in left_out
+        for own in _forms(kind, linear)
+        for form in own
+    ]
     ends = np.cumsum([0, *(len(effect.parameters) for effect in (*effects, *alike))])
     at = [np.arange(*ends[i : i + 2]) for i in range(len(ends) - 1)]
     blocks = [linear.effect_columns(effect) for effect in (*effects, *alike)]
@@ -66,7 +71,8 @@ def effect_forms(linear: Linearization, left_out: Sequence[str] = ()) -> EffectF
         at.append(theirs)
     form_counts = Counter(effect.name for effect in effects)
     return EffectForms(
-        tuple(effects), tuple(at), columns, where, form_counts, untestable, look_alikes)
+        tuple(effects), tuple(at), columns, where, form_counts, untestable, look_alikes
+    )
 
 
 def _catalogue_effects(
@@ -146,9 +152,12 @@ def _common_forms(
         if isinstance(effect, OfCameras):
             alike.setdefault(effect.parts[0][2].key, []).append((effect, own))
     return [
-        (combine_cameras([effect for effect, _ in forms]),
-         np.concatenate([own for _, own in forms]))
-        for forms in alike.values() if len(forms) == cameras
+        (
+            combine_cameras([effect for effect, _ in forms]),
+            np.concatenate([own for _, own in forms]),
+        )
+        for forms in alike.values()
+        if len(forms) == cameras
     ]
 
 
@@ -174,25 +183,34 @@ def smooth_fields(linear: Linearization) -> dict[str, Array]:
     tangential = np.stack([-radial[..., 1], radial[..., 0]], axis=-1)
     phase = 2 * np.pi * np.nan_to_num(linear.linear.optical)
     fields = {
-        'theta': [direction * (theta**i)[..., None] for direction in (radial, tangential)
-                  for i in range(1, _CURVE_DEGREE + 1)],
+        'theta': [
+            direction * (theta**i)[..., None]
+            for direction in (radial, tangential)
+            for i in range(1, _CURVE_DEGREE + 1)
+        ],
         'range': [
             direction * (near**i * theta**j)[..., None]
-            for direction in (radial, tangential) for i in (1, 2) for j in (1, 2, 3)
+            for direction in (radial, tangential)
+            for i in (1, 2)
+            for j in (1, 2, 3)
         ],
-        'pixel_phase': [wave(harmonic * phase) * axis for harmonic in (1, 2)
-                        for wave in (np.sin, np.cos) for axis in np.eye(2)],
+        'pixel_phase': [
+            wave(harmonic * phase) * axis
+            for harmonic in (1, 2)
+            for wave in (np.sin, np.cos)
+            for axis in np.eye(2)
+        ],
     }
     t = scene.times
     if np.isfinite(t).all() and np.ptp(t) > 0:
         when = (2 * (t - t.min()) / np.ptp(t) - 1)[:, None] * np.ones_like(x)
         fields['time'] = [
             (field * when**i)[..., None] * axis
-            for field in (np.ones_like(x), x, y) for axis in np.eye(2) for i in (1, 2, 3)
+            for field in (np.ones_like(x), x, y)
+            for axis in np.eye(2)
+            for i in (1, 2, 3)
         ]
-    return {
-        name: linear.whiten(np.stack(columns, axis=-1)) for name, columns in fields.items()
-    }
+    return {name: linear.whiten(np.stack(columns, axis=-1)) for name, columns in fields.items()}
 
 
 def intrinsic_walks(linear: Linearization) -> tuple[Array, Array]:
@@ -227,7 +245,8 @@ def bump_values(at: Array, mine: Mask, centres: Array, pitch: float) -> sparse.c
     """Return Gaussian bumps (n, K) at places (..., 2), zero out of reach and not of `mine`."""
     sd = _BUMP_WIDTH * pitch
     near = cKDTree(at[mine]).sparse_distance_matrix(
-        cKDTree(centres), _BUMP_REACH * sd, output_type='ndarray')
+        cKDTree(centres), _BUMP_REACH * sd, output_type='ndarray'
+    )
     row = np.flatnonzero(mine)[near['i']]
     values = np.exp(-((near['v'] / sd) ** 2) / 2)
     return sparse.csr_array((values, (row, near['j'])), (mine.size, len(centres)))

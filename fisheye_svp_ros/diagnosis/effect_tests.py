@@ -104,8 +104,12 @@ class EffectTests:
     def _score_forms(self, remaining: Array) -> list[Score]:
         """Test all forms of the catalogue by the information that remains."""
         forms = range(len(self.null.fixed.forms.effects))
-        return score_each(remaining, [self.null.form_columns(form) for form in forms],
-                          self.null.scale, self.null.variances.sigma**2)
+        return score_each(
+            remaining,
+            [self.null.form_columns(form) for form in forms],
+            self.null.scale,
+            self.null.variances.sigma**2,
+        )
 
     def score_beside(self, included: Index, columns: Index) -> Score:
         """Test columns beside what is included, and no other effects."""
@@ -118,7 +122,9 @@ class EffectTests:
         return self.adjust_p_value(self.score_beside(rest, columns), rest, columns, effect)
 
     def candidates(
-        self, included: Index, per_frame: bool = True,
+        self,
+        included: Index,
+        per_frame: bool = True,
         worth: Callable[[Score], bool] = lambda _: True,
     ) -> list[Candidate]:
         """Return all forms, best criterion first.
@@ -135,7 +141,8 @@ class EffectTests:
             # Some sizes have a meaning only where they are positive.
             positive = np.array([parameter.positive for parameter in effect.parameters])
             if (score.estimate[positive] < 0).any() or effect.is_implausible(
-                    score.estimate, null.linear.scene):
+                score.estimate, null.linear.scene
+            ):
                 continue
             gain, count = score.statistic, score.rank
             if effect.per_frame:  # what it is in single frames is one variance
@@ -143,12 +150,11 @@ class EffectTests:
                 score = score._replace(p_value=float(special.chdtrc(1, max(gain, 0.0))) / 2)
             criterion = float(gain - count * np.log(null.full.rows))
             candidates.append(
-                Candidate(form, effect, score, self._correct(effect, score), criterion))
+                Candidate(form, effect, score, self._correct(effect, score), criterion)
+            )
         return sorted(candidates, key=lambda candidate: -candidate.criterion)
 
-    def likeliest_forms(
-        self, included: Index, names: Sequence[str], most: int
-    ) -> list[Candidate]:
+    def likeliest_forms(self, included: Index, names: Sequence[str], most: int) -> list[Candidate]:
         """Return the best form of each named effect that has one of at most so many parameters."""
         best: dict[str, Candidate] = {}
         for candidate in self.candidates(included, per_frame=False):
@@ -164,8 +170,7 @@ class EffectTests:
                 continue
             if not candidate.effect.per_frame:  # that one holds at any size of the variances
                 columns = self.null.form_columns(candidate.form)
-                score = self.adjust_p_value(
-                    candidate.score, included, columns, candidate.effect)
+                score = self.adjust_p_value(candidate.score, included, columns, candidate.effect)
                 corrected = self._correct(candidate.effect, score)
                 candidate = replace(candidate, score=score, corrected=corrected)
             if candidate.corrected < SIGNIFICANCE:
@@ -216,12 +221,15 @@ class EffectTests:
         whole, parts = (
             null.restrict_information(information, included, at)
             for information in (
-                null.information[at[:, None], at], null.information_without_frames(at))
+                null.information[at[:, None], at],
+                null.information_without_frames(at),
+            )
         )
         inside, more = np.searchsorted(at, included), np.searchsorted(at, columns)
-        return sum_gains(_log_marginal(whole, inside, more, prior) - np.array([
-            _log_marginal(part, inside, more, prior) for part in parts
-        ]))
+        return sum_gains(
+            _log_marginal(whole, inside, more, prior)
+            - np.array([_log_marginal(part, inside, more, prior) for part in parts])
+        )
 
 
 def sum_gains(gains: Array) -> HeldOutGain:
@@ -261,7 +269,8 @@ def random_gain(null: NullModel, included: Index, columns: Index) -> float:
 
     parts: list[FactoredEquations] = [null.factorization, *null.frame_alternatives]
     return min(cost(f.log_determinant, f.information) for f in parts) - min(
-        cost(*integrate_columns(f, columns, 1 / size)) for f in parts for size in _TURN_SIZES)
+        cost(*integrate_columns(f, columns, 1 / size)) for f in parts for size in _TURN_SIZES
+    )
 
 
 def _alternative_gain(

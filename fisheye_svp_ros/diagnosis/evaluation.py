@@ -122,8 +122,7 @@ class Evaluation:
         if views is not None:
             noise *= float(np.sqrt(1 - views.share))
         held_out = selection.problem.inputs.held_out
-        test = None if held_out is None else HeldOutData.prepare(
-            held_out, selection.null.linear)
+        test = None if held_out is None else HeldOutData.prepare(held_out, selection.null.linear)
         return cls(selection, fitted, offsets, noise, test, medium)
 
     @property
@@ -184,8 +183,11 @@ class Evaluation:
         return self._errors_of(self.null, None if self.averaged_model.kinds else self.other_models)
 
     def _errors_of(self, null: NullModel, models: list[OtherModel] | None = None) -> Array:
-        return (standard_errors(null, jackknife=False) if self.selection.problem.options.quick
-                else total_errors(null, models))
+        return (
+            standard_errors(null, jackknife=False)
+            if self.selection.problem.options.quick
+            else total_errors(null, models)
+        )
 
     def predict(
         self, without: Sequence[str] = (), offsets: PredictedOffsets | None = None
@@ -204,7 +206,8 @@ class Evaluation:
         if offsets is not None and test.another_target:
             offsets = offsets.of_image
         return predict_other_data(
-            test.data, replace(state, pose=test.pose, rig=selection.state.rig), offsets)
+            test.data, replace(state, pose=test.pose, rig=selection.state.rig), offsets
+        )
 
     @cached_property
     def counted_frames(self) -> Mask:
@@ -223,14 +226,16 @@ class Evaluation:
         if self.held_out is None:
             return self.medium.cross_validate().take(self.counted_frames)
         return predict_other_data(
-            self.held_out.data, replace(self.medium.air.state, pose=self.held_out.pose))
+            self.held_out.data, replace(self.medium.air.state, pose=self.held_out.pose)
+        )
 
     @cached_property
     def _cause_predictions(self) -> list[HeldOut]:
         """Predictions with the first 0, 1, ... causes."""
-        return [self._base_prediction, *(
-            self.predict(self.names[i + 1 :]) for i in range(len(self.names))
-        )]
+        return [
+            self._base_prediction,
+            *(self.predict(self.names[i + 1 :]) for i in range(len(self.names))),
+        ]
 
     @cached_property
     def _extended_prediction(self) -> HeldOut:
@@ -269,8 +274,7 @@ class Evaluation:
         if self.medium is not None:
             return self.fixed_model  # the lens as it is in air was no free fit either
         start = self.null.linear.state
-        return self._adjust(
-            replace(start, terms=tuple(t for t in start.terms if is_shared(t[0]))))
+        return self._adjust(replace(start, terms=tuple(t for t in start.terms if is_shared(t[0]))))
 
     def _adjust(self, state: RigState) -> Linearization:
         """Return a state fitted by least squares."""
@@ -280,17 +284,22 @@ class Evaluation:
     @property
     def falling(self) -> bool:
         """Whether the rms of the fitted frames falls from base to named to extended."""
-        sizes = [one.rms_px for one in (
-            self.figures.base, self.figures.named, self.figures.extended)]
+        sizes = [
+            one.rms_px for one in (self.figures.base, self.figures.named, self.figures.extended)
+        ]
         return all(after <= MAX_RMS_RATIO * before for before, after in pairwise(sizes))
 
     @cached_property
     def figures(self) -> Figures:
         """How well each model describes the data it was fitted to and the data held out."""
         named = FitQuality(rms_px(self.cause_fit), self._cause_predictions[-1].rms)
-        return Figures(self._base_quality(), named, self._lens_quality(),
-                       self._extended_quality(),
-                       self._gain(self._given_prediction, self._extended_prediction))
+        return Figures(
+            self._base_quality(),
+            named,
+            self._lens_quality(),
+            self._extended_quality(),
+            self._gain(self._given_prediction, self._extended_prediction),
+        )
 
     def _base_quality(self) -> FitQuality:
         linear, full = self.simulation, self.null.full
@@ -299,8 +308,7 @@ class Evaluation:
         # Of the points that the causes were fitted to: figures before and after are comparable.
         views = self.cause_fit.data.views
         squares = ((views.uv - linear.linear.uv) ** 2).sum(axis=-1)[views.used]
-        return FitQuality(
-            float(np.sqrt(np.nanmean(squares))), self._given_prediction.rms, chi2)
+        return FitQuality(float(np.sqrt(np.nanmean(squares))), self._given_prediction.rms, chi2)
 
     def _lens_quality(self) -> FitQuality:
         linear = self.selection.problem.linear
@@ -311,8 +319,7 @@ class Evaluation:
     def _extended_quality(self) -> FitQuality:
         residuals = self.fitted.residuals()
         chi2 = float((residuals**2).sum()) / self._noise_square / self.null.full.rows
-        return FitQuality(
-            rms_px(self.null.linear, residuals), self._extended_prediction.rms, chi2)
+        return FitQuality(rms_px(self.null.linear, residuals), self._extended_prediction.rms, chi2)
 
     @property
     def frames(self) -> int:
@@ -340,29 +347,40 @@ class Evaluation:
         named = sum(c.share for c in components if c.named_share)
         total = sum(squares.values())
         shares = {name: named * s / total if total else 0.0 for name, s in squares.items()}
-        held_out = [(after.rms, self._gain(before, after).value)
-                    for before, after in pairwise(predictions)]
+        held_out = [
+            (after.rms, self._gain(before, after).value) for before, after in pairwise(predictions)
+        ]
         causes = selected_causes(
-            EffectTests(self.null), self.selection.causes, self.errors, shares, held_out)
+            EffectTests(self.null), self.selection.causes, self.errors, shares, held_out
+        )
         if not self.selection.problem.options.quick:
             refuting = refuting_blocks(self.null, self.fitted)
-            causes = [replace(cause, refuted_by_frames=refuting.get(cause.effect, ()))
-                      for cause in causes]
+            causes = [
+                replace(cause, refuted_by_frames=refuting.get(cause.effect, ()))
+                for cause in causes
+            ]
         if self.medium is None:
             return causes
         gain = self._gain(self._given_prediction, self._base_prediction)
         remaining = 1 - self.medium.share
         fitted = replace(self.medium, state=self.selection.state)
         errors = dict(zip(shared_names(self.null.linear), self.errors.tolist(), strict=True))
-        return [medium_cause(fitted, errors, self._base_prediction.rms, gain.value),
-                *(replace(cause, share=remaining * cause.share) for cause in causes)]
+        return [
+            medium_cause(fitted, errors, self._base_prediction.rms, gain.value),
+            *(replace(cause, share=remaining * cause.share) for cause in causes),
+        ]
 
     def components(self, noise_causes: Mapping[str, float]) -> list[Component]:
         """Return the variance budget; noise_causes: p-values of causes in the noise."""
         null, tests = self.null, EffectTests(self.null)
-        p_values = component_significance(null) | {
-            effect.name: tests.test_removal(null.included_columns, columns, effect).p_value
-            for effect, columns, _ in self.selection.causes} | dict(noise_causes)
+        p_values = (
+            component_significance(null)
+            | {
+                effect.name: tests.test_removal(null.included_columns, columns, effect).p_value
+                for effect, columns, _ in self.selection.causes
+            }
+            | dict(noise_causes)
+        )
         parts = variance_budget(null, self._squares, p_values, self.offsets.views)
         return parts if self.medium is None else self.medium.budget(parts)
 
@@ -381,12 +399,16 @@ class Evaluation:
         errors = np.sqrt(np.diag(written.widen(np.diag(alone**2))))
         after = dict(zip(shared_names(written.linear), errors, strict=True))
         given = stated_parameters(selection.problem.inputs.lenses)
-        before = dict(zip(shared_names(selection.first.linear),
-                          self._errors_of(selection.first), strict=True))
+        before = dict(
+            zip(
+                shared_names(selection.first.linear), self._errors_of(selection.first), strict=True
+            )
+        )
         was, now = selection.problem.base.parameters, written.linear.state.parameters
         return {
             name: Intrinsic(
-                *given[name], was[name], float(before[name]), now[name], float(after[name]))
+                *given[name], was[name], float(before[name]), now[name], float(after[name])
+            )
             for name in self.free
         }
 

@@ -105,7 +105,8 @@ class FittedModel:
         """Solve the mixed-model equations of a null model for what is in the model."""
         eq = null.equations.combine_columns(np.eye(len(null.scale), null.column_count))
         return cls._solve(
-            null.linear, null.active_effects, eq, null.variances, null.scale[: null.column_count])
+            null.linear, null.active_effects, eq, null.variances, null.scale[: null.column_count]
+        )
 
     @classmethod
     def of_state(cls, linear: Linearization, variances: Variances) -> FittedModel:
@@ -120,7 +121,11 @@ class FittedModel:
 
     @classmethod
     def _solve(
-        cls, linear: Linearization, random: RandomEffects, eq: Equations, variances: Variances,
+        cls,
+        linear: Linearization,
+        random: RandomEffects,
+        eq: Equations,
+        variances: Variances,
         scale: Array,
     ) -> FittedModel:
         # What the data leave open stays where it is.
@@ -143,15 +148,14 @@ class FittedModel:
         rows = predict_rows(self.random.columns, self.pose_columns, *eq.split(e, r), eq.units)
         return np.asarray(rows + self.linear.shared_columns @ (values / self.scale[:, None]))
 
-    def solve_rows(
-        self, rows: Array, pull: Array | float = 0.0
-    ) -> tuple[Array, Array, Array]:
+    def solve_rows(self, rows: Array, pull: Array | float = 0.0) -> tuple[Array, Array, Array]:
         """Return the coefficients (E, k, C), (R, C), (K, C) that rows (F, M, C) call for.
 
         pull (K, C): products of pseudo-observations with the normalized shared columns.
         """
         e, r = self.factored.equations.join(
-            *multiply_rows(self.random.columns, self.pose_columns, rows))
+            *multiply_rows(self.random.columns, self.pose_columns, rows)
+        )
         x = np.einsum('fmk,fmc->kc', self.linear.shared_columns, rows, optimize=True)
         return self.factored.solve(e, r, x / self.scale[:, None] + pull)
 
@@ -183,7 +187,8 @@ class FittedModel:
     def standardized_residuals(self) -> Array:
         """Residuals (F, M) over their standard deviations."""
         return np.asarray(
-            self.residuals() / np.sqrt((1 - self.leverages()) * self.solution.variance))
+            self.residuals() / np.sqrt((1 - self.leverages()) * self.solution.variance)
+        )
 
     def standardized_squares(self) -> Array:
         """Return squared residuals (F, M) over their expected squares: each about 1 on average."""
@@ -265,14 +270,16 @@ class FittedModel:
         mean = self._landmark_offsets(self.solution.e[..., None], self.solution.r[:, None])
         width = posterior.root.shape[1]
         root = self._landmark_offsets(
-            posterior.root[:count].reshape(*shape, width), posterior.root[count:])
+            posterior.root[:count].reshape(*shape, width), posterior.root[count:]
+        )
         root = np.concatenate([sigma * root, mean], axis=-1).reshape(mean.size, width + 1)
         square = root @ root.T
         if not eq.by_group:  # what a landmark's own block leaves open
             present = (self.random.columns.unit_label >= 0)[eq.units]
             own = 3 * eq.units[:, None] + np.arange(3)
             square[own[:, :, None], own[:, None]] += np.where(
-                present[:, :, None] & present[:, None], sigma**2 * posterior.block, 0.0)
+                present[:, :, None] & present[:, None], sigma**2 * posterior.block, 0.0
+            )
         return np.asarray(square)
 
     def _target_motions(self) -> Array:

@@ -52,8 +52,7 @@ _NEAR_RANGE = 1  # of ray_errors.RANGES: 1 m
 
 def lens_columns(linear: Linearization) -> Mask:
     """Return which of what is shared (K,) goes into a lens file: intrinsics, lasting effects."""
-    return mask_shared(
-        linear, lambda effect: effect.stage != 'target' and not effect.of_recording)
+    return mask_shared(linear, lambda effect: effect.stage != 'target' and not effect.of_recording)
 
 
 def compare_lens_files(evaluation: Evaluation) -> FileFigure:
@@ -64,8 +63,9 @@ def compare_lens_files(evaluation: Evaluation) -> FileFigure:
     """
     if evaluation.medium is not None:  # the lens as given is one in air
         gain = evaluation.gains['named']
-        return FileFigure(gain.before, gain.after, gain.value, gain.low, gain.high,
-                          float(gain.low > 0))
+        return FileFigure(
+            gain.before, gain.after, gain.value, gain.low, gain.high, float(gain.low > 0)
+        )
     kept = evaluation.counted_frames
     before, after = (one.take(kept) for one in _predict_with_files(evaluation))
     gain, sure = gain_and_confidence(before, after, evaluation.noise_px)
@@ -84,7 +84,7 @@ def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
         change, added, combination = shifts.refit(null, information)
         new = np.append(now + change - given, np.zeros(len(shifts.columns)))
         off = np.where(of_lens, new * null.scale[at[:-1]] + added, 0.0)
-        off[:len(refit_rig)] -= refit_rig @ off
+        off[: len(refit_rig)] -= refit_rig @ off
         residual[frame] = (null.leave_one_out.rows[frame][:, at] @ combination)[:, None]
         residual[frame, :, 0] += null.fixed.border[frame][:, at[:-1]] @ off
     even = ratio[..., None]
@@ -110,7 +110,7 @@ def _shared_values(evaluation: Evaluation) -> tuple[Array, Array]:
     start, free = 6 * (null.linear.data.cameras - 1), null.linear.free
     now = np.append(np.zeros(start), null.linear.state.shared_values(free))
     stated, given = stated_parameters(problem.inputs.lenses), now.copy()
-    given[start:start + len(free)] = [stated[name][0] for name in free]
+    given[start : start + len(free)] = [stated[name][0] for name in free]
     before = {effect.name: values for effect, values in problem.base.terms}
     for effect, columns, values in null.terms:
         held = before.get(effect.name)
@@ -127,12 +127,22 @@ def find_bounds(null: NullModel) -> list[EffectBound]:
         if effect.budget_stage() == 'target':
             columns.append(mine)
             prior.append(null.prior_precision(mine, effect))
-        elif effect.name in _BOUNDED_EFFECTS and not null.effect_kinds & set(effect.kinds) and (
-                effect.name not in smallest or len(mine) < len(smallest[effect.name][1])):
+        elif (
+            effect.name in _BOUNDED_EFFECTS
+            and not null.effect_kinds & set(effect.kinds)
+            and (effect.name not in smallest or len(mine) < len(smallest[effect.name][1]))
+        ):
             smallest[effect.name] = effect, mine
-    return [_effect_bound(null, effect, mine, np.concatenate([*columns, mine]),
-                          np.concatenate([*prior, null.prior_precision(mine, effect)]))
-            for effect, mine in smallest.values()]
+    return [
+        _effect_bound(
+            null,
+            effect,
+            mine,
+            np.concatenate([*columns, mine]),
+            np.concatenate([*prior, null.prior_precision(mine, effect)]),
+        )
+        for effect, mine in smallest.values()
+    ]
 
 
 def _effect_bound(
@@ -178,7 +188,8 @@ def find_lens_rays(
         return {}, None
     quick = evaluation.selection.problem.options.quick
     known = LensCovariance.from_model(
-        evaluation.null, evaluation.averaged_model, None if quick else evaluation.other_models)
+        evaluation.null, evaluation.averaged_model, None if quick else evaluation.other_models
+    )
     before = evaluation.extended_lenses(evaluation.simulation.state)
     views = known.linear.data.views
     errors, offsets, asked = {}, [], evaluation.selection.problem.options.range_m
@@ -200,7 +211,11 @@ def find_lens_rays(
 
 
 def _written_rays(
-    evaluation: Evaluation, known: LensCovariance, camera: int, name: str, uv: Array,
+    evaluation: Evaluation,
+    known: LensCovariance,
+    camera: int,
+    name: str,
+    uv: Array,
     ranges: tuple[float, ...] = RANGES,
 ) -> tuple[RayModel, Mask]:
     """Return the rays of the lens of a camera that is written, and which points (G,) have some."""
@@ -213,15 +228,15 @@ def _written_rays(
         lens = evaluation.extended_lenses(linear.state.retract(linear.free, frames, shared))[name]
         return lens if written is None else written.add_to(lens, camera)
 
-    model, there = ray_model(
-        extend_lens, known.covariance[np.ix_(of_lens, of_lens)], uv, ranges)
+    model, there = ray_model(extend_lens, known.covariance[np.ix_(of_lens, of_lens)], uv, ranges)
     field = None if written is None else written.fields.get(camera)
     if field is None:
         return model, there
     covariance, cross = known.with_field(field)
     lens = extend_lens(np.zeros(int(of_lens.sum())))
     return model.with_field(
-        lens, uv[there], field.bumps_at(uv[there]), covariance, cross[of_lens]), there
+        lens, uv[there], field.bumps_at(uv[there]), covariance, cross[of_lens]
+    ), there
 
 
 def _difference(model: RayModel, points: Array) -> Array:
@@ -251,8 +266,7 @@ def _offset(
     distance, drawn = _distances(nearer, expected, floor)
     p_value = float((1 + (drawn >= distance).sum()) / (1 + len(drawn)))
     ratio = distance / max(float(np.sqrt((drawn**2).mean())), 1.0)
-    return LensOffset(1e3 * _rms(nearer), ratio, p_value,
-                      _rms(nearer) * focal, stated is not None)
+    return LensOffset(1e3 * _rms(nearer), ratio, p_value, _rms(nearer) * focal, stated is not None)
 
 
 def _distances(off: Array, samples: Array, floor: float) -> tuple[float, Array]:
@@ -268,7 +282,7 @@ def _distances(off: Array, samples: Array, floor: float) -> tuple[float, Array]:
     covariance: Array = within[:, 1:] @ within[:, 1:].T / flat.shape[1]
     covariance[np.diag_indices_from(covariance)] += least
     root = np.asarray(np.linalg.cholesky(covariance))
-    distances = np.sqrt((solve_lower(root, within)**2).sum(axis=0))
+    distances = np.sqrt((solve_lower(root, within) ** 2).sum(axis=0))
     distances[0] = np.hypot(distances[0], rest / np.sqrt(least))
     return float(distances[0]), distances[1:]
 
@@ -282,7 +296,7 @@ def _reduce_rank(samples: Array, off: Array, least: float) -> tuple[Array, float
     basis = np.linalg.qr(samples[:, :_DIRECTIONS])[0]
     both = np.column_stack([off, samples])
     within = basis.T @ both
-    beyond = ((both - basis @ within)**2).sum(axis=0)
+    beyond = ((both - basis @ within) ** 2).sum(axis=0)
     if (beyond[1:] > _NEGLIGIBLE * least).any():
         return both, 0.0
     return within, float(np.sqrt(beyond[0]))

@@ -79,8 +79,9 @@ class ModelErrors:
         finest = [grid.pitch for grid in null.random.grids if grid.name == FINEST_FIELD]
         modes, alone = fitted.target_modes(null.variances.sigma)
         geometry = ColumnGeometry.measure(null.linear, max(finest, default=np.nan), modes, alone)
-        return cls(shared_names(null.linear), inverse / np.outer(scale, scale), null.variances,
-                   geometry)
+        return cls(
+            shared_names(null.linear), inverse / np.outer(scale, scale), null.variances, geometry
+        )
 
     def of_poses(self, linear: Linearization) -> ErrorParts:
         """Return covariances (F, 6, 6), m and rad, of the change in `Pose.retract` of each frame.
@@ -103,7 +104,7 @@ class ModelErrors:
         misfit = misfit + self._landmark_covariances(random, maps)
         rows, columns = maps.shape[-1], random.shared_columns
         for f in range(len(maps)):
-            field = (columns[f * rows:(f + 1) * rows].T @ turned[f]).T
+            field = (columns[f * rows : (f + 1) * rows].T @ turned[f]).T
             misfit[f] += (field * variance[random.shared_label]) @ field.T
         return ErrorParts(self.variances.sigma**2 * maps @ turned, parameters, misfit)
 
@@ -116,19 +117,21 @@ class ModelErrors:
         turn = _turn_columns(linear)
         weight = linear.row_weight
         columns = linear.shared_columns * mask_shared(
-            linear, lambda effect: effect.stage in ('ray', 'image', 'detector'))
+            linear, lambda effect: effect.stage in ('ray', 'image', 'detector')
+        )
         flat, around = flat_rows(columns), flat_rows(turn)
         columns = (flat - around @ np.linalg.lstsq(around, flat, rcond=None)[0]).reshape(
-            columns.shape)
+            columns.shape
+        )
         random, variance = self._random_columns(linear)
         misfit = random.group**2 @ variance[random.group_label]
         label = random.shared_label[: random.shared.shape[1]]
         fields = random.shared.power(2) @ np.where(
-            np.append(_OF_IMAGE, False)[label], variance[label], 0.0)
+            np.append(_OF_IMAGE, False)[label], variance[label], 0.0
+        )
         misfit = misfit + np.asarray(fields).reshape(misfit.shape)
         px = np.where(weight > 0, weight, np.nan) ** -2.0
-        parameters = np.einsum(
-            'fmk,kl,fml->fm', columns, self._covariance_of(linear), columns)
+        parameters = np.einsum('fmk,kl,fml->fm', columns, self._covariance_of(linear), columns)
         return ErrorParts(self.variances.sigma**2 * px, parameters * px, misfit * px)
 
     def summary(self, linear: Linearization) -> dict[str, dict[str, float]]:
@@ -136,10 +139,12 @@ class ModelErrors:
 
         position_m, rotation_rad: of a pose from one frame; image_px: of a coordinate.
         """
-        found: dict[str, dict[str, float]] = {'image_px': {
-            name: float(np.sqrt(np.nanmean(part)))
-            for name, part in self.of_points(linear)._asdict().items()
-        }}
+        found: dict[str, dict[str, float]] = {
+            'image_px': {
+                name: float(np.sqrt(np.nanmean(part)))
+                for name, part in self.of_points(linear)._asdict().items()
+            }
+        }
         if linear.data.poses is not None:
             return found
         return found | pose_summary(self.of_poses(linear))
@@ -171,8 +176,10 @@ class ModelErrors:
 def pose_summary(parts: ErrorParts) -> dict[str, dict[str, float]]:
     """Return root mean squares of position_m and rotation_rad from covariances (F, 6, 6)."""
     return {
-        what: {name: float(np.sqrt(np.trace(part[:, mine, mine], axis1=1, axis2=2).mean()))
-               for name, part in parts._asdict().items()}
+        what: {
+            name: float(np.sqrt(np.trace(part[:, mine, mine], axis1=1, axis2=2).mean()))
+            for name, part in parts._asdict().items()
+        }
         for what, mine in (('position_m', slice(0, 3)), ('rotation_rad', slice(3, 6)))
     }
 
@@ -188,8 +195,9 @@ def pose_maps(columns: Array) -> Array:
 
 def shared_names(linear: Linearization) -> tuple[str, ...]:
     """Return the names of what is shared in a linearization: rig, intrinsics, effects."""
-    terms = [name for term in linear.state.terms if is_shared(term[0])
-             for name in parameter_names(term)]
+    terms = [
+        name for term in linear.state.terms if is_shared(term[0]) for name in parameter_names(term)
+    ]
     rig = (f'rig.{i}' for i in range(6 * (linear.data.cameras - 1)))
     return (*rig, *linear.free, *terms)
 
@@ -209,10 +217,18 @@ def _shared_columns(linear: Linearization) -> Array:
 
 def mask_shared(linear: Linearization, which: Callable[[Effect], bool]) -> Mask:
     """Return which of what is shared (K,) are intrinsics, or effects of some kind."""
-    own = [np.full(len(values), which(effect)) for effect, values in linear.state.terms
-           if is_shared(effect)]
-    return np.concatenate([np.zeros(6 * (linear.data.cameras - 1), dtype=bool),
-                           np.ones(len(linear.free), dtype=bool), *own])
+    own = [
+        np.full(len(values), which(effect))
+        for effect, values in linear.state.terms
+        if is_shared(effect)
+    ]
+    return np.concatenate(
+        [
+            np.zeros(6 * (linear.data.cameras - 1), dtype=bool),
+            np.ones(len(linear.free), dtype=bool),
+            *own,
+        ]
+    )
 
 
 def _turn_columns(linear: Linearization) -> Array:
@@ -222,7 +238,10 @@ def _turn_columns(linear: Linearization) -> Array:
 
 
 def with_uncertainty(
-    errors: ModelErrors, linear: Linearization, noise: float, misfit: float,
+    errors: ModelErrors,
+    linear: Linearization,
+    noise: float,
+    misfit: float,
     lenses_of: Callable[[RigState], Mapping[str, Lens]],
 ) -> dict[str, Lens]:
     """Return the lenses of a diagnosis, each with what is known of its errors.
@@ -238,15 +257,24 @@ def with_uncertainty(
             continue  # of the rig
         step = np.zeros(len(errors.covariance))
         step[k] = _STEP_SIGMAS * stderr
-        one, other = (lenses_of(linear.state.retract(linear.free, frames, way))
-                      for way in (step, -step))
+        one, other = (
+            lenses_of(linear.state.retract(linear.free, frames, way)) for way in (step, -step)
+        )
         for name, columns in by.items():
             values = [np.array([*_numbers(lens[name]).values()]) for lens in (one, other)]
             columns[:, k] = (values[0] - values[1]) / (2 * step[k])
     return {
-        name: replace(lens, uncertainty=_entry(
-            errors, camera, noise, misfit, by[name] @ errors.covariance @ by[name].T,
-            list(_numbers(lens))))
+        name: replace(
+            lens,
+            uncertainty=_entry(
+                errors,
+                camera,
+                noise,
+                misfit,
+                by[name] @ errors.covariance @ by[name].T,
+                list(_numbers(lens)),
+            ),
+        )
         for camera, (name, lens) in enumerate(lenses.items())
     }
 
@@ -255,32 +283,51 @@ def _numbers(lens: Lens) -> dict[str, float]:
     """Return all numbers of a lens: of its curves, its corrections and those of its target."""
     target = Target.from_entries(lens.target, lens.name)
     terms = (*ForwardModel(lens).terms, *(target.terms if target else ()))
-    return {**lens.parameters, **{
-        name: float(value) for term in terms for name, value in
-        zip(parameter_names(term), term[1], strict=True)}}
+    return {
+        **lens.parameters,
+        **{
+            name: float(value)
+            for term in terms
+            for name, value in zip(parameter_names(term), term[1], strict=True)
+        },
+    }
 
 
 def _entry(
-    errors: ModelErrors, camera: int, noise: float, misfit: float, covariance: Array,
+    errors: ModelErrors,
+    camera: int,
+    noise: float,
+    misfit: float,
+    covariance: Array,
     names: list[str],
 ) -> dict[str, Any]:
     geometry, variances = errors.geometry, errors.variances
-    sizes = {name: float(size) for name, size in zip(NAMES, variances.tau, strict=True)
-             if size and STAGE_OF[name] != 'target'}
+    sizes = {
+        name: float(size)
+        for name, size in zip(NAMES, variances.tau, strict=True)
+        if size and STAGE_OF[name] != 'target'
+    }
     modes = geometry.modes.reshape(len(geometry.points), -1)
     off = np.concatenate([geometry.alone, modes], axis=1)
     known = np.diag(covariance) > 0
     return {
-        'noise_px': noise, 'misfit_px': misfit,
+        'noise_px': noise,
+        'misfit_px': misfit,
         'parameters': [name for name, there in zip(names, known, strict=True) if there],
         'covariance': covariance[np.ix_(known, known)].tolist(),
         'components': sizes,
         'extent_px': geometry.extents[camera].tolist(),
         'finest_px': float(geometry.finest) if np.isfinite(geometry.finest) else None,
-        'landmarks': [[*pair, *place, *(float(f'{value:.6g}') for value in values)]
-                      for *pair, place, values in zip(
-            geometry.landmark.tolist(), geometry.board.tolist(), geometry.points.tolist(), off,
-            strict=True)],
+        'landmarks': [
+            [*pair, *place, *(float(f'{value:.6g}') for value in values)]
+            for *pair, place, values in zip(
+                geometry.landmark.tolist(),
+                geometry.board.tolist(),
+                geometry.points.tolist(),
+                off,
+                strict=True,
+            )
+        ],
     }
 
 
@@ -302,8 +349,10 @@ class LensErrors:
         """Return what a lens carries; raise LensError for one that carries nothing, or half."""
         entry = lens.uncertainty
         if entry is None:
-            raise LensError(f'lens {lens.name!r} has no uncertainty; use the extended_lens.yaml '
-                            'that `diagnose -o` writes')
+            raise LensError(
+                f'lens {lens.name!r} has no uncertainty; use the extended_lens.yaml '
+                'that `diagnose -o` writes'
+            )
         try:
             size = np.array([float(entry['components'].get(name, 0.0)) for name in NAMES])
             lam = np.where(size > 0, 1 / np.maximum(size, 1e-30) ** 2, LAMBDA_ABSENT)
@@ -315,18 +364,33 @@ class LensErrors:
             ids, boards = (np.array([*map(int, rows[:, i])], dtype=np.int64) for i in (0, 1))
             geometry = ColumnGeometry(
                 np.array(entry['extent_px'], dtype=float).reshape(1, 2, 2),
-                np.nan if finest is None else float(finest), ids, boards, rows[:, 2:5],
-                rows[:, 8:].reshape(len(rows), 3, -1), rows[:, 5:8])
+                np.nan if finest is None else float(finest),
+                ids,
+                boards,
+                rows[:, 2:5],
+                rows[:, 8:].reshape(len(rows), 3, -1),
+                rows[:, 5:8],
+            )
             names = tuple(map(str, entry['parameters']))
             covariance = np.array(entry['covariance'], dtype=float).reshape(len(names), len(names))
-            found = cls(lens, float(entry['noise_px']), float(entry['misfit_px']),
-                        ModelErrors(names, covariance, Variances(1.0, lam, np.zeros(0)), geometry))
+            found = cls(
+                lens,
+                float(entry['noise_px']),
+                float(entry['misfit_px']),
+                ModelErrors(names, covariance, Variances(1.0, lam, np.zeros(0)), geometry),
+            )
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as cause:
             raise LensError(f'lens {lens.name!r}: uncertainty is incomplete ({cause})') from cause
         numbers = (found.noise, found.misfit, *covariance.ravel(), *size)
         wide = np.diff(geometry.extents, axis=1) > 0
-        if not (np.isfinite(numbers).all() and found.noise > 0 and len(rows) and wide.all()
-                and np.isfinite(rows).all() and (np.diag(covariance) >= 0).all()):
+        if not (
+            np.isfinite(numbers).all()
+            and found.noise > 0
+            and len(rows)
+            and wide.all()
+            and np.isfinite(rows).all()
+            and (np.diag(covariance) >= 0).all()
+        ):
             raise LensError(f'lens {lens.name!r}: uncertainty holds a number that cannot be')
         return found
 

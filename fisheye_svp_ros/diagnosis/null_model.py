@@ -88,8 +88,15 @@ class FixedColumns:
         scale = column_norms(columns)
         ends = np.cumsum([part.shape[-1] for part in parts])
         own, _, *where, walks_at = np.split(np.arange(len(scale)), ends[:-1])
-        return cls(border_of(linear, columns / scale), scale, len(own), forms,
-                   dict(zip(fields, where, strict=True)), walks_at, roughness)
+        return cls(
+            border_of(linear, columns / scale),
+            scale,
+            len(own),
+            forms,
+            dict(zip(fields, where, strict=True)),
+            walks_at,
+            roughness,
+        )
 
 
 @dataclass(frozen=True)
@@ -107,8 +114,13 @@ class NullModel:
 
     @classmethod
     def estimate(
-        cls, data: RigViews, state: RigState, free: Sequence[str], before: Variances | None = None,
-        left_out: Sequence[str] = (), finest: bool = False,
+        cls,
+        data: RigViews,
+        state: RigState,
+        free: Sequence[str],
+        before: Variances | None = None,
+        left_out: Sequence[str] = (),
+        finest: bool = False,
     ) -> NullModel:
         """Linearize a state and estimate the variances of its random effects (REML).
 
@@ -119,7 +131,10 @@ class NullModel:
 
     @classmethod
     def with_variances(
-        cls, data: RigViews, state: RigState, free: Sequence[str],
+        cls,
+        data: RigViews,
+        state: RigState,
+        free: Sequence[str],
         variances: Variances | None = None,
     ) -> NullModel:
         """Return the null model of known variances, without effects that could be added.
@@ -134,8 +149,13 @@ class NullModel:
 
     @classmethod
     def _linearize(
-        cls, data: RigViews, state: RigState, free: Sequence[str], left_out: Sequence[str],
-        finest: bool, alive: Mask | None = None,
+        cls,
+        data: RigViews,
+        state: RigState,
+        free: Sequence[str],
+        left_out: Sequence[str],
+        finest: bool,
+        alive: Mask | None = None,
     ) -> NullModel:
         """Return the model before any variance is known; alive: its components, None for all."""
         linear = Linearization(data, state, free)
@@ -151,7 +171,11 @@ class NullModel:
         return replace(self, variances=variances, full=self.full.add_products(products))
 
     def relinearize(
-        self, data: RigViews, state: RigState, free: Sequence[str], left_out: Sequence[str],
+        self,
+        data: RigViews,
+        state: RigState,
+        free: Sequence[str],
+        left_out: Sequence[str],
         finest: bool,
     ) -> NullModel:
         """Return the model around another state, the variances as they are."""
@@ -174,7 +198,8 @@ class NullModel:
         """Return the equations of all components with chosen columns as their whole border."""
         columns = self.fixed.border[..., :-1]
         return self.full.combine_columns(
-            identifiable_basis(self.linear.frame_columns, columns, chosen))
+            identifiable_basis(self.linear.frame_columns, columns, chosen)
+        )
 
     @property
     def column_count(self) -> int:
@@ -219,8 +244,12 @@ class NullModel:
     @cached_property
     def leave_one_out(self) -> LeaveOneOut:
         """Each frame, seen from all the others."""
-        return leave_groups_out(self.factorization, self.active_effects.columns,
-                                self.linear.frame_columns, self.fixed.border)
+        return leave_groups_out(
+            self.factorization,
+            self.active_effects.columns,
+            self.linear.frame_columns,
+            self.fixed.border,
+        )
 
     def information_without_frames(self, at: Index) -> Array:
         """Return the information (F, m, m) of all frames but one, of some of the border (m,)."""
@@ -315,16 +344,20 @@ class NullModel:
         eq = self.full.select(alive).free_component(kind)
         f = factor_equations(eq, self.variances.lam, self.variances.weight)
         count = len(f.information) - len(self.scale) - 1
-        fields = (integrate_columns(f, np.arange(count), own * self.full.rows / count / size)
-                  for size in _FIELD_SIZES)
+        fields = (
+            integrate_columns(f, np.arange(count), own * self.full.rows / count / size)
+            for size in _FIELD_SIZES
+        )
         return alternatives + [(logs, part[count:, count:]) for logs, part in fields]
 
     @cached_property
     def walk_alternatives(self) -> list[Alternative]:
         """The same with smooth walks of the intrinsics of several sizes."""
         fixed = self.fixed
-        return [integrate_columns(self.factorization, fixed.walks, fixed.roughness / size)
-                for size in _WALK_SIZES]
+        return [
+            integrate_columns(self.factorization, fixed.walks, fixed.roughness / size)
+            for size in _WALK_SIZES
+        ]
 
     @cached_property
     def frame_alternatives(self) -> tuple[FactoredEquations, FactoredEquations]:
@@ -338,13 +371,12 @@ class NullModel:
         anew, _ = estimate_variances(eq, replace(self.variances, lam=start), _FRAME_STEPS)
         without, estimated = (
             factor_equations(self.full.select(now.alive), now.lam, now.weight)
-            for now in (replace(self.variances, lam=lam), anew))
+            for now in (replace(self.variances, lam=lam), anew)
+        )
         return without, estimated
 
 
-def prior_products(
-    linear: Linearization, state: RigState, scale: Array, sigma: float
-) -> Array:
+def prior_products(linear: Linearization, state: RigState, scale: Array, sigma: float) -> Array:
     """Return what the priors of effects add to the products (X + 1, X + 1) of a border.
 
     A pseudo-observation each (`Effect.prior_sigma`), for values of a state; scale (X,): norms of
@@ -355,7 +387,8 @@ def prior_products(
     terms = [term for term in state.terms if is_shared(term[0])]
     values = np.concatenate([np.zeros(0), *(values for _, values in terms)])
     expected = np.concatenate(
-        [np.zeros(0), *(effect.prior_sigma(linear.scene) for effect, _ in terms)])
+        [np.zeros(0), *(effect.prior_sigma(linear.scene) for effect, _ in terms)]
+    )
     at = linear.shared_columns.shape[-1] - len(values) + np.arange(len(values))
     rows = np.zeros((len(values), len(scale) + 1))
     rows[np.arange(len(values)), at] = 1 / scale[at]
@@ -381,7 +414,8 @@ def cluster_frames(linear: Linearization) -> Index:
     away = np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-300)
     turn = pose.rotation.reshape(-1, 9) / np.sqrt(2)  # so far apart as the angle, if small
     tree = hierarchy.linkage(
-        np.concatenate([middle / away, np.log(away), turn], axis=1), 'complete')
+        np.concatenate([middle / away, np.log(away), turn], axis=1), 'complete'
+    )
     cluster = hierarchy.fcluster(tree, _SIMILAR_POSE, 'distance').astype(np.int64) - 1
     return frames if cluster.max() + 1 < _MIN_CLUSTERS else cluster
 

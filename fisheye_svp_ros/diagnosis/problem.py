@@ -105,8 +105,9 @@ class DiagnosisOptions:
                 raise ParameterError(f'effect {name!r} is unknown; known are {known}')
         for name in self.included:
             if not can_be_included(name):
-                raise ParameterError(f'effect {name} cannot be fitted without a test; leave it '
-                                     'out of --with')
+                raise ParameterError(
+                    f'effect {name} cannot be fitted without a test; leave it out of --with'
+                )
 
 
 @dataclass(frozen=True)
@@ -126,9 +127,14 @@ class Inputs:
 
     @classmethod
     def check(
-        cls, observations: Observations, lens: Lens | Mapping[str, Lens],
-        options: DiagnosisOptions, *, free_intrinsics: bool | None = None,
-        poses: dict[int, Pose] | None = None, held_out: Observations | None = None,
+        cls,
+        observations: Observations,
+        lens: Lens | Mapping[str, Lens],
+        options: DiagnosisOptions,
+        *,
+        free_intrinsics: bool | None = None,
+        poses: dict[int, Pose] | None = None,
+        held_out: Observations | None = None,
     ) -> Inputs:
         """Return checked inputs, as `diagnose` takes them; raise ObservationError otherwise."""
         observations, _ = remove_copies(observations)
@@ -238,7 +244,8 @@ def find_hand_eye(linear: Linearization, poses: dict[int, Pose]) -> HandEye:
     except GeometryError as cause:
         raise ObservationError(
             f'{data.observations.source}: the given poses fit neither the camera in the world nor '
-            f'a flange that carries it: {cause}; or leave the poses out') from cause
+            f'a flange that carries it: {cause}; or leave the poses out'
+        ) from cause
 
 
 def _misfit_ratio(problem: Problem, poses: dict[int, Pose]) -> float:
@@ -254,9 +261,15 @@ def _misfit_ratio(problem: Problem, poses: dict[int, Pose]) -> float:
         return np.inf
     free = NullModel.estimate(data, problem.base, problem.free, left_out=left_out)
     fixed = free.relinearize(held, state, problem.free, left_out, finest=False)
-    before, after = (float(eliminate(one.information, np.concatenate(
-        [one.included_columns, one.fixed.own + one.fixed.forms.generic]))[-1, -1])
-        for one in (fixed, free))
+    before, after = (
+        float(
+            eliminate(
+                one.information,
+                np.concatenate([one.included_columns, one.fixed.own + one.fixed.forms.generic]),
+            )[-1, -1]
+        )
+        for one in (fixed, free)
+    )
     unknown = free.full.group_rank
     return max(before - after, 0.0) / unknown / (after / (free.full.rows - unknown))
 

@@ -23,18 +23,33 @@ from fisheye_svp_ros.solve.rig_state import Linearization
 MILLIMETRE = 1e-3  # unit of offsets on the target
 SAG = 'frame_sag'
 STAGE_OF = {
-    'image_broad': 'lens', 'image_coarse': 'lens', 'image_fine': 'lens', 'image_finest': 'lens',
-    'landmark_in_plane': 'target', 'landmark_normal': 'target', 'landmark': 'target',
-    'board_stretch': 'target', 'board_in_plane': 'target', 'board_normal': 'target',
-    'frame_focal': 'frame', 'frame_centre': 'frame', 'frame_linear': 'frame',
-    'frame_quadratic': 'frame', 'frame_bumps': 'frame', 'frame_bend': 'frame',
+    'image_broad': 'lens',
+    'image_coarse': 'lens',
+    'image_fine': 'lens',
+    'image_finest': 'lens',
+    'landmark_in_plane': 'target',
+    'landmark_normal': 'target',
+    'landmark': 'target',
+    'board_stretch': 'target',
+    'board_in_plane': 'target',
+    'board_normal': 'target',
+    'frame_focal': 'frame',
+    'frame_centre': 'frame',
+    'frame_linear': 'frame',
+    'frame_quadratic': 'frame',
+    'frame_bumps': 'frame',
+    'frame_bend': 'frame',
     SAG: 'frame',
 }
 NAMES = tuple(STAGE_OF)
 OF_LANDMARKS = np.array([name.startswith('landmark') for name in NAMES])  # components
 _NUMEROUS = np.isin(NAMES, ('frame_bumps', 'image_finest'))  # coefficients, seldom called for
-_IMAGE_GRIDS = (('image_broad', 3, 0.5), ('image_coarse', 6, 0.5), ('image_fine', 14, 3.0),
-           ('image_finest', 26, 3.0))
+_IMAGE_GRIDS = (
+    ('image_broad', 3, 0.5),
+    ('image_coarse', 6, 0.5),
+    ('image_fine', 14, 3.0),
+    ('image_finest', 26, 3.0),
+)
 _FRAME_CELLS, _BOARD_CELLS = 4, 4
 _MIN_LANDMARKS = 12
 
@@ -64,7 +79,8 @@ class RandomEffects(NamedTuple):
         """Return the effects of some of the components (`NAMES`) only."""
         return self._replace(
             columns=self.columns.select(alive),
-            grids=tuple(grid for grid in self.grids if alive[NAMES.index(grid.name)]))
+            grids=tuple(grid for grid in self.grids if alive[NAMES.index(grid.name)]),
+        )
 
     @property
     def grid_columns(self) -> int:
@@ -195,24 +211,45 @@ def make_random_effects(
     """
     points = _Points.gather(linear, geometry)
     frame, label = _frame_columns(points, geometry is None)
-    static = list(_image_grids(points, finest) if geometry is None else
-                  _complete_grids(points, geometry.finest))
+    static = list(
+        _image_grids(points, finest)
+        if geometry is None
+        else _complete_grids(points, geometry.finest)
+    )
     grids, fields = [grid for grid, _ in static], list(_board_fields(points.landmarks))
     weight = points.weight.reshape(-1, 1)
-    parts = [sparse.csr_array(sparse.kron(bumps.multiply(weight).tocsr(), np.eye(2), 'csr'))
-             for _, bumps in static]
+    parts = [
+        sparse.csr_array(sparse.kron(bumps.multiply(weight).tocsr(), np.eye(2), 'csr'))
+        for _, bumps in static
+    ]
     names = [grid.name for grid in grids]
     if linear.data.poses is None:  # else the camera moves, and gravity beside it
         parts.append(_sag_columns(points, linear.state.pose.rotation))
         names.append(SAG)
-    of = [np.full(part.shape[1], NAMES.index(name))
-          for name, part in (*zip(names, parts, strict=True), *fields)]
+    of = [
+        np.full(part.shape[1], NAMES.index(name))
+        for name, part in (*zip(names, parts, strict=True), *fields)
+    ]
     landmarks = points.landmarks
-    kinds = np.array([[NAMES.index(name) for name in (
-        ('landmark_in_plane', 'landmark_in_plane', 'landmark_normal') if one.flat
-        else ('landmark',) * 3)] for one in landmarks.boards])
+    kinds = np.array(
+        [
+            [
+                NAMES.index(name)
+                for name in (
+                    ('landmark_in_plane', 'landmark_in_plane', 'landmark_normal')
+                    if one.flat
+                    else ('landmark',) * 3
+                )
+            ]
+            for one in landmarks.boards
+        ]
+    )
     columns = RandomColumns(
-        frame, label, points.place, points.slot, kinds[landmarks.board_of],
+        frame,
+        label,
+        points.place,
+        points.slot,
+        kinds[landmarks.board_of],
         _join_columns(points.weight.size * 2, parts),
         _join_columns(landmarks.ids.size * 3, [field for _, field in fields]),
         np.concatenate([np.zeros(0, dtype=np.int64), *of]),
@@ -243,8 +280,9 @@ def _frame_columns(points: _Points, compact: bool) -> tuple[Array, Index]:
         blocks.append(('frame_bumps', _on_both_axes(bumps)))
     blocks.append(('frame_bend', _bend_columns(points)))
     columns = np.concatenate([block for _, block in blocks], axis=-1)
-    label = np.repeat([NAMES.index(name) for name, _ in blocks],
-                      [block.shape[-1] for _, block in blocks])
+    label = np.repeat(
+        [NAMES.index(name) for name, _ in blocks], [block.shape[-1] for _, block in blocks]
+    )
     frames, count = points.used.shape
     return columns.reshape(frames, 2 * count, -1), label
 
@@ -282,9 +320,7 @@ def _sag_columns(points: _Points, rotation: Array) -> sparse.csr_array:
     return sparse.csr_array(columns.reshape(points.used.size * 2, -1))
 
 
-def _image_grids(
-    points: _Points, finest: bool
-) -> Iterator[tuple[ImageGrid, sparse.csr_array]]:
+def _image_grids(points: _Points, finest: bool) -> Iterator[tuple[ImageGrid, sparse.csr_array]]:
     """Yield bumps over the image that all frames share, camera by camera, coarse to fine.
 
     Each grid with its values (F N, K) at the points.
@@ -315,8 +351,10 @@ def _complete_grids(
             pitch = finest if name == 'image_finest' else float((high - low).max()) / most
             if np.isfinite(pitch):
                 centres = _cover_points(points, mine, pitch)
-                yield (ImageGrid(name, camera, centres, pitch),
-                       bump_values(points.uv, mine, centres, pitch))
+                yield (
+                    ImageGrid(name, camera, centres, pitch),
+                    bump_values(points.uv, mine, centres, pitch),
+                )
 
 
 def _board_fields(landmarks: _Landmarks) -> Iterator[tuple[str, sparse.csr_array]]:
@@ -346,8 +384,9 @@ def _board_fields(landmarks: _Landmarks) -> Iterator[tuple[str, sparse.csr_array
 def _remove_polynomial(values: Array, at: Array, degree: int) -> Array:
     """Take the best polynomial of places (L, 2) out of values (L, K)."""
     x, y = at.T
-    powers = np.stack([x ** (total - j) * y**j
-                       for total in range(degree + 1) for j in range(total + 1)], axis=-1)
+    powers = np.stack(
+        [x ** (total - j) * y**j for total in range(degree + 1) for j in range(total + 1)], axis=-1
+    )
     return np.asarray(values - powers @ np.linalg.lstsq(powers, values, rcond=1e-9)[0])
 
 

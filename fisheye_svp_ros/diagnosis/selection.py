@@ -106,18 +106,33 @@ class _Search:
     refits_left: int
 
     def estimate_null_model(self, problem: Problem) -> NullModel:
-        return NullModel.estimate(self.data, self.state, problem.free, self.variances,
-                             problem.options.left_out, self.finest)
+        return NullModel.estimate(
+            self.data,
+            self.state,
+            problem.free,
+            self.variances,
+            problem.options.left_out,
+            self.finest,
+        )
 
 
 def select_causes(problem: Problem, progress: Progress) -> Selection:
     """Add causes to a fitted state until none is left that is significant and predicts better."""
-    search = _Search(problem.data, _include_effects(problem), None, None, False, (),
-                     1 if problem.options.quick else _MAX_ROUNDS)
+    search = _Search(
+        problem.data,
+        _include_effects(problem),
+        None,
+        None,
+        False,
+        (),
+        1 if problem.options.quick else _MAX_ROUNDS,
+    )
     first: NullModel | None = None
     for turn in range(_MAX_ROUNDS):
-        progress(f'testing {len(CATALOGUE)} effects, round {turn + 1}',
-                 0.8 - 0.75 * _PROGRESS_DECAY**turn)
+        progress(
+            f'testing {len(CATALOGUE)} effects, round {turn + 1}',
+            0.8 - 0.75 * _PROGRESS_DECAY**turn,
+        )
         null = search.estimate_null_model(problem)
         first, before = first or null, replace(search, variances=null.variances)
         # How many causes may be taken in at once.
@@ -128,8 +143,9 @@ def select_causes(problem: Problem, progress: Progress) -> Selection:
         if search.state is before.state and search.finest == before.finest:
             break
         if search.state is not before.state:
-            search = replace(search, state=_refit(problem, search, null),
-                             refits_left=search.refits_left - 1)
+            search = replace(
+                search, state=_refit(problem, search, null), refits_left=search.refits_left - 1
+            )
         if not search.refits_left:
             break
     assert first is not None
@@ -157,10 +173,17 @@ def _change_effects(problem: Problem, search: _Search, null: NullModel, most: in
         return search
     effect, offset, step = found
     return replace(
-        search, state=with_effect(search.state, effect, offset), trace=(*search.trace, step),
+        search,
+        state=with_effect(search.state, effect, offset),
+        trace=(*search.trace, step),
         # Their random offsets must not stand in for them: drawn as those of most are.
-        variances=replace(null.variances, weight=np.where(
-            np.isin(null.random.landmark, effect.landmarks), 1.0, null.variances.weight)))
+        variances=replace(
+            null.variances,
+            weight=np.where(
+                np.isin(null.random.landmark, effect.landmarks), 1.0, null.variances.weight
+            ),
+        ),
+    )
 
 
 def _revise(problem: Problem, search: _Search, null: NullModel) -> _Search:
@@ -169,8 +192,11 @@ def _revise(problem: Problem, search: _Search, null: NullModel) -> _Search:
         return search
     fitted = FittedModel.solve_null_model(null)
     # Points of different frames err alike where they fall on the same place.
-    if (not search.finest and fitted.place_correlation() > _FIELD_TEST_SIGMAS
-            and null.calls_for_finest_field(search.data, search.state, problem.options.left_out)):
+    if (
+        not search.finest
+        and fitted.place_correlation() > _FIELD_TEST_SIGMAS
+        and null.calls_for_finest_field(search.data, search.state, problem.options.left_out)
+    ):
         return replace(search, finest=True)
     return _revise_outliers(problem, search, fitted)
 
@@ -195,8 +221,13 @@ def _revise_outliers(problem: Problem, search: _Search, fitted: FittedModel) -> 
         state = replace(state, terms=(*state.terms, term))
     elif changed:
         state = replace(state)  # the same, to be fitted to other data
-    return replace(search, data=data, state=state, revision=Revision(outliers, growth),
-                   refits_left=_REFITS_AFTER_REVISION)
+    return replace(
+        search,
+        data=data,
+        state=state,
+        revision=Revision(outliers, growth),
+        refits_left=_REFITS_AFTER_REVISION,
+    )
 
 
 def _refit(problem: Problem, search: _Search, null: NullModel) -> RigState:
@@ -207,9 +238,7 @@ def _refit(problem: Problem, search: _Search, null: NullModel) -> RigState:
     return refit(search.data, state, problem.free, search.variances)
 
 
-def _finish(
-    problem: Problem, search: _Search, null: NullModel
-) -> tuple[_Search, NullModel]:
+def _finish(problem: Problem, search: _Search, null: NullModel) -> tuple[_Search, NullModel]:
     """Fit once more with the last variances, without what they no longer call for."""
     free, options = problem.free, problem.options
     changed = search.state is not null.linear.state
@@ -222,13 +251,17 @@ def _finish(
         if not changed:
             return search, null  # all that is in the model was asked for beside these variances
         included, steps = eliminate_effects(
-            EffectTests(null), _known_effects(problem), options.quick)
+            EffectTests(null), _known_effects(problem), options.quick
+        )
         if not steps:
             return search, null
         gone = [step.name for step in steps]
         search = replace(
-            search, state=_change_state(null, included, gone, ()), variances=null.variances,
-            trace=(*search.trace, *steps))
+            search,
+            state=_change_state(null, included, gone, ()),
+            variances=null.variances,
+            trace=(*search.trace, *steps),
+        )
         null = search.estimate_null_model(problem)
 
 
@@ -261,8 +294,9 @@ def _change_state(
     estimated = _estimate_forms(null, included, forms)
 
     def take_step(fraction: float) -> RigState:
-        return reduce(lambda state, one: with_effect(state, one[0], fraction * one[1]),
-                      estimated, kept)
+        return reduce(
+            lambda state, one: with_effect(state, one[0], fraction * one[1]), estimated, kept
+        )
 
     return shorten_step(null.linear.data, null.linear.free, take_step)[0]
 
@@ -274,9 +308,15 @@ def _estimate_forms(
     columns = [null.form_columns(form) for form in forms]
     every = np.concatenate([included, *columns])
     information = null.restrict_information(null.information, included)
-    prior = np.concatenate([np.zeros(len(included)), *(
-        null.physical_precision(mine, null.fixed.forms.effects[form])
-        for form, mine in zip(forms, columns, strict=True))])
+    prior = np.concatenate(
+        [
+            np.zeros(len(included)),
+            *(
+                null.physical_precision(mine, null.fixed.forms.effects[form])
+                for form, mine in zip(forms, columns, strict=True)
+            ),
+        ]
+    )
     inverse = pseudo_inverse(information[np.ix_(every, every)] + np.diag(prior), 1e-12)
     values = (inverse @ information[every, -1]) / null.scale[every]
     estimated, at = [], len(included)
@@ -337,13 +377,17 @@ def reinstate_outliers(
     near = ~views.used & (views.landmark >= 0) & (off < _REINSTATED_SIGMAS * scale)
     weight, row, table = views.weight.copy(), views.row.copy(), data.observations
     for view, point in np.argwhere(near):
-        known = ((table.frame[outliers.rows] == views.frame[view])
-                 & (table.camera[outliers.rows] == views.camera[view])
-                 & (table.landmark[outliers.rows] == views.landmark[view, point])
-                 & (table.uv[outliers.rows] == views.uv[view, point]).all(axis=1))
+        known = (
+            (table.frame[outliers.rows] == views.frame[view])
+            & (table.camera[outliers.rows] == views.camera[view])
+            & (table.landmark[outliers.rows] == views.landmark[view, point])
+            & (table.uv[outliers.rows] == views.uv[view, point]).all(axis=1)
+        )
         for i in np.flatnonzero(known & ~again)[:1]:
             again[i], row[view, point] = True, outliers.rows[i]
             weight[view, point] = 1 / np.nan_to_num(table.sigma[outliers.rows[i]], nan=1.0)
     why = tuple(one for one, back in zip(outliers.why, again, strict=True) if not back)
-    return (replace(data, views=views._replace(weight=weight, row=row)),
-            Outliers(outliers.rows[~again], outliers.px[~again], why))
+    return (
+        replace(data, views=views._replace(weight=weight, row=row)),
+        Outliers(outliers.rows[~again], outliers.px[~again], why),
+    )

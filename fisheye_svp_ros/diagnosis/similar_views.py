@@ -93,15 +93,17 @@ class SimilarViews(NamedTuple):
     def predict(self, linear: Linearization) -> Array:
         """Return what is predicted of other views (S, N, 2), px, zero where none is like them."""
         other, known = LandmarkViews.gather(linear), self.known
-        _, label = np.unique(
-            np.concatenate([other.key, known.key]), axis=0, return_inverse=True)
+        _, label = np.unique(np.concatenate([other.key, known.key]), axis=0, return_inverse=True)
         mine, theirs = np.split(label.ravel(), [len(other.key)])
         _, here, there = np.intersect1d(mine, theirs, return_indices=True)
         predicted = np.zeros((*other.row[here].shape, 2))
         for some in _batches(len(here), predicted.shape[1] * known.row.shape[1]):
             between = _ViewDistances.measure(other.take(here[some]), known.take(there[some]))
-            predicted[some] = self.variance * between.kernel(
-                self.reach, self.lasting) @ self.weights[there[some]]
+            predicted[some] = (
+                self.variance
+                * between.kernel(self.reach, self.lasting)
+                @ self.weights[there[some]]
+            )
         return _in_px(linear, other.row[here], predicted)
 
 
@@ -166,9 +168,15 @@ class _Process:
 
         start = min(np.log(starts), key=loss)
         around = [(x - np.log(_SEARCH_RANGE), x + np.log(_SEARCH_RANGE)) for x in start]
-        return _unpack_parameters(optimize.minimize(
-            loss, start, method='L-BFGS-B', bounds=around,
-            options={'ftol': _LIKELIHOOD_TOLERANCE}).x)
+        return _unpack_parameters(
+            optimize.minimize(
+                loss,
+                start,
+                method='L-BFGS-B',
+                bounds=around,
+                options={'ftol': _LIKELIHOOD_TOLERANCE},
+            ).x
+        )
 
 
 def similar_views(linear: Linearization, whitened: Array) -> SimilarViews | None:
@@ -185,17 +193,22 @@ def similar_views(linear: Linearization, whitened: Array) -> SimilarViews | None
     sigma = 1 / np.where(data.views.used, data.views.weight, 1.0)
     residual = np.where(
         known.mask[..., None],
-        (data.by_view(whitened) * sigma[..., None]).reshape(-1, 2)[known.row], 0.0)
+        (data.by_view(whitened) * sigma[..., None]).reshape(-1, 2)[known.row],
+        0.0,
+    )
     noise = np.where(known.mask, (sigma**2).ravel()[known.row], 1.0)
     typical = float(noise[known.mask].mean())
     few = slice(min(views, _MOST_VIEWS))
     every = int(np.ceil(count * float(few.stop) ** 3 / _MOST_CUBES))
     process = _Process.from_views(
-        known.take(slice(None, None, every), few), residual[::every, few], noise[::every, few])
+        known.take(slice(None, None, every), few), residual[::every, few], noise[::every, few]
+    )
     span = float(np.ptp(known.t[known.mask]))
     lasting = [(span * part,) for part in _LASTING] if span > 0 else [()]
-    starts = [(ratio * typical, reach, *lasts)
-              for ratio, reach, lasts in product(_RATIOS, _REACHES, lasting)]
+    starts = [
+        (ratio * typical, reach, *lasts)
+        for ratio, reach, lasts in product(_RATIOS, _REACHES, lasting)
+    ]
     found = process.maximize_likelihood(starts)
     gain = process.log_likelihood(*found) - process.log_likelihood(0.0, *found[1:])
     p = float(special.chdtrc(len(starts[0]), max(2 * gain, 0.0)))
@@ -207,8 +220,9 @@ def similar_views(linear: Linearization, whitened: Array) -> SimilarViews | None
         inverse = np.linalg.inv(one.covariance(*found))
         weights[some] = inverse @ one.residual
         own[some] = one.residual - weights[some] / np.einsum('lvv->lv', inverse)[..., None]
-    return SimilarViews(known, *found, weights, _in_px(linear, known.row, own),
-                        found[0] / (typical + found[0]), p)
+    return SimilarViews(
+        known, *found, weights, _in_px(linear, known.row, own), found[0] / (typical + found[0]), p
+    )
 
 
 def _batches(landmarks: int, size: int) -> Iterator[slice]:

@@ -68,10 +68,14 @@ NO_OTHER_FRAME = 'there is no other frame to confirm it'
 
 
 def diagnose(
-    observations: Observations, lens: Lens | Mapping[str, Lens], *,
+    observations: Observations,
+    lens: Lens | Mapping[str, Lens],
+    *,
     free_intrinsics: bool | None = None,
-    poses: dict[int, Pose] | None = None, held_out: Observations | None = None,
-    options: DiagnosisOptions | None = None, progress: Progress = lambda *_: None,
+    poses: dict[int, Pose] | None = None,
+    held_out: Observations | None = None,
+    options: DiagnosisOptions | None = None,
+    progress: Progress = lambda *_: None,
 ) -> Diagnosis:
     """Find what a lens's simulation gets wrong about observations.
 
@@ -84,8 +88,13 @@ def diagnose(
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
     inputs = Inputs.check(
-        observations, lens, options or DiagnosisOptions(), free_intrinsics=free_intrinsics,
-        poses=poses, held_out=held_out)
+        observations,
+        lens,
+        options or DiagnosisOptions(),
+        free_intrinsics=free_intrinsics,
+        poses=poses,
+        held_out=held_out,
+    )
     diagnosis = _run_stages(inputs, progress)
     if diagnosis.noise_px > ROUNDING:
         return diagnosis
@@ -93,9 +102,14 @@ def diagnose(
 
 
 def diagnose_against(
-    observations: Observations, other: Observations, lens: Lens | Mapping[str, Lens], *,
-    options: DiagnosisOptions | None = None, progress: Progress = lambda *_: None,
-    free_intrinsics: bool | None = None, **settings: Any,
+    observations: Observations,
+    other: Observations,
+    lens: Lens | Mapping[str, Lens],
+    *,
+    options: DiagnosisOptions | None = None,
+    progress: Progress = lambda *_: None,
+    free_intrinsics: bool | None = None,
+    **settings: Any,
 ) -> Diagnosis:
     """Diagnose a data set, and ask another one of the same camera whether the lens's causes hold.
 
@@ -105,19 +119,29 @@ def diagnose_against(
     """
     for table in (observations, other):
         if len(np.unique(table.camera)) > 1:
-            raise ObservationError(f'{table.source}: two data sets of one camera are compared; '
-                                   'choose the rows of one camera')
+            raise ObservationError(
+                f'{table.source}: two data sets of one camera are compared; '
+                'choose the rows of one camera'
+            )
     check_distinct(observations, other)
     options = options or DiagnosisOptions()
 
     def diagnose_one(
-        table: Observations, options: DiagnosisOptions, begin: float, end: float, prefix: str = '',
+        table: Observations,
+        options: DiagnosisOptions,
+        begin: float,
+        end: float,
+        prefix: str = '',
         **settings: Any,
     ) -> Diagnosis:
         return diagnose(
-            table, lens, free_intrinsics=free_intrinsics, options=options,
+            table,
+            lens,
+            free_intrinsics=free_intrinsics,
+            options=options,
             progress=lambda stage, done: progress(prefix + stage, begin + done * (end - begin)),
-            **settings)
+            **settings,
+        )
 
     found = diagnose_one(observations, options, 0.0, 0.35, **settings)
     second = diagnose_one(other, options, 0.35, 0.7, 'the other set: ')
@@ -126,8 +150,14 @@ def diagnose_against(
     datasets = compare_datasets(models[0], models[1], observations.source, other.source)
     gone = tuple(name for name in datasets.refuted_causes if name not in options.included)
     if gone:
-        found = diagnose_one(observations, options.leave_out(*gone), 0.7, 0.85,
-                             'without what the other set refutes: ', **settings)
+        found = diagnose_one(
+            observations,
+            options.leave_out(*gone),
+            0.7,
+            0.85,
+            'without what the other set refutes: ',
+            **settings,
+        )
         datasets = replace(datasets, withdrawn=gone)
     return replace(found, record=found.record._replace(against=datasets))
 
@@ -152,15 +182,21 @@ def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
     # The problem of a robot has no poses any more.
     observations = evaluated.evaluation.selection.problem.inputs.observations
     inputs, views = replace(inputs, observations=observations), evaluated.turned
-    turned = [] if inputs.poses is not None else find_turned_frames(
-        evaluated.evaluation.null, evaluated.evaluation.fitted)
+    turned = (
+        []
+        if inputs.poses is not None
+        else find_turned_frames(evaluated.evaluation.null, evaluated.evaluation.fitted)
+    )
     if any(one.corrected for one, _ in turned):
         table = turn_frames(inputs.observations, turned)
         evaluated = _evaluate(replace(inputs, observations=table), progress)
     found = _conclude(evaluated.evaluation, evaluated.candidates, evaluated.cameras)
     frames = (*views, *(one for one, _ in turned))
-    found = replace(found, advice=[*turn_advice(frames), *found.advice],
-                    record=found.record._replace(turned=frames))
+    found = replace(
+        found,
+        advice=[*turn_advice(frames), *found.advice],
+        record=found.record._replace(turned=frames),
+    )
     if inputs.poses is None or not evaluated.of_robot:
         return found
     hand_eye = find_hand_eye(found.model, inputs.poses)
@@ -186,8 +222,9 @@ def _evaluate(inputs: Inputs, progress: Progress) -> _EvaluationResult:
     selection, cameras = agree_on_target(selection, progress)
     progress('measuring the gain on held-out data', 0.8)
     evaluation, candidates = _confirm(selection, medium)
-    return _EvaluationResult(evaluation, candidates, cameras, of_robot,
-                             tuple(one for one, _ in turned))
+    return _EvaluationResult(
+        evaluation, candidates, cameras, of_robot, tuple(one for one, _ in turned)
+    )
 
 
 def _conclude(
@@ -202,12 +239,21 @@ def _conclude(
     causes = evaluation.causes(components) + noise_causes
     significant = significant_components(components)
     lenses = with_uncertainty(
-        evaluation.model_errors, averaged.linear, evaluation.noise_px,
-        evaluation.uncertainty['image_px']['misfit'], evaluation.extended_lenses)
+        evaluation.model_errors,
+        averaged.linear,
+        evaluation.noise_px,
+        evaluation.uncertainty['image_px']['misfit'],
+        evaluation.extended_lenses,
+    )
     advice = advise(evaluation, causes, significant)
     conclusion = conclude(
-        evaluation, causes, components, advice, candidates,
-        any(pair.verdict == 'contradict' for pair in cameras))
+        evaluation,
+        causes,
+        components,
+        advice,
+        candidates,
+        any(pair.verdict == 'contradict' for pair in cameras),
+    )
     field = evaluation.written_field
     for camera, (name, lens) in enumerate(lenses.items()):
         lens = conclusion.with_ray_error(averaged.with_shift_entry(lens, name), name)
@@ -215,10 +261,19 @@ def _conclude(
     return Diagnosis(
         evaluation,
         evaluation.figures,
-        components, causes, _remaining(evaluation, noise_causes, significant),
-        advice_on_lens(advice, conclusion), lenses,
-        SearchRecord(list(selection.trace), EffectTests(selection.first).untestable,
-                     _outliers(evaluation), cameras), conclusion)
+        components,
+        causes,
+        _remaining(evaluation, noise_causes, significant),
+        advice_on_lens(advice, conclusion),
+        lenses,
+        SearchRecord(
+            list(selection.trace),
+            EffectTests(selection.first).untestable,
+            _outliers(evaluation),
+            cameras,
+        ),
+        conclusion,
+    )
 
 
 def _outliers(evaluation: Evaluation) -> list[dict[str, Any]]:
@@ -240,7 +295,8 @@ def _remaining(
     # The weights are relative where the noise itself is a cause: sigma is no longer tested.
     stated = bool(np.isfinite(observations.sigma).all()) and not noise_causes
     remaining = remaining_structure(
-        EffectTests(selection.null), evaluation.fitted, components, stated)
+        EffectTests(selection.null), evaluation.fitted, components, stated
+    )
     remaining = add_outliers(remaining, selection.revision.outliers, len(observations))
     hidden = {name for cause in noise_causes for name in cause.effect_class.hidden_structure}
     return [one for one in remaining if one.variable not in hidden]
@@ -259,22 +315,26 @@ def _weakest_cause(evaluation: Evaluation) -> _Doubt | None:
     selection, null = evaluation.selection, evaluation.null
     tests, full = EffectTests(null), cross_validate(null)
     kept = full.is_predictable
-    twins = [(effect.name, columns, confounded_effects(tests, effect.name, columns))
-             for effect, columns, _ in null.terms if not effect.per_frame]
+    twins = [
+        (effect.name, columns, confounded_effects(tests, effect.name, columns))
+        for effect, columns, _ in null.terms
+        if not effect.per_frame
+    ]
     other = None if evaluation.held_out is None else evaluation.predict()
     doubts = []
     for cause in selection.causes:
         effect, columns, values = cause
         if effect.name in selection.problem.options.included or effect.per_frame:
             continue
-        z, why = _gain_in_sigmas(
-            cross_validate(null, [effect.name]).take(kept), full.take(kept)), ''
+        z, why = (
+            _gain_in_sigmas(cross_validate(null, [effect.name]).take(kept), full.take(kept)),
+            '',
+        )
         if len(kept) < 2:
             why = NO_OTHER_FRAME
         elif z <= 1:
             why = REFUTED_BY_FRAMES if z < -1 else NO_GAIN
-        elif other is not None and _gain_in_sigmas(
-                evaluation.predict([effect.name]), other) < -1:
+        elif other is not None and _gain_in_sigmas(evaluation.predict([effect.name]), other) < -1:
             why = REFUTED_BY_FILE
         why = why or find_confounder(tests, effect, columns, twins) or _implausible(effect, values)
         if why:
@@ -290,7 +350,9 @@ def _gain_in_sigmas(before: HeldOut, after: HeldOut) -> float:
 
 
 def find_confounder(
-    tests: EffectTests, effect: Effect, columns: Index,
+    tests: EffectTests,
+    effect: Effect,
+    columns: Index,
     twins: Sequence[tuple[str, Index, list[str]]],
 ) -> str:
     """Return which effect in the place of another cause makes this one needless."""
@@ -328,10 +390,14 @@ def _confirm(
             return evaluation, _add_refused_causes(selection, candidates)
         effect, columns, values = doubt.cause
         test = EffectTests(selection.null).test_removal(
-            selection.null.included_columns, columns, effect)
+            selection.null.included_columns, columns, effect
+        )
         candidates[effect.name] = UnconfirmedCause(
-            effect.name, parameters_of(effect, values, evaluation.errors[columns]), test.p_value,
-            doubt.why)
+            effect.name,
+            parameters_of(effect, values, evaluation.errors[columns]),
+            test.p_value,
+            doubt.why,
+        )
         selection = without_cause(selection, effect.name)
         if doubt.why in (REFUTED_BY_FRAMES, REFUTED_BY_FILE) or _implausible(effect, values):
             selection = replace(selection, refuted=(*selection.refuted, effect.name))
@@ -345,7 +411,11 @@ def _add_refused_causes(
     every = dict(found)
     why = NO_GAIN if selection.null.linear.data.frames > 1 else NO_OTHER_FRAME
     for step in selection.trace:
-        if (not step.accepted and step.why.endswith('does not predict better')
-                and step.name not in causes and step.name not in every):
+        if (
+            not step.accepted
+            and step.why.endswith('does not predict better')
+            and step.name not in causes
+            and step.name not in every
+        ):
             every[step.name] = UnconfirmedCause(step.name, {}, step.corrected, why)
     return list(every.values())

@@ -79,8 +79,11 @@ def add_effects(
     """
     forms, trace, failed = list[int](), list[TraceStep](), set()
     while len(forms) < most:
-        remaining = (c for c in tests.significant_candidates(included)
-                     if c.form not in failed and c.effect.name not in refused)
+        remaining = (
+            c
+            for c in tests.significant_candidates(included)
+            if c.form not in failed and c.effect.name not in refused
+        )
         best = _next_candidate(remaining)
         if best is None:
             break
@@ -89,8 +92,9 @@ def add_effects(
         if not (best.effect.per_frame or quick):
             gain = tests.held_out_gain(included, columns, best.effect)
         why = 'significant and predicts better' if gain.convincing else 'does not predict better'
-        trace.append(_trace_step(
-            best.effect, best.score, best.corrected, gain, gain.convincing, why))
+        trace.append(
+            _trace_step(best.effect, best.score, best.corrected, gain, gain.convincing, why)
+        )
         if gain.convincing:
             included = np.concatenate([included, columns])
             forms.append(best.form)
@@ -117,15 +121,30 @@ def _commoner_candidate(best: Candidate, others: Iterator[Candidate]) -> Candida
     if not best.effect.rarer_than:
         return best
     size = len(best.effect.parameters)
-    return next((c for c in near if c.effect.name == best.effect.rarer_than
-                 and len(c.effect.parameters) == size), best)
+    return next(
+        (
+            c
+            for c in near
+            if c.effect.name == best.effect.rarer_than and len(c.effect.parameters) == size
+        ),
+        best,
+    )
 
 
 def _trace_step(
     effect: Effect, score: Score, corrected: float, gain: HeldOutGain, accepted: bool, why: str
 ) -> TraceStep:
-    return TraceStep(effect.key, score.statistic, score.rank, score.p_value, corrected,
-                     gain.value, gain.stderr, accepted, why)
+    return TraceStep(
+        effect.key,
+        score.statistic,
+        score.rank,
+        score.p_value,
+        corrected,
+        gain.value,
+        gain.stderr,
+        accepted,
+        why,
+    )
 
 
 def eliminate_effects(
@@ -170,7 +189,7 @@ def _test_removal(
 
 
 def find_single_landmarks(
-    tests: EffectTests
+    tests: EffectTests,
 ) -> tuple[LandmarkSurveyEffect, Array, TraceStep] | None:
     """Return landmarks that stand out against the variance of all, their offsets and the test.
 
@@ -197,8 +216,14 @@ def find_single_landmarks(
     ids = null.random.landmark[found]
     effect = LandmarkSurveyEffect(tuple(int(i) for i in ids))
     step = TraceStep(
-        effect.key, float(statistic[found].sum()), int(rank[found].sum()), float(p[found[0]]),
-        float(p[found[0]] * number), np.nan, np.nan, True,
+        effect.key,
+        float(statistic[found].sum()),
+        int(rank[found].sum()),
+        float(p[found[0]]),
+        float(p[found[0]] * number),
+        np.nan,
+        np.nan,
+        True,
         'further off than the bulk of landmarks',
     )
     return effect, offset[found].ravel(), step

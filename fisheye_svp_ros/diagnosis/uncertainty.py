@@ -80,9 +80,7 @@ def _reporting_matrix(null: NullModel) -> Array:
     return found
 
 
-def _estimate(
-    information: Array, included: Index, reported: Array
-) -> tuple[Array, Array, Array]:
+def _estimate(information: Array, included: Index, reported: Array) -> tuple[Array, Array, Array]:
     """Return estimates (K,), covariance (K, K) of what is included, normalised, what is open."""
     if not len(included):
         return np.zeros(0), np.zeros((0, 0)), np.zeros(0, dtype=bool)
@@ -164,7 +162,8 @@ def model_covariance(null: NullModel, models: Sequence[OtherModel], into: Array)
         sizes, vectors = np.linalg.eigh(step @ wider @ step.T - known)
         change = step @ values - base
         added += weight * (
-            (vectors * np.maximum(sizes, 0.0)) @ vectors.T + np.outer(change, change))
+            (vectors * np.maximum(sizes, 0.0)) @ vectors.T + np.outer(change, change)
+        )
     return np.asarray(added * np.outer(size, size))
 
 
@@ -187,7 +186,8 @@ def _fit_other_model(
     """Return estimates (m,) and their covariance (m, m), normalised, by another model."""
     at = one.included[one.included < null.column_count]
     estimate, covariance, _ = _estimate(
-        null.restrict_information(null.information, at) + prior, one.included, reported)
+        null.restrict_information(null.information, at) + prior, one.included, reported
+    )
     return estimate, covariance
 
 
@@ -219,7 +219,8 @@ def likely_models(null: NullModel, averaged_kinds: Collection[str] = ()) -> list
         forms, model = max(waiting.items(), key=lambda item: item[1].criterion)
         found[forms] = waiting.pop(forms)
         for one in tests.candidates(
-                model.included, per_frame=False, worth=partial(_is_likely, null, 0.0)):
+            model.included, per_frame=False, worth=partial(_is_likely, null, 0.0)
+        ):
             kinds, gain = _effect_family(one.effect), _log_odds(null, one.score)
             if model.kinds & kinds or {*one.effect.kinds} & {*averaged_kinds}:
                 continue
@@ -243,14 +244,15 @@ def _exchange_effects(null: NullModel) -> Iterator[tuple[frozenset[int], OtherMo
         score = tests.score_beside(rest, columns)
         lost = _log_odds(null, score)
         least = lost - _ODDS_WINDOW
-        for one in tests.candidates(
-                rest, per_frame=False, worth=partial(_is_likely, null, least)):
+        for one in tests.candidates(rest, per_frame=False, worth=partial(_is_likely, null, least)):
             kinds = frozenset(one.effect.kinds)
             gain = _log_odds(null, one.score) - lost
             if _is_lasting(one.effect) and not null.effect_kinds & kinds:
                 included = np.concatenate([rest, null.form_columns(one.form)])
-                yield frozenset({~i, one.form}), OtherModel(
-                    gain, included, kinds | set(effect.kinds))
+                yield (
+                    frozenset({~i, one.form}),
+                    OtherModel(gain, included, kinds | set(effect.kinds)),
+                )
 
 
 def _effect_family(effect: Effect) -> set[str]:
@@ -290,8 +292,12 @@ class LensCovariance:
             errors = np.hypot(errors, field_uncertainty(null))
         larger = np.nan_to_num(errors) / np.maximum(known, 1e-300)
         ratios = np.where(known > 0, np.maximum(larger, 1.0), 0.0)
-        alone = cls(averaged.linear, averaged.widen(least * np.outer(ratios, ratios)), ratios,
-                    averaged.place)
+        alone = cls(
+            averaged.linear,
+            averaged.widen(least * np.outer(ratios, ratios)),
+            ratios,
+            averaged.place,
+        )
         return alone if models is None else alone.with_other_models(null, models)
 
     def with_other_models(self, null: NullModel, models: list[OtherModel]) -> LensCovariance:
@@ -333,8 +339,9 @@ def _effect_names(state: RigState) -> set[str]:
 
 def _is_of_lens(effect: Effect) -> bool:
     """Whether a lens holds an effect, so that it moves its rays."""
-    return (effect.stage not in ('target', 'noise')
-            and not (effect.of_recording or effect.per_frame or effect.of_target))
+    return effect.stage not in ('target', 'noise') and not (
+        effect.of_recording or effect.per_frame or effect.of_target
+    )
 
 
 def _likely_forms(null: NullModel, models: list[OtherModel]) -> list[int]:

@@ -73,8 +73,7 @@ def cause_squares(null: NullModel, causes: Sequence[PlacedEffect]) -> dict[str, 
     section 4.3.
     """
     nothing = no_variances(len(NAMES), len(null.variances.weight))
-    f = factor_equations(
-        null.full.select(nothing.alive), nothing.lam, null.variances.weight)
+    f = factor_equations(null.full.select(nothing.alive), nothing.lam, null.variances.weight)
     every = np.zeros(null.column_count)
     owner = np.full(null.column_count, -1)
     for one, (_, columns, values) in enumerate(causes):
@@ -92,8 +91,15 @@ def cause_squares(null: NullModel, causes: Sequence[PlacedEffect]) -> dict[str, 
     squares = {}
     for one, (effect, _, _) in enumerate(causes):
         others = [other for other in range(count) if other != one]
-        added = [np.mean([explained_square(tuple(sorted((*some, one)))) - explained_square(some)
-                          for some in combinations(others, size)]) for size in range(count)]
+        added = [
+            np.mean(
+                [
+                    explained_square(tuple(sorted((*some, one)))) - explained_square(some)
+                    for some in combinations(others, size)
+                ]
+            )
+            for size in range(count)
+        ]
         squares[effect.name] = max(float(np.mean(added)), 0.0) * px2
     return squares
 
@@ -105,7 +111,9 @@ def _px2(null: NullModel) -> float:
 
 
 def variance_budget(
-    null: NullModel, squares: Mapping[str, float], p_values: Mapping[str, float],
+    null: NullModel,
+    squares: Mapping[str, float],
+    p_values: Mapping[str, float],
     repeated: SimilarViews | None = None,
 ) -> list[Component]:
     """Return all parts: what is named, random components, noise.
@@ -142,8 +150,11 @@ def variance_budget(
 def component_significance(null: NullModel) -> dict[str, float]:
     """Return the p-values of the random components that have a variance, by name."""
     p_values = component_p_values(null.equations_of(null.included_columns), null.variances)
-    return {name: float(p) for name, p, alive in
-            zip(NAMES, p_values, null.variances.alive, strict=True) if alive}
+    return {
+        name: float(p)
+        for name, p, alive in zip(NAMES, p_values, null.variances.alive, strict=True)
+        if alive
+    }
 
 
 def significant_components(components: list[Component]) -> list[Component]:
@@ -154,9 +165,13 @@ def significant_components(components: list[Component]) -> list[Component]:
 
 def stage_shares(components: list[Component]) -> dict[str, tuple[float, float]]:
     """Return the share of each stage and what of it has a name."""
-    return {stage: (sum(c.share for c in components if c.stage == stage),
-                    sum(c.named_share for c in components if c.stage == stage))
-            for stage in STAGES}
+    return {
+        stage: (
+            sum(c.share for c in components if c.stage == stage),
+            sum(c.named_share for c in components if c.stage == stage),
+        )
+        for stage in STAGES
+    }
 
 
 def noise_px(null: NullModel) -> float:
@@ -207,7 +222,8 @@ def _field_tests(tests: EffectTests) -> Iterator[tuple[str, float, float]]:
     total = float((null.linear.residual**2).sum())
     for name, columns in null.fixed.fields.items():
         score = tests.adjust_p_value(
-            tests.score(remaining, columns), null.included_columns, columns)
+            tests.score(remaining, columns), null.included_columns, columns
+        )
         explained = (score.statistic - score.rank) * null.variances.sigma**2
         yield name, score.p_value, max(explained, 0.0) / total
 
@@ -251,9 +267,7 @@ def _group_p_value(e2: Array, labels: Index) -> float:
     return float(special.chdtrc(int((counts > 0).sum()) - 1, statistic))
 
 
-def add_outliers(
-    left: list[Structure], outliers: Outliers, observations: int
-) -> list[Structure]:
+def add_outliers(left: list[Structure], outliers: Outliers, observations: int) -> list[Structure]:
     """Return what remains, with outliers that are no mere wrong ids."""
     far = len(outliers.rows) - outliers.swap_count
     if not far:
@@ -294,7 +308,8 @@ def noise_growth(fitted: FittedModel) -> NoiseGrowth:
         sign * across > _ACROSS_SHARE * abs(value)
         and sign * _growth_within(e2, z, np.repeat(landmark, 2), frame) > _LANDMARK_SIGMAS
         and sign * _growth_within(e2[1::2], z[1::2], landmark, frame[1::2]) > _ACROSS_SIGMAS
-        and sign * _growth_on_places(errors, z[::2], *pairs) > _PLACE_SIGMAS)
+        and sign * _growth_on_places(errors, z[::2], *pairs) > _PLACE_SIGMAS
+    )
     p = float(special.chdtrc(1, max(gain / tails, 0.0))) if confirmed else 1.0
     level = float(np.mean(e2 * np.exp(-2 * value * z)))
     return NoiseGrowth(value, stderr, p, level * np.exp(2 * value * every))
@@ -325,13 +340,18 @@ def _scatter(fitted: FittedModel) -> tuple[Array, Index]:
     arm = linear.data.blocks(np.nan_to_num(linear.linear.uv - center))[used].reshape(-1, 2)
     landmark, camera = (
         linear.data.blocks(of[..., None] * np.ones(2))[used][::2].astype(np.int64)
-        for of in (linear.data.views.landmark,
-                   np.broadcast_to(linear.data.camera_of[:, None], linear.weight.shape)))
+        for of in (
+            linear.data.views.landmark,
+            np.broadcast_to(linear.data.camera_of[:, None], linear.weight.shape),
+        )
+    )
     height = np.maximum(np.linalg.norm(arm, axis=1), 1e-9)
     radial = (errors * arm).sum(axis=1) / height
     across = (errors[:, 1] * arm[:, 0] - errors[:, 0] * arm[:, 1]) / height
-    return np.stack([_without_profile(_without_colors(radial, height, landmark), height, camera),
-                     across], axis=-1), landmark
+    return np.stack(
+        [_without_profile(_without_colors(radial, height, landmark), height, camera), across],
+        axis=-1,
+    ), landmark
 
 
 def _without_colors(radial: Array, height: Array, landmark: Index) -> Array:

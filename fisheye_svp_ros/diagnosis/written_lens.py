@@ -107,17 +107,25 @@ class OpenShifts(NamedTuple):
         None where one is refuted, by held-out frames or by its size.
         """
         null = selection.null
-        if (ViewpointShiftEffect.name in selection.refuted
-                or any(lens.port is not None for lens in null.linear.state.lenses)):
+        if ViewpointShiftEffect.name in selection.refuted or any(
+            lens.port is not None for lens in null.linear.state.lenses
+        ):
             return cls((), np.zeros(0, dtype=np.int64))
-        named = {kind.replace(FlatPortEffect.name, ViewpointShiftEffect.name)
-                 for kind in null.effect_kinds}
-        found = [(effect, null.form_columns(form)[0])
-                 for form, effect in enumerate(null.fixed.forms.effects)
-                 if effect.name == ViewpointShiftEffect.name and len(effect.parameters) == 1
-                 and not named & {*effect.kinds, effect.name}]
-        return cls(tuple(effect for effect, _ in found),
-                   np.array([column for _, column in found], dtype=np.int64))
+        named = {
+            kind.replace(FlatPortEffect.name, ViewpointShiftEffect.name)
+            for kind in null.effect_kinds
+        }
+        found = [
+            (effect, null.form_columns(form)[0])
+            for form, effect in enumerate(null.fixed.forms.effects)
+            if effect.name == ViewpointShiftEffect.name
+            and len(effect.parameters) == 1
+            and not named & {*effect.kinds, effect.name}
+        ]
+        return cls(
+            tuple(effect for effect, _ in found),
+            np.array([column for _, column in found], dtype=np.int64),
+        )
 
     def posterior(self, null: NullModel, information: Array) -> ShiftPosterior:
         """Return what an information matrix says of each.
@@ -134,8 +142,11 @@ class OpenShifts(NamedTuple):
         evidence = score**2 / (block + prior) / 2 - np.log1p(block / prior) / 2
         weight = special.expit(evidence + np.log(PRIOR_ODDS))
         return ShiftPosterior(
-            np.where(weight >= MIN_WEIGHT, weight, 0.0), score / (block + prior) / scale,
-            1 / (block + prior) / scale**2, follow * scale)
+            np.where(weight >= MIN_WEIGHT, weight, 0.0),
+            score / (block + prior) / scale,
+            1 / (block + prior) / scale**2,
+            follow * scale,
+        )
 
     def refit(self, null: NullModel, information: Array) -> tuple[Array, Array, Array]:
         """Return what changes by the information, as `posterior` takes it, with the shifts' means.
@@ -173,22 +184,33 @@ class AveragedModel:
         found = shifts.posterior(null, null.information[np.ix_(at, at)])
         follow = found.follow / null.scale[: null.column_count, None]
         state = linear.state.retract(
-            linear.free, np.zeros((linear.data.frames, 6)), follow @ found.mean)
+            linear.free, np.zeros((linear.data.frames, 6)), follow @ found.mean
+        )
         likely = np.flatnonzero(found.weight)
         for i in likely:
-            state = with_effect(state, shifts.effects[i], found.mean[i:i + 1])
+            state = with_effect(state, shifts.effects[i], found.mean[i : i + 1])
         averaged = Linearization(linear.data, state, linear.free) if len(likely) else linear
         names, before = shared_names(averaged), shared_names(linear)
         place = np.array([names.index(name) for name in before], dtype=np.int64)
         root = np.zeros((len(names), len(likely)))
         root[place] = follow[:, likely]
         root[np.setdiff1d(np.arange(len(names)), place)] = np.eye(len(likely))
-        return cls(averaged, tuple(
-            AveragedShift(effect.parts[0][1] if isinstance(effect, OfCameras) else '',
-                          float(found.weight[i]), float(found.mean[i]), float(found.stderr[i]))
-            for i, effect in enumerate(shifts.effects) if found.weight[i]),
+        return cls(
+            averaged,
+            tuple(
+                AveragedShift(
+                    effect.parts[0][1] if isinstance(effect, OfCameras) else '',
+                    float(found.weight[i]),
+                    float(found.mean[i]),
+                    float(found.stderr[i]),
+                )
+                for i, effect in enumerate(shifts.effects)
+                if found.weight[i]
+            ),
             tuple(kind for i in likely for kind in shifts.effects[i].kinds),
-            root * found.stderr[likely], place)
+            root * found.stderr[likely],
+            place,
+        )
 
     def widen(self, covariance: Array) -> Array:
         """Return a covariance (K, K) of the model with what the shifts add: (N, N)."""
@@ -198,8 +220,9 @@ class AveragedModel:
 
     def errors(self, errors: ModelErrors) -> ModelErrors:
         """Return what is known of the errors with the shifts, from that without."""
-        return replace(errors, names=shared_names(self.linear),
-                       covariance=self.widen(errors.covariance))
+        return replace(
+            errors, names=shared_names(self.linear), covariance=self.widen(errors.covariance)
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds: nothing where no shift is left open."""
@@ -231,8 +254,10 @@ class CameraField(NamedTuple):
     def bumps_at(self, uv: Array) -> Array:
         """Return the values (N, Q) of its bumps at image points (N, 2), px."""
         every = np.ones(len(uv), dtype=bool)
-        return np.concatenate([bump_values(uv, every, grid.centres, grid.pitch).toarray()
-                               for grid in self.grids], axis=1)
+        return np.concatenate(
+            [bump_values(uv, every, grid.centres, grid.pitch).toarray() for grid in self.grids],
+            axis=1,
+        )
 
 
 @dataclass(frozen=True)
@@ -255,8 +280,7 @@ class WrittenField:
         None where there is nothing to predict, or several cameras have one lens.
         """
         data, lenses = fitted.linear.data, fitted.linear.state.lenses
-        if (not fitted.random.grids or data.frames < 2 * FOLDS
-                or data.cameras > len(lenses)):
+        if not fitted.random.grids or data.frames < 2 * FOLDS or data.cameras > len(lenses):
             return None
         variances, order = selection.null.variances, np.arange(data.frames)
         squares = _hold_out(fitted, variances, order % FOLDS)
@@ -265,8 +289,11 @@ class WrittenField:
             return cls(before, after, (), {})
         block, ends = contiguous_blocks(data)
         squares = _hold_out(fitted, variances, block)
-        refuted = tuple(edge for edge, (without, with_field) in zip(ends, squares, strict=True)
-                        if with_field > without)
+        refuted = tuple(
+            edge
+            for edge, (without, with_field) in zip(ends, squares, strict=True)
+            if with_field > without
+        )
         return cls(before, after, refuted, _fields(selection, fitted))
 
     def add_to(self, lens: Lens, camera: int) -> Lens:
@@ -276,9 +303,13 @@ class WrittenField:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
-        return {'written': bool(self.fields), 'without_px': self.before, 'with_px': self.after,
-                'refuted_by_frames': [list(ends) for ends in self.refuted],
-                'rms_px': max((one.field.rms for one in self.fields.values()), default=0.0)}
+        return {
+            'written': bool(self.fields),
+            'without_px': self.before,
+            'with_px': self.after,
+            'refuted_by_frames': [list(ends) for ends in self.refuted],
+            'rms_px': max((one.field.rms for one in self.fields.values()), default=0.0),
+        }
 
 
 def _hold_out(fitted: FittedModel, variances: Variances, fold: Index) -> Array:
@@ -297,9 +328,7 @@ def _hold_out(fitted: FittedModel, variances: Variances, fold: Index) -> Array:
     return squares
 
 
-def _predict(
-    fitted: FittedModel, variances: Variances, out: Mask
-) -> tuple[Array, Array]:
+def _predict(fitted: FittedModel, variances: Variances, out: Mask) -> tuple[Array, Array]:
     """Return what the other frames predict of the rows (F, M) of some, and the field's part."""
     linear = fitted.linear
     kept, tested = split_frames(fitted, variances, out)
@@ -308,10 +337,14 @@ def _predict(
     group = np.zeros((int(out.sum()), 6 + tested.group.shape[2], 1))
     of_field = (np.arange(len(shared)) < fitted.random.grid_columns)[:, None]
     whole, field = (
-        predict_rows(tested, linear.frame_columns[out], group, offsets, values,
-                     kept.equations.units)[..., 0]
-        for offsets, values in ((unit, shared),
-                                (np.zeros_like(unit), np.where(of_field, shared, 0.0))))
+        predict_rows(
+            tested, linear.frame_columns[out], group, offsets, values, kept.equations.units
+        )[..., 0]
+        for offsets, values in (
+            (unit, shared),
+            (np.zeros_like(unit), np.where(of_field, shared, 0.0)),
+        )
+    )
     fixed = linear.shared_columns[out] @ (solution.values / fitted.scale)
     return whole + fixed, field
 
@@ -322,17 +355,24 @@ def _fields(selection: Selection, fitted: FittedModel) -> dict[int, CameraField]
     values = _shared_coefficients(selection, fitted)
     posterior = posterior_covariance(fitted.factored)
     count = fitted.solution.e.size
-    root = sigma * fitted.factored.equations.split(
-        posterior.root[:count].reshape(*fitted.solution.e.shape, -1), posterior.root[count:])[2]
+    root = (
+        sigma
+        * fitted.factored.equations.split(
+            posterior.root[:count].reshape(*fitted.solution.e.shape, -1), posterior.root[count:]
+        )[2]
+    )
     shared = sigma * posterior.shared / fitted.scale[:, None]
-    found, camera_of = {}, np.concatenate(
-        [np.full(2 * len(grid.centres), grid.camera) for grid in random.grids])
+    found, camera_of = (
+        {},
+        np.concatenate([np.full(2 * len(grid.centres), grid.camera) for grid in random.grids]),
+    )
     for camera in np.unique(camera_of).tolist():
         grids = tuple(grid for grid in random.grids if grid.camera == camera)
         mine = np.flatnonzero(camera_of == camera)
         known = fitted.linear.state.lenses[camera].image_field
         found[camera] = CameraField(
-            _field(grids, values[mine], root[mine], known), grids, root[mine], shared)
+            _field(grids, values[mine], root[mine], known), grids, root[mine], shared
+        )
     return found
 
 
@@ -357,12 +397,17 @@ def _field(
         low, high = np.minimum(low, known.nodes[0, 0]), np.maximum(high, known.nodes[-1, -1])
     low = np.round(low)
     columns, rows = (np.ceil((high - low) / (_PITCH * finest)).astype(int) + 1).clip(
-        MIN_NODES, MAX_NODES)
+        MIN_NODES, MAX_NODES
+    )
     pitch = np.full(2, round(_PITCH * finest, _DIGITS))
     nodes = ImageField(low, pitch, np.zeros((rows, columns, 2))).nodes
-    bumps = sparse.hstack([
-        bump_values(nodes, np.ones(nodes.shape[:2], dtype=bool), grid.centres, grid.pitch)
-        for grid in grids], format='csr')
+    bumps = sparse.hstack(
+        [
+            bump_values(nodes, np.ones(nodes.shape[:2], dtype=bool), grid.centres, grid.pitch)
+            for grid in grids
+        ],
+        format='csr',
+    )
     there = (bumps @ values.reshape(-1, 2)).reshape(nodes.shape)
     spread = (bumps @ root.reshape(bumps.shape[1], -1)).reshape(rows, columns, 2, -1)
     if known is not None:

@@ -207,8 +207,10 @@ class Effect(ABC):
         if self.name in held:
             known, before = self.from_dict(held[self.name], lens.name)
             if known != self:
-                raise LensError(f'lens {lens.name!r} already holds {known.key} in {self.place}; '
-                                f'{self.key} cannot be added')
+                raise LensError(
+                    f'lens {lens.name!r} already holds {known.key} in {self.place}; '
+                    f'{self.key} cannot be added'
+                )
             values = values + before
         changes: dict[str, Any] = {self.place: {**held, self.name: self.to_dict(values)}}
         return replace(lens, **changes)
@@ -253,7 +255,8 @@ class Effect(ABC):
     def key(self) -> str:
         """A short name of this form, unique within a data set."""
         parts = [
-            f'{f.name}={_shorten(getattr(self, f.name))}' for f in fields(self)
+            f'{f.name}={_shorten(getattr(self, f.name))}'
+            for f in fields(self)
             if f.metadata.get('key', True)
         ]
         return f'{self.name}({", ".join(parts)})' if parts else self.name
@@ -271,8 +274,10 @@ class Effect(ABC):
         structure = {name: value for name, value in entry.items() if name != 'parameters'}
         known = {field.name for field in fields(cls)}
         if foreign := [name for name in structure if name not in known]:
-            raise LensError(f'{where}: effect {cls.name} has {foreign[0]}, which does not belong '
-                            'there; its numbers are in a mapping, parameters')
+            raise LensError(
+                f'{where}: effect {cls.name} has {foreign[0]}, which does not belong '
+                'there; its numbers are in a mapping, parameters'
+            )
         try:
             effect = cls(**{name: _frozen(value) for name, value in structure.items()})
             names = [parameter.name for parameter in effect.parameters]
@@ -325,8 +330,11 @@ class NoiseEffect(Effect):
 
 def noise_scale(terms: Sequence[Term], scene: Scene) -> Array | float:
     """Return the factor (S, N) of noise effects on the standard deviation of the noise."""
-    return prod(effect.noise_scale(scene, values) for effect, values in terms
-                if isinstance(effect, NoiseEffect))
+    return prod(
+        effect.noise_scale(scene, values)
+        for effect, values in terms
+        if isinstance(effect, NoiseEffect)
+    )
 
 
 def require_time(scene: Scene, minimum: int) -> Array:

@@ -20,20 +20,38 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.registry import Registry
 
 _KINDS: tuple[type[Effect], ...] = (
-    ray.ViewpointShiftEffect, ray.RadialProfileEffect, image.FocalLengthEffect,
-    image.PrincipalPointEffect, image.AspectEffect, image.SkewEffect, image.DecenteringEffect,
-    image.SensorTiltEffect, ray.FlatPortEffect, recording.FocalDriftEffect,
-    recording.SessionStepEffect, target.LandmarkSurveyEffect, target.LandmarkScaleEffect,
-    target.TargetShapeEffect, target.BoardPoseEffect, detection.DotCentroidEffect,
-    detection.DetectorBiasEffect, pose.RollingShutterEffect, pose.StereoTimeOffsetEffect,
-    pose.RigFlexEffect, detection.WrongIdsEffect, detection.QuantisationEffect,
+    ray.ViewpointShiftEffect,
+    ray.RadialProfileEffect,
+    image.FocalLengthEffect,
+    image.PrincipalPointEffect,
+    image.AspectEffect,
+    image.SkewEffect,
+    image.DecenteringEffect,
+    image.SensorTiltEffect,
+    ray.FlatPortEffect,
+    recording.FocalDriftEffect,
+    recording.SessionStepEffect,
+    target.LandmarkSurveyEffect,
+    target.LandmarkScaleEffect,
+    target.TargetShapeEffect,
+    target.BoardPoseEffect,
+    detection.DotCentroidEffect,
+    detection.DetectorBiasEffect,
+    pose.RollingShutterEffect,
+    pose.StereoTimeOffsetEffect,
+    pose.RigFlexEffect,
+    detection.WrongIdsEffect,
+    detection.QuantisationEffect,
     detection.NoiseVsAngleEffect,
 )
 # Not tested for: only stated by the user, or named as what a cause may be mistaken for.
 _LOOK_ALIKES: tuple[type[Effect], ...] = (ray.DomePortEffect,)
 CATALOGUE: Registry[type[Effect]] = Registry(
-    'effects', {kind.name: kind for kind in _KINDS}, Effect,
-    {kind.name: kind for kind in _LOOK_ALIKES})
+    'effects',
+    {kind.name: kind for kind in _KINDS},
+    Effect,
+    {kind.name: kind for kind in _LOOK_ALIKES},
+)
 
 
 def load_effects(entries: Mapping[str, Any], where: str) -> tuple[Term, ...]:

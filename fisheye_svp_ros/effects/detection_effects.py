@@ -40,8 +40,11 @@ class DotCentroidEffect(Effect):
     def is_implausible(self, values: Array, scene: Scene) -> bool:
         """Whether the dots would reach the centres of their neighbours on every board."""
         views = scene.views
-        places = [views.points[views.used & (views.board == board.id)]
-                  for board in scene.boards if board.flat]
+        places = [
+            views.points[views.used & (views.board == board.id)]
+            for board in scene.boards
+            if board.flat
+        ]
         apart = [spacing(np.unique(np.round(points, 9), axis=0)) for points in places]
         return bool(values[0] > max(apart) ** 2)
 

@@ -54,8 +54,9 @@ class Target:
         try:
             table = np.array(rows, dtype=float).reshape(-1, 5)
         except (TypeError, ValueError) as cause:
-            raise LensError(f'{where}: target.{LANDMARKS} must be a list of [landmark, board, x, '
-                            'y, z]') from cause
+            raise LensError(
+                f'{where}: target.{LANDMARKS} must be a list of [landmark, board, x, y, z]'
+            ) from cause
         ids, first = np.unique(table[:, 0].astype(np.int64), return_index=True)
         return cls(terms, ids, table[first, 1].astype(np.int64), table[first, 2:])
 

@@ -76,9 +76,7 @@ class ForwardModel:
     cameras: of a rig whose lenses differ, the model of each camera.
     """
 
-    def __init__(
-        self, lens: Lens | Sequence[Lens], terms: Sequence[Term] | None = None
-    ) -> None:
+    def __init__(self, lens: Lens | Sequence[Lens], terms: Sequence[Term] | None = None) -> None:
         """Take the corrections of the lens and of its target, or other effects in their place.
 
         One lens, and its effects, is that of every camera.
@@ -89,7 +87,8 @@ class ForwardModel:
             if len(lens) > 1:
                 self.cameras = tuple(
                     ForwardModel(one, None if terms is None else camera_terms(terms, i))
-                    for i, one in enumerate(lens))
+                    for i, one in enumerate(lens)
+                )
                 terms = ()
             lens = lens[0]
         own = load_effects(lens.corrections, lens.name) if terms is None else terms
@@ -176,9 +175,12 @@ class ForwardModel:
     def transform_columns(self, linear: LinearViews, views: Views, columns: Array) -> Array:
         """Return columns (S, N, 2, P) that move ideal image points as they move measured ones."""
         if self.cameras:
-            return gather_rows([
-                (rows, self.cameras[i].transform_columns(own, views.take(rows), columns[rows]))
-                for rows, i, own in linear.cameras])
+            return gather_rows(
+                [
+                    (rows, self.cameras[i].transform_columns(own, views.take(rows), columns[rows]))
+                    for rows, i, own in linear.cameras
+                ]
+            )
         for stage, uv in (('image', linear.ideal), ('detector', linear.optical)):
             if self._acts(stage):
                 columns = columns + self._slope(linear, views, stage, uv) @ columns
@@ -210,12 +212,15 @@ class ForwardModel:
         """Return what effects may look at once the views are linearised."""
         if not self.cameras:
             return Scene(views, self.lens, pose, linear.ideal, linear.image.incidence)
-        parts = tuple((rows, i, self.cameras[i].scene(pose.take(rows), views.take(rows), own))
-                      for rows, i, own in linear.cameras)
+        parts = tuple(
+            (rows, i, self.cameras[i].scene(pose.take(rows), views.take(rows), own))
+            for rows, i, own in linear.cameras
+        )
         rays = [(rows, own.image.incidence) for rows, _, own in linear.cameras]
         unit = gather_rows([(rows, np.moveaxis(ray.unit, 0, -1)) for rows, ray in rays])
         incidence = Incidence(
-            gather_rows([(rows, ray.theta) for rows, ray in rays]), np.moveaxis(unit, -1, 0),
+            gather_rows([(rows, ray.theta) for rows, ray in rays]),
+            np.moveaxis(unit, -1, 0),
             gather_rows([(rows, ray.valid.astype(float)) for rows, ray in rays]) > 0,
         )
         return Scene(views, self.lens, pose, linear.ideal, incidence, parts)
@@ -281,13 +286,16 @@ class ForwardModel:
     def _by_camera(self, pose: Pose, views: Views, limited: bool) -> LinearViews:
         parts = tuple(
             CameraViews(rows, i, model._linearize(pose.take(rows), views.take(rows), limited))
-            for rows, i, model in self.split(views))
+            for rows, i, model in self.split(views)
+        )
         uv, d_pose, ideal, optical, points = (
             gather_rows([(rows, getattr(own, name)) for rows, _, own in parts])
-            for name in ('uv', 'd_pose', 'ideal', 'optical', 'points'))
+            for name in ('uv', 'd_pose', 'ideal', 'optical', 'points')
+        )
         valid = gather_rows([(rows, own.valid.astype(float)) for rows, _, own in parts]) > 0
         return LinearViews(
-            uv, valid, d_pose, ideal, optical, self.lens, pose, points, limited, parts)
+            uv, valid, d_pose, ideal, optical, self.lens, pose, points, limited, parts
+        )
 
     def _seen_points(self, pose: Pose, views: Views) -> Array:
         """Return the points (S, N, 3), m, where target and pose effects make them be seen."""

@@ -81,8 +81,7 @@ class SkewEffect(PlaneEffect):
     name = 'skew'
     meaning = 'The pixel axes are not square to each other.'
     signature = (
-        'residuals like a shear of the image: outward along one diagonal, inward along the '
-        'other'
+        'residuals like a shear of the image: outward along one diagonal, inward along the other'
     )
     to_separate = 'views turned about the axis by 45 and 90 degrees'
 

@@ -23,7 +23,8 @@ class OfCameras(Effect):
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(
             parameter._replace(name=f'{label}.{parameter.name}')
-            for _, label, effect in self.parts for parameter in effect.parameters
+            for _, label, effect in self.parts
+            for parameter in effect.parameters
         )
 
     @property
@@ -48,8 +49,9 @@ class OfCameras(Effect):
 
     def prior_sigma(self, scene: Scene) -> Array:
         own = {number: one for _, number, one in scene.cameras}
-        return np.concatenate([
-            effect.prior_sigma(own[number]) for number, _, effect in self.parts])
+        return np.concatenate(
+            [effect.prior_sigma(own[number]) for number, _, effect in self.parts]
+        )
 
     def columns(self, scene: Scene) -> Array:
         """Every camera has a scene of its own: see `of_camera`."""
@@ -77,8 +79,18 @@ class OfCameras(Effect):
 @cache
 def of_cameras(kind: type[Effect]) -> type[OfCameras]:
     """Return the class of an effect's forms by camera; it has the effect's name."""
-    words = {name: getattr(kind, name) for name in (
-        'name', 'stage', 'rarer_than', 'asked_after', 'to_separate', 'abrupt', 'of_frames')}
+    words = {
+        name: getattr(kind, name)
+        for name in (
+            'name',
+            'stage',
+            'rarer_than',
+            'asked_after',
+            'to_separate',
+            'abrupt',
+            'of_frames',
+        )
+    }
     return type(f'{kind.__name__}OfCameras', (OfCameras,), words)
 
 

@@ -80,8 +80,9 @@ class RadialProfileEffect(Effect):
         return [*(cls(terms, limit) for terms in (1, 2, 4)), finest]
 
     def merge_with(self, other: Self) -> Effect:
-        return replace(other, terms=max(self.terms, other.terms),
-                       first=min(self.first, other.first))
+        return replace(
+            other, terms=max(self.terms, other.terms), first=min(self.first, other.first)
+        )
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -227,5 +228,6 @@ class DomePortEffect(PlaneEffect):
         if lens.port is not None:
             raise LensError(f'lens {lens.name!r} already has a port; {self.key} cannot be added')
         x, y = map(float, values)
-        return replace(lens, port=DomeGlass(
-            self.radius, 1.0, x, y, 0.0, self.thickness, self.glass_index))
+        return replace(
+            lens, port=DomeGlass(self.radius, 1.0, x, y, 0.0, self.thickness, self.glass_index)
+        )

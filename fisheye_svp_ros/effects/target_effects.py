@@ -54,7 +54,8 @@ class LandmarkSurveyEffect(Effect):
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(
             Parameter(f'{landmark}.{axis}', 'm', 0.02)
-            for landmark in self.landmarks for axis in 'xyz'
+            for landmark in self.landmarks
+            for axis in 'xyz'
         )
 
     @property
@@ -110,7 +111,7 @@ class LandmarkScaleEffect(Effect):
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
         points = scene.views.points[scene.views.used]
         where = tuple(float(x) for x in np.round(points.mean(axis=0), 9))
-        whole, = find_boards(points, np.zeros(len(points), dtype=np.int64))
+        (whole,) = find_boards(points, np.zeros(len(points), dtype=np.int64))
         # Several boards may each be stretched their own way: the null model knows how much.
         plane = tuple(float(x) for x in np.round(whole.axes[:2].ravel(), 9))
         return [cls(1, where), cls(2, where, plane) if whole.flat else cls(3, where)]
@@ -173,7 +174,8 @@ class TargetShapeEffect(Effect):
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(
             Parameter(f'board{int(board[0])}.z{i}{j}', 'm', 0.005)
-            for board in self.boards for i, j in _powers(self.degree)
+            for board in self.boards
+            for i, j in _powers(self.degree)
         )
 
     @property
@@ -225,7 +227,8 @@ class BoardPoseEffect(Effect):
         reference = labels[np.argmax(counts)]
         others = [
             (float(board.id), *(float(x) for x in np.round(board.centre, 9)))
-            for board in scene.boards if board.id != reference
+            for board in scene.boards
+            if board.id != reference
         ]
         forms: list[Effect] = [cls((one,)) for one in others]
         return forms if len(others) == 1 else [cls(tuple(others)), *forms]

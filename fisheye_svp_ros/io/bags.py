@@ -176,7 +176,9 @@ class BagWriter:
         """
         try:
             self._connections[topic] = self._writer.add_connection(
-                topic, typename, typestore=_types(),
+                topic,
+                typename,
+                typestore=_types(),
                 offered_qos_profiles=[_profile(one) for one in offered],
             )
         except Exception as cause:
@@ -247,8 +249,11 @@ class Bag:
             yield Record(topic, typename, when, message)
         if notes:
             more = f' and {len(notes) - _MAX_LISTED} more' if len(notes) > _MAX_LISTED else ''
-            self.damage = ('it is damaged, and only its intact parts are read; '
-                           + '; '.join(notes[:_MAX_LISTED]) + more)
+            self.damage = (
+                'it is damaged, and only its intact parts are read; '
+                + '; '.join(notes[:_MAX_LISTED])
+                + more
+            )
 
     def topics(self) -> set[tuple[str, str]]:
         """Return the topics and their types; raise BagError where nothing can be read."""
@@ -279,8 +284,10 @@ class Bag:
             if plain != file:
                 passed(file.stat().st_size)
         if problems and not count:
-            raise BagError(f'{self.path}: not a recording, or no part of it is intact '
-                           f'({"; ".join(problems[:_MAX_LISTED])})')
+            raise BagError(
+                f'{self.path}: not a recording, or no part of it is intact '
+                f'({"; ".join(problems[:_MAX_LISTED])})'
+            )
 
 
 def _list_topics(file: Path) -> set[tuple[str, str]]:
@@ -300,10 +307,12 @@ def _profile(offered: OfferedQos) -> Qos:
         history=QosHistory.KEEP_LAST,
         depth=_DEPTH,
         reliability=QosReliability.RELIABLE if offered.reliable else QosReliability.BEST_EFFORT,
-        durability=(QosDurability.TRANSIENT_LOCAL if offered.latched
-                    else QosDurability.VOLATILE),
-        deadline=_UNLIMITED_TIME, lifespan=_UNLIMITED_TIME, liveliness=QosLiveliness.AUTOMATIC,
-        liveliness_lease_duration=_UNLIMITED_TIME, avoid_ros_namespace_conventions=False,
+        durability=(QosDurability.TRANSIENT_LOCAL if offered.latched else QosDurability.VOLATILE),
+        deadline=_UNLIMITED_TIME,
+        lifespan=_UNLIMITED_TIME,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=_UNLIMITED_TIME,
+        avoid_ros_namespace_conventions=False,
     )
 
 

@@ -70,8 +70,12 @@ class TableParts:
 
     def write(self, number: int, columns: Columns) -> None:
         """Write a part; raise OutputError where that is impossible."""
-        write_text(self._path(number), json.dumps(
-            {name: list(columns[name]) for name in self._types}, default=np.generic.item))
+        write_text(
+            self._path(number),
+            json.dumps(
+                {name: list(columns[name]) for name in self._types}, default=np.generic.item
+            ),
+        )
 
     def join(self, path: Path) -> list[Path]:
         """Write all parts in order as `write_columns` does; raise OutputError for a bad one."""
@@ -90,8 +94,9 @@ class TableParts:
                 if kind is int and any(abs(cell or 0) > _MAX_INTEGER for cell in part[name]):
                     raise ValueError(f'{name} holds a number above {_MAX_INTEGER}')
         except (OutputError, ValueError, TypeError) as cause:
-            raise OutputError(f'{path}: a part of the table is damaged ({cause}); remove it and '
-                              'compute it again') from cause
+            raise OutputError(
+                f'{path}: a part of the table is damaged ({cause}); remove it and compute it again'
+            ) from cause
         return part
 
     def _path(self, number: int) -> Path:
@@ -119,8 +124,9 @@ def read_columns(path: Path) -> dict[str, list[Any]]:
         raise OutputError(f'{path}: {problem}; give the .csv file next to it')
     data = read_bytes(path, OutputError)
     try:
-        file = pyarrow.parquet.ParquetFile(pyarrow.BufferReader(data),
-                                           page_checksum_verification=True)
+        file = pyarrow.parquet.ParquetFile(
+            pyarrow.BufferReader(data), page_checksum_verification=True
+        )
         about, names = file.metadata, file.schema_arrow.names
         if about.num_rows * about.num_columns > _MOST_CELLS:
             raise ValueError(f'more than {_MOST_CELLS} cells')
@@ -138,9 +144,17 @@ def read_columns(path: Path) -> dict[str, list[Any]]:
 def _to_python(pyarrow: Any, column: Any) -> list[Any]:
     """Return a column of numbers or text; None is an empty cell."""
     kinds = pyarrow.types
-    if not any(test(column.type) for test in (
-            kinds.is_integer, kinds.is_floating, kinds.is_string, kinds.is_large_string,
-            kinds.is_boolean, kinds.is_null)):
+    if not any(
+        test(column.type)
+        for test in (
+            kinds.is_integer,
+            kinds.is_floating,
+            kinds.is_string,
+            kinds.is_large_string,
+            kinds.is_boolean,
+            kinds.is_null,
+        )
+    ):
         raise ValueError(f'a column of {column.type}; numbers and text are read')
     cells: list[Any] = column.to_pylist()
     return cells

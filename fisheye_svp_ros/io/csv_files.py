@@ -84,7 +84,8 @@ class CsvTable:
             if name == 't':
                 unit = _stamp_unit(column)
                 needed = 'a time in seconds' + (
-                    f' (these are {unit}: divide by {_PER_SECOND[unit]:g})' if unit else '')
+                    f' (these are {unit}: divide by {_PER_SECOND[unit]:g})' if unit else ''
+                )
             self.refuse(np.abs(column) > _MAX_VALUE, name, needed)
         return values
 
@@ -125,16 +126,20 @@ class CsvTable:
         wanted, there = ','.join(required), ','.join(self._header)
         if not any(self._header):
             raise ObservationError(
-                f'{self.path}: it is empty; a header with {wanted or "names"} is needed')
+                f'{self.path}: it is empty; a header with {wanted or "names"} is needed'
+            )
         missing = [name for name in required if name not in self._header]
         if missing and all(map(_is_number, self._header)):
             raise ObservationError(
-                f'{self.path}: its first line holds numbers; a header with {wanted} is needed')
+                f'{self.path}: its first line holds numbers; a header with {wanted} is needed'
+            )
         if missing:
             names = ', '.join(map(repr, missing))
             which = f'column {names} is' if len(missing) == 1 else f'columns {names} are'
-            raise ObservationError(f'{self.path}: {which} missing from its header, '
-                                   f'{there[:_MAX_HEADER]!r}; needed are {wanted}')
+            raise ObservationError(
+                f'{self.path}: {which} missing from its header, '
+                f'{there[:_MAX_HEADER]!r}; needed are {wanted}'
+            )
         twice = [name for name, count in Counter(self._header).items() if name and count > 1]
         if twice:
             raise ObservationError(f'{self.path}: its header has {twice[0]!r} twice')
@@ -202,8 +207,11 @@ def read(path: str | Path) -> Observations:
     names = table.text('camera') if 'camera' in table else ('',) * len(frame)
     cameras = tuple(dict.fromkeys(names))
     # Results of a camera go to a folder of its name, in that of all.
-    table.refuse([name.startswith('/') or '..' in name.split('/') for name in names], 'camera',
-                 'a name without .. that does not begin with /')
+    table.refuse(
+        [name.startswith('/') or '..' in name.split('/') for name in names],
+        'camera',
+        'a name without .. that does not begin with /',
+    )
     if len(cameras) > 1:
         named = next(filter(None, cameras))
         table.refuse([not name for name in names], 'camera', f'a name, as {named!r} elsewhere,')
@@ -255,12 +263,19 @@ def write_observations(path: str | Path, observations: Observations) -> None:
     file cannot be written.
     """
     if not isinstance(observations, Observations):
-        raise ParameterError(f'observations are of type {type(observations).__name__}; a table is '
-                             'needed, after the path')
+        raise ParameterError(
+            f'observations are of type {type(observations).__name__}; a table is '
+            'needed, after the path'
+        )
     table = observations
     columns: dict[str, NDArray[Any]] = {
-        'frame': table.frame, 'landmark': table.landmark, 'u': table.uv[:, 0], 'v': table.uv[:, 1],
-        'x': table.xyz[:, 0], 'y': table.xyz[:, 1], 'z': table.xyz[:, 2],
+        'frame': table.frame,
+        'landmark': table.landmark,
+        'u': table.uv[:, 0],
+        'v': table.uv[:, 1],
+        'x': table.xyz[:, 0],
+        'y': table.xyz[:, 1],
+        'z': table.xyz[:, 2],
     }
     if table.cameras != ('',):
         columns['camera'] = np.array(table.cameras)[table.camera]

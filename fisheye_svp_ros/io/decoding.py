@@ -23,9 +23,9 @@ Points = NDArray[np.void]
 
 LANDMARKS = np.dtype([('landmark', '<u4'), ('x', '<f8'), ('y', '<f8'), ('z', '<f8')])
 IMAGE_POINTS = np.dtype([('landmark', '<u4'), ('u', '<f8'), ('v', '<f8')])
-RESIDUALS = np.dtype([
-    *IMAGE_POINTS.descr, ('du', '<f8'), ('dv', '<f8'), ('theta', '<f8'), ('range', '<f8')
-])
+RESIDUALS = np.dtype(
+    [*IMAGE_POINTS.descr, ('du', '<f8'), ('dv', '<f8'), ('theta', '<f8'), ('range', '<f8')]
+)
 
 MAX_VALUE = 1e12  # m or px; squares and products of anything larger are soon no numbers
 _MAX_POINT_BYTES = 1 << 16  # bytes of a point
@@ -95,7 +95,7 @@ def _raw_points(cloud: Any, what: str) -> Points:
     data, row_step = cloud.data, int(cloud.row_step)
     if row_step > step * cloud.width and len(data) == row_step * cloud.height > 0:
         rows = np.frombuffer(data, np.uint8).reshape(cloud.height, row_step)
-        data = rows[:, :step * cloud.width].tobytes()  # without the padding of the rows
+        data = rows[:, : step * cloud.width].tobytes()  # without the padding of the rows
     if len(data) != step * count:
         raise ObservationError(
             f'{what}: {len(cloud.data)} bytes of data do not hold {count} points of {step} bytes'
@@ -210,21 +210,26 @@ def read_camera_info(message: Any, topic: str = 'camera_info') -> CameraModel:
     if not k[0]:
         raise ObservationError(f'{topic}: k is 0, as of a camera that is not calibrated')
     if not (np.abs([*k, *d]) <= MAX_VALUE).all():  # not so for NaN
-        raise ObservationError(f'{topic}: k or d holds a value that is not a finite number, or '
-                               f'beyond {MAX_VALUE:g}')
+        raise ObservationError(
+            f'{topic}: k or d holds a value that is not a finite number, or beyond {MAX_VALUE:g}'
+        )
     size, roi = (int(message.width), int(message.height)), message.roi
     part = roi.x_offset or roi.y_offset or (roi.width or size[0], roi.height or size[1]) != size
     if part or max(message.binning_x, message.binning_y) > 1:
-        raise ObservationError(f'{topic}: of a part of the image, or binned; whole images are '
-                               'needed')
+        raise ObservationError(
+            f'{topic}: of a part of the image, or binned; whole images are needed'
+        )
     return CameraModel(str(message.distortion_model), size, (k[0], k[4], k[2], k[5], k[1]), d)
 
 
 def statuses(message: Any) -> list[Status]:
     """Return the statuses of a DiagnosticArray."""
     return [  # the level is a byte: rclpy gives bytes, a bag reader a number
-        Status(one.level[0] if isinstance(one.level, bytes) else int(one.level), str(one.message),
-               {pair.key: pair.value for pair in one.values})
+        Status(
+            one.level[0] if isinstance(one.level, bytes) else int(one.level),
+            str(one.message),
+            {pair.key: pair.value for pair in one.values},
+        )
         for one in message.status
     ]
 

@@ -190,17 +190,24 @@ class _Loader(_Base):  # type: ignore[misc]
 
     # A date is nothing that any file here has; 2001-99-99 may be a name.
     yaml_implicit_resolvers: ClassVar = {
-        first: [(tag, pattern) for tag, pattern in resolvers
-                if tag not in (_INT, _FLOAT, _TIMESTAMP)]
+        first: [
+            (tag, pattern) for tag, pattern in resolvers if tag not in (_INT, _FLOAT, _TIMESTAMP)
+        ]
         for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 
 
 _Loader.add_implicit_resolver(
-    _INT, re.compile(r'[-+]?(0|[1-9][0-9]*|0x[0-9a-fA-F]+)$'), list('-+0123456789'))
+    _INT, re.compile(r'[-+]?(0|[1-9][0-9]*|0x[0-9a-fA-F]+)$'), list('-+0123456789')
+)
 _Loader.add_implicit_resolver(
-    _FLOAT, re.compile(r'[-+]?((\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|\.(inf|Inf|INF))$'
-                       r'|\.(nan|NaN|NAN)$'), list('-+.0123456789'))
+    _FLOAT,
+    re.compile(
+        r'[-+]?((\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|\.(inf|Inf|INF))$'
+        r'|\.(nan|NaN|NAN)$'
+    ),
+    list('-+.0123456789'),
+)
 # OpenCV's matrices are mappings; those of other types are none that a lens has.
 _Loader.add_constructor('tag:yaml.org,2002:opencv-matrix', _Loader.construct_yaml_map)
 
@@ -215,7 +222,8 @@ class _Dumper(_BaseDumper):  # type: ignore[misc]
 # Whoever builds a lens or a scenario in Python computes with numpy.
 for _scalar in (np.bool_, np.integer, np.floating):
     _Dumper.add_multi_representer(
-        _scalar, lambda dumper, value: dumper.represent_data(value.item()))
+        _scalar, lambda dumper, value: dumper.represent_data(value.item())
+    )
 
 
 def read_yaml(path: str | Path, error: type[FisheyeSvpError]) -> dict[str, Any]:
@@ -250,8 +258,9 @@ def compose_yaml(text: str, where: str | Path, error: type[FisheyeSvpError]) -> 
             if isinstance(event, yaml.AliasEvent):
                 raise _yaml_error('an alias; write out what it stands for', event)
             if depth > _DEEPEST or values > _MOST_VALUES:
-                raise _yaml_error(f'more than {_MOST_VALUES} values, or nested deeper than '
-                               f'{_DEEPEST}', event)
+                raise _yaml_error(
+                    f'more than {_MOST_VALUES} values, or nested deeper than {_DEEPEST}', event
+                )
         node: yaml.Node | None = yaml.compose(text, _Loader)
         _refuse_repeated_keys(node)
     return node
@@ -319,5 +328,7 @@ def _convert_errors(where: str | Path, error: type[FisheyeSvpError]) -> Iterator
         raise error(f'{where}: broken YAML{line}: {problem}') from cause
     except (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError) as cause:
         # What PyYAML lets out for a value that is none of its own tag
-        raise error(f'{where}: broken YAML: a value is not what it is tagged as, or has too many '
-                    f'digits ({cause})') from cause
+        raise error(
+            f'{where}: broken YAML: a value is not what it is tagged as, or has too many '
+            f'digits ({cause})'
+        ) from cause

@@ -16,7 +16,12 @@ _NAMES = ('map1', 'map2', 'mask', 'K', 'R', 'P')
 
 
 def save_maps(
-    folder: Path, u: NDArray[np.float32], v: NDArray[np.float32], mask: Mask, k: Array, r: Array,
+    folder: Path,
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    mask: Mask,
+    k: Array,
+    r: Array,
     p: Array,
 ) -> None:
     """Write maps.npz and maps.yml: map1, map2 and mask (H, W), K (3, 3), R (3, 3), P (3, 4).
@@ -41,6 +46,11 @@ def write_png(path: Path, pixels: NDArray[Any]) -> None:
 def to_color(pixels: NDArray[Any], zoom: float = 1.0) -> NDArray[np.uint8]:
     """Return an image of any depth as 8 bits of blue, green and red, resized."""
     scale = 255 / max(float(pixels.max()), 1.0) if pixels.dtype != np.uint8 else 1.0
-    image = cv2.resize(cv2.convertScaleAbs(pixels, alpha=scale), None, fx=zoom, fy=zoom,
-                       interpolation=cv2.INTER_AREA)
+    image = cv2.resize(
+        cv2.convertScaleAbs(pixels, alpha=scale),
+        None,
+        fx=zoom,
+        fy=zoom,
+        interpolation=cv2.INTER_AREA,
+    )
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image)

@@ -35,11 +35,14 @@ def environment(spread: str, radius: float, layout: str | Path | None = None) ->
         raise ObservationError(
             f'{path}: inner and outer must each be a list of [incidence_deg, azimuth_deg]'
         ) from cause
-    directions = np.stack([
-        np.sin(incidence) * np.cos(azimuth),
-        np.sin(incidence) * np.sin(azimuth),
-        -np.cos(incidence),
-    ], axis=-1)
+    directions = np.stack(
+        [
+            np.sin(incidence) * np.cos(azimuth),
+            np.sin(incidence) * np.sin(azimuth),
+            -np.cos(incidence),
+        ],
+        axis=-1,
+    )
     chosen = np.repeat([spread in ('whole', 'inner'), spread in ('whole', 'outer')], counts)
     landmarks = Landmarks(np.flatnonzero(chosen), radius * directions[chosen])
     return check_landmarks(landmarks, str(path))

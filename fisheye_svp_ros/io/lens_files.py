@@ -34,8 +34,18 @@ from fisheye_svp_ros.registry import Registry
 
 C = TypeVar('C', bound=Curve)
 
-_FIELDS = {'name', 'image', 'projection', 'max_incidence_deg', 'viewpoint_shift', 'corrections',
-           'target', 'calibration', 'uncertainty', 'provenance'}
+_FIELDS = {
+    'name',
+    'image',
+    'projection',
+    'max_incidence_deg',
+    'viewpoint_shift',
+    'corrections',
+    'target',
+    'calibration',
+    'uncertainty',
+    'provenance',
+}
 MAX_LENS_BYTES = 1 << 26  # bytes; a .cameramodel may hold all that it was fitted to
 _MAX_NUMBER = 1e12  # any number of a lens
 _DEPTH = 3  # folders, one in the other
@@ -56,16 +66,19 @@ def load_lens(path: str | Path) -> Lens:
     foreign = read_foreign(path, text)
     if foreign is None and not camera:
         if not OWN_SECTIONS.search(text):
-            raise LensError(f'{path}: not a lens file: it has no projection, and no format of '
-                            f'{READABLE}')
+            raise LensError(
+                f'{path}: not a lens file: it has no projection, and no format of {READABLE}'
+            )
         return lens_from_dict(parse_yaml(text, path, LensError), str(path))
     lenses = foreign.lenses if foreign else {}
     if foreign and not lenses:
         raise LensError(f'{path}: it holds a rig, but no lens')
     camera = camera or next(iter(lenses), '')
     if camera not in lenses:
-        raise LensError(f'{path}: no camera {camera!r} in it; it has '
-                        + (', '.join(lenses) or 'one without a name'))
+        raise LensError(
+            f'{path}: no camera {camera!r} in it; it has '
+            + (', '.join(lenses) or 'one without a name')
+        )
     return lenses[camera]
 
 
@@ -110,10 +123,12 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
         **_projection(_section(document, 'projection', where), f'{where}: projection'),
         max_incidence=np.nan,
         viewpoint_shift=_viewpoint_shift(document.get('viewpoint_shift'), where),
-        port=None if PORT not in own else _curve(
-            own[PORT], PORTS, '', 0, f'{where}: corrections.port'),
-        image_field=None if IMAGE_FIELD not in own else ImageField.from_dict(
-            own[IMAGE_FIELD], where),
+        port=None
+        if PORT not in own
+        else _curve(own[PORT], PORTS, '', 0, f'{where}: corrections.port'),
+        image_field=None
+        if IMAGE_FIELD not in own
+        else ImageField.from_dict(own[IMAGE_FIELD], where),
         target=target,
         calibration=_mapping(document, 'calibration', where),
         uncertainty=_mapping(document, 'uncertainty', where),
@@ -142,8 +157,9 @@ def lens_to_dict(lens: Lens) -> dict[str, Any]:
         'max_incidence_deg': float(np.degrees(lens.max_incidence)),
     }
     if lens.viewpoint_shift is not None:
-        parts = [_curve_to_dict(part, VIEWPOINT_SHIFTS, 'e')
-                 for part in lens.viewpoint_shift.summands()]
+        parts = [
+            _curve_to_dict(part, VIEWPOINT_SHIFTS, 'e') for part in lens.viewpoint_shift.summands()
+        ]
         document['viewpoint_shift'] = parts if len(parts) > 1 else parts[0]
     own = {} if lens.port is None else {PORT: _curve_to_dict(lens.port, PORTS, '')}
     own |= lens.corrections
@@ -164,12 +180,15 @@ def _read(path: str | Path) -> tuple[str, str]:
         lenses = _in_folder(Path(file))
         camera = camera or next(iter(lenses))
         if camera not in lenses:
-            raise LensError(f'{file}: no lens of camera {camera!r} in it; there are '
-                            + ', '.join(lenses))
+            raise LensError(
+                f'{file}: no lens of camera {camera!r} in it; there are ' + ', '.join(lenses)
+            )
         file, camera = str(lenses[camera]), ''
     if Path(file).name == _COLMAP_BINARY and Path(file).is_file():
-        raise LensError(f"{file}: COLMAP's binary form cannot be read; write cameras.txt with "
-                        'colmap model_converter --output_type TXT')
+        raise LensError(
+            f"{file}: COLMAP's binary form cannot be read; write cameras.txt with "
+            'colmap model_converter --output_type TXT'
+        )
     return read_text(file, LensError, MAX_LENS_BYTES), camera
 
 
@@ -179,16 +198,23 @@ def _in_folder(folder: Path) -> dict[str, Path]:
     # Names of cameras may have slashes, and then their files are further down.
     for depth in range(_DEPTH):
         above = '*/' * depth
-        found = found or {
-            str(file.relative_to(folder).with_suffix('')): file
-            for file in sorted(folder.glob(f'{above}*.yaml')) if file.stem not in FILES_OF_RIG
-        } or {
-            str(file.parent.relative_to(folder)): file
-            for file in sorted(folder.glob(f'{above}*/extended_lens.yaml'))
-        }
+        found = (
+            found
+            or {
+                str(file.relative_to(folder).with_suffix('')): file
+                for file in sorted(folder.glob(f'{above}*.yaml'))
+                if file.stem not in FILES_OF_RIG
+            }
+            or {
+                str(file.parent.relative_to(folder)): file
+                for file in sorted(folder.glob(f'{above}*/extended_lens.yaml'))
+            }
+        )
     if not found:
-        raise LensError(f'{folder}: a folder without lenses; those of a rig are CAMERA.yaml or '
-                        'CAMERA/extended_lens.yaml')
+        raise LensError(
+            f'{folder}: a folder without lenses; those of a rig are CAMERA.yaml or '
+            'CAMERA/extended_lens.yaml'
+        )
     return found
 
 
@@ -217,7 +243,10 @@ def _viewpoint_shift(section: Any, where: str) -> ViewpointShift | None:
 
 
 def _curve(
-    section: Mapping[str, Any], registry: Mapping[str, type[C]], listed: str, first: int,
+    section: Mapping[str, Any],
+    registry: Mapping[str, type[C]],
+    listed: str,
+    first: int,
     where: str,
 ) -> C:
     """Return the curve of a section; a list stands for coefficients numbered from `first`."""
@@ -233,8 +262,11 @@ def _curve(
         raise LensError(f'{where}.{listed} has {len(numbered)} values; this model takes {most}')
     values |= {f'{listed}{i}': value for i, value in enumerate(numbered, start=first)}
     _refuse_unknown(values, set(known), where)
-    missing = [one.name for one in signature(kind).parameters.values()
-               if one.name in known and one.default is one.empty and one.name not in values]
+    missing = [
+        one.name
+        for one in signature(kind).parameters.values()
+        if one.name in known and one.default is one.empty and one.name not in values
+    ]
     if missing:
         raise LensError(f'{where}: incomplete; add {", ".join(missing)}')
     return kind(**{name: _number(values, name, where) for name in values})
@@ -249,12 +281,20 @@ def _curve_to_dict(curve: Curve, registry: Registry[Any], listed: str) -> dict[s
 
 def _effects(document: Mapping[str, Any], name: str, where: str) -> dict[str, Any]:
     section = document.get(name) or {}
-    wrong = [f'.{key}' for key, entry in section.items()
-             if key != LANDMARKS and not isinstance(entry, dict)
-             ] if isinstance(section, dict) else ['']
+    wrong = (
+        [
+            f'.{key}'
+            for key, entry in section.items()
+            if key != LANDMARKS and not isinstance(entry, dict)
+        ]
+        if isinstance(section, dict)
+        else ['']
+    )
     if wrong:
-        raise LensError(f'{where}: {name}{wrong[0]}: {name} must map each effect name to its '
-                        'parameters, as in decentering: {parameters: {p1: 0.001, p2: 0.0}}')
+        raise LensError(
+            f'{where}: {name}{wrong[0]}: {name} must map each effect name to its '
+            'parameters, as in decentering: {parameters: {p1: 0.001, p2: 0.0}}'
+        )
     return section
 
 
@@ -278,7 +318,8 @@ def _number(mapping: Mapping[str, Any], name: str, where: str) -> float:
         raise LensError(f'{where}: {name} is {value!r}; a number is needed')
     if not abs(value) < _MAX_NUMBER:
         raise LensError(
-            f'{where}: {name} is {value}; a finite number is needed, below {_MAX_NUMBER:g}')
+            f'{where}: {name} is {value}; a finite number is needed, below {_MAX_NUMBER:g}'
+        )
     return float(value)
 
 
@@ -300,5 +341,6 @@ def _refuse_unknown(
 ) -> None:
     unknown = sorted(set(map(str, mapping)) - known - unsaid)
     if unknown:
-        raise LensError(f'{where}: unknown field {unknown[0]!r}; known are '
-                        + ', '.join(sorted(known)))
+        raise LensError(
+            f'{where}: unknown field {unknown[0]!r}; known are ' + ', '.join(sorted(known))
+        )

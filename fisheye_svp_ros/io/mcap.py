@@ -32,11 +32,14 @@ _HEAD = struct.Struct('<BQ')  # of a record: opcode, length
 
 _Note = Callable[[str], None]
 _Passed = Callable[[int], None]
-_MESSAGES = ('SELECT name, type, timestamp, data FROM messages CROSS JOIN topics '
-             'ON topics.id = topic_id ORDER BY timestamp, messages.id')
+_MESSAGES = (
+    'SELECT name, type, timestamp, data FROM messages CROSS JOIN topics '
+    'ON topics.id = topic_id ORDER BY timestamp, messages.id'
+)
 _COMPUTED_CELLS = (
     'SELECT 1 FROM sqlite_master AS m, pragma_table_xinfo(m.name) AS c WHERE c.hidden '
-    "OR m.type = 'view' OR m.sql LIKE 'CREATE VIRTUAL %' LIMIT 1")
+    "OR m.type = 'view' OR m.sql LIKE 'CREATE VIRTUAL %' LIMIT 1"
+)
 _COLUMN_TYPES = [str, str, int, bytes]
 
 
@@ -71,8 +74,11 @@ def listed_topics(path: Path) -> set[tuple[str, str]]:
         summary = _summary(stream)
     if summary is None:
         return set()
-    return {(channel.topic, schema.name) for channel in summary.channels.values()
-            if (schema := summary.schemas.get(channel.schema_id))}
+    return {
+        (channel.topic, schema.name)
+        for channel in summary.channels.values()
+        if (schema := summary.schemas.get(channel.schema_id))
+    }
 
 
 def _batches(path: Path, note: _Note, passed: _Passed) -> Iterator[list[RawMessage]]:
@@ -163,7 +169,7 @@ def _contents(body: bytes, where: str, note: _Note) -> list[Any]:
         opcode, length = _HEAD.unpack_from(data, place)
         place += _HEAD.size + length
         if place <= len(data):
-            records += _parse_record(opcode, data[place - length:place], where, note)
+            records += _parse_record(opcode, data[place - length : place], where, note)
     return records
 
 
@@ -190,8 +196,11 @@ def _decompress(chunk: Chunk) -> bytes:
 def _parse_record(opcode: int, body: bytes, where: str, note: _Note) -> list[Any]:
     """Return the record of a body in a list; empty for one that tells nothing of messages."""
     stream = ReadDataStream(BytesIO(body))
-    kinds: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel,
-                             Opcode.STATISTICS: Statistics}
+    kinds: dict[int, Any] = {
+        Opcode.SCHEMA: Schema,
+        Opcode.CHANNEL: Channel,
+        Opcode.STATISTICS: Statistics,
+    }
     try:
         if opcode == Opcode.MESSAGE:
             return [Message.read(stream, len(body))]
@@ -221,8 +230,10 @@ def database_messages(
 def database_topics(path: Path) -> set[tuple[str, str]]:
     """Return the topics and types that a database lists; empty where it cannot be read."""
     with suppress(sqlite3.Error, BagError), closing(_connect(path)) as database:
-        return {(str(topic), str(kind)) for topic, kind in
-                database.execute('SELECT name, type FROM topics')}
+        return {
+            (str(topic), str(kind))
+            for topic, kind in database.execute('SELECT name, type FROM topics')
+        }
     return set()
 
 

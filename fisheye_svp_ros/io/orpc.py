@@ -137,8 +137,10 @@ def _read_corners(path: Path, boards: dict[int, Board]) -> Array:
             )
         rows.append(row)
     if promised != len(rows):
-        raise ObservationError(f'{path}: num_corners is {promised}, but {len(rows)} corners are '
-                               'in it; the file is damaged')
+        raise ObservationError(
+            f'{path}: num_corners is {promised}, but {len(rows)} corners are '
+            'in it; the file is damaged'
+        )
     places = [tuple(row[:2]) for row in rows]
     if len(set(places)) < len(places):
         raise ObservationError(f'{path}: it has a corner twice')
@@ -150,10 +152,12 @@ def _image_times(files: list[Path], dataset: Path) -> Array:
     mine = [_time(file) for file in files]
     everywhere = [_time(file) for file in dataset.rglob('*.orpc')]
     known = [time for time in (*mine, *everywhere) if time is not None]
-    return np.array([
-        np.nan if time is None or None in mine else (time - min(known)).total_seconds()
-        for time in mine
-    ])
+    return np.array(
+        [
+            np.nan if time is None or None in mine else (time - min(known)).total_seconds()
+            for time in mine
+        ]
+    )
 
 
 def _time(file: Path) -> datetime | None:
@@ -177,8 +181,10 @@ def _lines(path: Path, separator: str | None = ',') -> list[tuple[int, list[str]
 def _parse_int(path: Path, line: int, field: str) -> int:
     value = _numbers(path, line, [field])[0]
     if not (value.is_integer() and 0 <= value <= MOST_LANDMARK):
-        raise ObservationError(f'{path}, line {line}: {field.strip()!r} is not a whole number '
-                               f'from 0 to {MOST_LANDMARK}')
+        raise ObservationError(
+            f'{path}, line {line}: {field.strip()!r} is not a whole number '
+            f'from 0 to {MOST_LANDMARK}'
+        )
     return int(value)
 
 

@@ -80,14 +80,19 @@ class Row(NamedTuple):
         if outside or (self.choices and value not in self.choices):
             raise ParameterError(f'{self.name} is {value!r}; allowed is {self.constraint()}')
         if self.frame and re.search(r'^/|\s', value):  # which tf2 refuses, message by message
-            raise ParameterError(f'{self.name} is {value!r}; a frame id begins without a slash '
-                                 'and holds no blanks')
+            raise ParameterError(
+                f'{self.name} is {value!r}; a frame id begins without a slash and holds no blanks'
+            )
         return value
 
 
 def parameter(
-    default: Any, description: str, unit: str = '', span: tuple[Any, Any] = (None, None),
-    choices: tuple[str, ...] = (), **flags: bool
+    default: Any,
+    description: str,
+    unit: str = '',
+    span: tuple[Any, Any] = (None, None),
+    choices: tuple[str, ...] = (),
+    **flags: bool,
 ) -> Any:
     """Return a dataclass field that is a row of the table; span: smallest and largest value.
 
@@ -135,24 +140,26 @@ class Sweep:
         return {name: values[name] for name in self.lists}
 
 
-def sweep_of(
-    table: Any, parameters: Mapping[str, Any], excluded: Collection[str] = ()
-) -> Sweep:
+def sweep_of(table: Any, parameters: Mapping[str, Any], excluded: Collection[str] = ()) -> Sweep:
     """Return the sweep that the `sweep.<parameter>` entries of a parameter file ask for.
 
     excluded: parameters that cannot be swept.
     Raises ParameterError for an unknown parameter, an empty list or a value that is not allowed.
     """
-    known = {row.name: row for row in rows(table)
-             if not isinstance(row.default, tuple) and row.name not in excluded}
+    known = {
+        row.name: row
+        for row in rows(table)
+        if not isinstance(row.default, tuple) and row.name not in excluded
+    }
     lists = {}
     for name, values in parameters.items():
         if not name.startswith(SWEEP):
             continue
         row = known.get(name.removeprefix(SWEEP))
         if row is None:
-            raise ParameterError(f'{name}: no such parameter to sweep; known are '
-                                 + ', '.join(known))
+            raise ParameterError(
+                f'{name}: no such parameter to sweep; known are ' + ', '.join(known)
+            )
         if values is None:  # as a parameter file has an empty list
             values = []
         if isinstance(values, str) or not isinstance(values, Sequence) or not len(values):
@@ -199,11 +206,16 @@ def _flatten(node: yaml.Node, prefix: str) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for key, value in _items(node):
         name = f'{prefix}{key}'
-        new = (_flatten(value, f'{name}.') if isinstance(value, yaml.MappingNode)
-               else {name: _value(value)})
+        new = (
+            _flatten(value, f'{name}.')
+            if isinstance(value, yaml.MappingNode)
+            else {name: _value(value)}
+        )
         if new.keys() & values.keys():
-            raise ValueError(f'{min(new.keys() & values.keys())!r} is listed twice, the second '
-                             f'time in line {value.start_mark.line + 1}')
+            raise ValueError(
+                f'{min(new.keys() & values.keys())!r} is listed twice, the second '
+                f'time in line {value.start_mark.line + 1}'
+            )
         values |= new
     return values
 

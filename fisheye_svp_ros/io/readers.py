@@ -27,24 +27,31 @@ from fisheye_svp_ros.scene.observations import Observations
 
 Sizes = dict[str, tuple[int, int]]  # width and height, px, by camera
 __all__ = [
-    'READERS', 'FramePoses', 'Reader', 'read_observations', 'read_poses', 'write_observations',
+    'READERS',
+    'FramePoses',
+    'Reader',
+    'read_observations',
+    'read_poses',
+    'write_observations',
     'write_poses',
 ]
 
 
-def photographs_beside(
-    path: Path, cameras: Sequence[str]
-) -> tuple[tuple[int, str, str], ...]:
+def photographs_beside(path: Path, cameras: Sequence[str]) -> tuple[tuple[int, str, str], ...]:
     """Return frame, camera and path of the photographs that `detect` wrote beside observations."""
     beside = path.with_suffix('.detect.json')
     if not beside.exists():
         return ()
     try:
-        entries = [(int(one['frame']), str(one['camera']), str(one['name']))
-                   for one in read_json(beside, ObservationError).get('photographs', ())]
+        entries = [
+            (int(one['frame']), str(one['camera']), str(one['name']))
+            for one in read_json(beside, ObservationError).get('photographs', ())
+        ]
     except (KeyError, TypeError, ValueError) as cause:
-        raise ObservationError(f'{beside}: photographs is not a list of name, camera and frame '
-                               f'({cause}); run `fisheye-svp detect` again') from cause
+        raise ObservationError(
+            f'{beside}: photographs is not a list of name, camera and frame '
+            f'({cause}); run `fisheye-svp detect` again'
+        ) from cause
     return tuple(one for one in entries if one[0] >= 0 and one[1] in cameras)
 
 
@@ -74,9 +81,11 @@ def check_sizes(path: str, sizes: Sizes, lenses: Mapping[str, Lens]) -> None:
     for camera, lens in lenses.items():
         size = sizes.get(camera) or sizes.get('')
         if size and size != (lens.width, lens.height):
-            raise LensError(f'{path}: images are {size[0]}x{size[1]} px, lens {lens.name!r} is '
-                            f'for {lens.width}x{lens.height} px; give the lens of this camera at '
-                            'this size')
+            raise LensError(
+                f'{path}: images are {size[0]}x{size[1]} px, lens {lens.name!r} is '
+                f'for {lens.width}x{lens.height} px; give the lens of this camera at '
+                'this size'
+            )
 
 
 def check_size_given(path: str, sizes: Sizes, given: Sizes, name: str) -> None:
@@ -84,8 +93,10 @@ def check_size_given(path: str, sizes: Sizes, given: Sizes, name: str) -> None:
     for camera, (width, height) in (sizes or sizes_beside(Path(path))).items():
         size = given.get(camera) or given.get('') or (width, height)
         if size != (width, height):
-            raise ParameterError(f'{path}: images are {width}x{height} px, {name} is '
-                                 f'{size[0]}x{size[1]}; give the size of the images')
+            raise ParameterError(
+                f'{path}: images are {width}x{height} px, {name} is '
+                f'{size[0]}x{size[1]}; give the size of the images'
+            )
 
 
 class Reader(NamedTuple):
@@ -97,16 +108,25 @@ class Reader(NamedTuple):
 
 
 _PACKAGE = 'fisheye_svp_ros.io'
-READERS: Registry[Reader] = Registry('readers', {
-    reader.form: reader for reader in (
-        Reader('a .csv file', lambda path: path.suffix.lower() == '.csv',
-               f'{_PACKAGE}.csv_files'),
-        Reader('an .orpc file', lambda path: path.suffix == '.orpc', f'{_PACKAGE}.orpc'),
-        Reader('a folder of .orpc files',
-               lambda path: path.is_dir() and any(path.glob('*.orpc')), f'{_PACKAGE}.orpc'),
-        Reader('a rosbag2 recording', is_recording, f'{_PACKAGE}.recording'),
-    )
-}, Reader)
+READERS: Registry[Reader] = Registry(
+    'readers',
+    {
+        reader.form: reader
+        for reader in (
+            Reader(
+                'a .csv file', lambda path: path.suffix.lower() == '.csv', f'{_PACKAGE}.csv_files'
+            ),
+            Reader('an .orpc file', lambda path: path.suffix == '.orpc', f'{_PACKAGE}.orpc'),
+            Reader(
+                'a folder of .orpc files',
+                lambda path: path.is_dir() and any(path.glob('*.orpc')),
+                f'{_PACKAGE}.orpc',
+            ),
+            Reader('a rosbag2 recording', is_recording, f'{_PACKAGE}.recording'),
+        )
+    },
+    Reader,
+)
 
 
 def read_observations(path: str | Path) -> Observations:

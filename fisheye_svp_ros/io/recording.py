@@ -73,8 +73,11 @@ def tabulate(records: Iterable[Any]) -> Columns:
     rows = {key: dict(values) for key, values in tags.items()}
     for node, stamp, values in results:
         # A node belongs to the scenario of the longest namespace that holds it.
-        base = max((base for base in bases if node.startswith(f'{base}/')), key=len,
-                   default=node.rpartition('/')[0])
+        base = max(
+            (base for base in bases if node.startswith(f'{base}/')),
+            key=len,
+            default=node.rpartition('/')[0],
+        )
         prefix = node.removeprefix(f'{base}/')
         row = rows.setdefault((base, stamp), {})
         row.update({f'{prefix}.{key}': value for key, value in values.items()})
@@ -84,8 +87,10 @@ def tabulate(records: Iterable[Any]) -> Columns:
 def _columns(rows: Mapping[tuple[str, int], Mapping[str, str]]) -> Columns:
     order = sorted(rows)
     names = dict.fromkeys(name for key in order for name in rows[key])
-    columns: Columns = {NAMESPACE: [base or '/' for base, _ in order],
-                        STAMP: [stamp for _, stamp in order]}
+    columns: Columns = {
+        NAMESPACE: [base or '/' for base, _ in order],
+        STAMP: [stamp for _, stamp in order],
+    }
     for name in names:
         columns[name] = parse_cells([rows[key].get(name) for key in order])
     return columns
@@ -108,8 +113,9 @@ def residual_sets(records: Iterable[Any]) -> list[ResidualSet]:
         else:
             clouds[record.topic, when] = read_residuals(record.message, record.topic)
     return [
-        ResidualSet(topic, when, points,
-                    tags.get((topic.removesuffix('/localizer/residuals'), when), {}))
+        ResidualSet(
+            topic, when, points, tags.get((topic.removesuffix('/localizer/residuals'), when), {})
+        )
         for (topic, when), points in sorted(clouds.items(), key=lambda item: item[0])
     ]
 
@@ -131,7 +137,8 @@ def read(path: str | Path) -> Observations:
     worlds: set[str] = set()
     sets: list[_PointSet] = []
     for record in bag.records(
-            lambda topic, kind: topic.rpartition('/')[2] in _NAMES and kind == _CLOUD):
+        lambda topic, kind: topic.rpartition('/')[2] in _NAMES and kind == _CLOUD
+    ):
         namespace, _, name = record.topic.rpartition('/')
         where = f'{path}, {record.topic}'
         stamp = stamp_of(record.message, where)
@@ -141,8 +148,10 @@ def read(path: str | Path) -> Observations:
         else:
             sets.append(_PointSet(stamp, namespace, read_image_points(record.message, where)))
     if len(worlds) != 1 or not sets:
-        raise ObservationError(f'{path}: observations need image_points and landmarks of one '
-                               f'namespace; {_topics_present(bag, worlds)}')
+        raise ObservationError(
+            f'{path}: observations need image_points and landmarks of one '
+            f'namespace; {_topics_present(bag, worlds)}'
+        )
     return _table(sorted(sets, key=lambda one: one[:2]), landmarks, worlds.pop(), str(path))
 
 

@@ -19,9 +19,13 @@ def is_recording(path: Path) -> bool:
 
 def recording_files(path: Path) -> list[Path]:
     """Return the files of a recording, by the numbers in their names; a file is one, whatever."""
-    return sorted(_files_in(path) if path.is_dir() else [path], key=lambda file: [
-        (int(word), '') if word.isdecimal() else (0, word)
-        for word in re.split(r'(\d+)', file.name)])
+    return sorted(
+        _files_in(path) if path.is_dir() else [path],
+        key=lambda file: [
+            (int(word), '') if word.isdecimal() else (0, word)
+            for word in re.split(r'(\d+)', file.name)
+        ],
+    )
 
 
 def metadata_topics(folder: Path) -> set[tuple[str, str]]:

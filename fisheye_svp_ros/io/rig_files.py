@@ -14,28 +14,41 @@ from fisheye_svp_ros.pose import Pose, identity, quaternion_from_rotation
 from fisheye_svp_ros.scene.observations import STEREO
 
 
-def save_rig(rig: Pose | Sequence[Pose], path: str | Path,
-             cameras: Sequence[str] = STEREO) -> None:
+def save_rig(
+    rig: Pose | Sequence[Pose], path: str | Path, cameras: Sequence[str] = STEREO
+) -> None:
     """Write each camera in the next one: position, m, and quaternion x, y, z, w.
 
     rig: the first camera in the second, or so many as there are cameras after the first.
     """
     steps = [rig] if isinstance(rig, Pose) else rig
-    write_text(path, dump_yaml({key: {
-        'position': step.position.tolist(),
-        'quaternion': quaternion_from_rotation(step.rotation).tolist(),
-    } for key, step in zip(pose_keys(cameras), steps, strict=True)}))
+    write_text(
+        path,
+        dump_yaml(
+            {
+                key: {
+                    'position': step.position.tolist(),
+                    'quaternion': quaternion_from_rotation(step.rotation).tolist(),
+                }
+                for key, step in zip(pose_keys(cameras), steps, strict=True)
+            }
+        ),
+    )
 
 
 def check_camera_names(cameras: Sequence[str], chain: Sequence[str], where: str) -> None:
     """Raise LensError for cameras, or a chain of some of them, that rig files cannot hold."""
     if taken := [name for name in cameras if name in FILES_OF_RIG]:
-        raise LensError(f'{where}: camera {taken[0]!r} has the name of a file of the rig, '
-                        f'{taken[0]}.yaml; rename the camera, for example {taken[0]}0')
+        raise LensError(
+            f'{where}: camera {taken[0]!r} has the name of a file of the rig, '
+            f'{taken[0]}.yaml; rename the camera, for example {taken[0]}0'
+        )
     if len(chain) > 1 and cameras_of(pose_keys(chain)) != tuple(chain):
         named = ', '.join(name for name in chain if SEPARATOR in name)
-        raise LensError(f'{where}: camera {named}: with {SEPARATOR} in its name, rig.yaml does '
-                        'not say which camera is in which; rename it')
+        raise LensError(
+            f'{where}: camera {named}: with {SEPARATOR} in its name, rig.yaml does '
+            'not say which camera is in which; rename it'
+        )
 
 
 def load_rigs(path: str | Path) -> tuple[Pose, ...]:
@@ -81,8 +94,10 @@ def load_pair(path: str | Path, cameras: Sequence[str]) -> Pose:
     if len(names) == 2 and tuple(cameras) != names[::-1]:
         return steps[0]
     if unknown := [name for name in cameras if name not in names]:
-        raise LensError(f'{path}: a rig of {", ".join(names)}, without {unknown[0]}; give the '
-                        'lenses of two of these, by their names')
+        raise LensError(
+            f'{path}: a rig of {", ".join(names)}, without {unknown[0]}; give the '
+            'lenses of two of these, by their names'
+        )
     places = cameras_in_first(steps)
     first, second = (places.take(names.index(name)) for name in cameras)
     return second.inverse().compose(first)
@@ -110,8 +125,10 @@ def _read_chain(path: str | Path) -> tuple[tuple[str, ...], tuple[Pose, ...]]:
     held = _read_rig(path)
     names = held.cameras or tuple(held.lenses) or STEREO
     if len(names) != len(held.rigs) + 1:
-        raise LensError(f'{path}: {len(names)} cameras, and {len(held.rigs)} transforms between '
-                        'them; each camera in the next one is needed')
+        raise LensError(
+            f'{path}: {len(names)} cameras, and {len(held.rigs)} transforms between '
+            'them; each camera in the next one is needed'
+        )
     return names, held.rigs
 
 

@@ -45,8 +45,10 @@ def _given_or_named(name: str, folder: str, error: type[FisheyeSvpError]) -> Pat
         return given
     if not is_there(named, Path.is_file):
         if given.is_dir():
-            raise error(f'{name!r} is a folder, and not one of the {folder} of this package; '
-                        f'write {name}/ for the folder')
+            raise error(
+                f'{name!r} is a folder, and not one of the {folder} of this package; '
+                f'write {name}/ for the folder'
+            )
         known = ', '.join(sorted(path.stem for path in config_path(folder).glob('*.yaml')))
         raise error(f'{name!r} is neither a file nor one of the {folder} of this package: {known}')
     return named
@@ -59,7 +61,7 @@ def without_camera(name: str) -> tuple[str, str]:
     """
     for place in [*(i for i, letter in enumerate(name) if letter == '#'), len(name)]:
         if is_there(Path(name[:place])):
-            return name[:place], name[place + 1:]
+            return name[:place], name[place + 1 :]
     file, _, camera = name.rpartition('#') if '#' in name else (name, '', '')
     return file, camera
 

@@ -40,9 +40,7 @@ _R = TypeVar('_R')
 LAMBDA_ABSENT = 1e12  # lambda of a component without variance
 
 
-def map_in_threads(
-    function: Callable[[_T], _R], items: Iterable[_T], products: float
-) -> list[_R]:
+def map_in_threads(function: Callable[[_T], _R], items: Iterable[_T], products: float) -> list[_R]:
     """Return what a function makes of items, on all cores where that is worth it.
 
     products: of numbers, in all; NumPy lets go of the interpreter for them.
@@ -58,7 +56,8 @@ def solve_lower(root: Array, right: Array, trans: Literal[0, 1] = 0) -> Array:
     if not len(root):
         return right
     return np.asarray(
-        linalg.solve_triangular(root, right, lower=True, trans=trans, check_finite=False))
+        linalg.solve_triangular(root, right, lower=True, trans=trans, check_finite=False)
+    )
 
 
 def solve_upper(factor: Array, right: Array) -> Array:
@@ -171,8 +170,12 @@ class Equations:
         else:
             width, units = int(r[: groups * self.width].sum()) // groups, blocks
         chosen = Blocks(
-            b.ee[np.ix_(blocks, e, e)], b.er[np.ix_(blocks, e, r)], b.rr[np.ix_(r, r)],
-            b.ex[np.ix_(blocks, e)], b.rx[r], b.xx,
+            b.ee[np.ix_(blocks, e, e)],
+            b.er[np.ix_(blocks, e, r)],
+            b.rr[np.ix_(r, r)],
+            b.ex[np.ix_(blocks, e)],
+            b.rx[r],
+            b.xx,
             np.where(present[b.e_label], b.e_label, ABSENT)[np.ix_(blocks, e)],
             np.where(present[b.r_label], b.r_label, ABSENT)[r],
         )
@@ -182,11 +185,14 @@ class Equations:
         """Return the equations with a shared component before the fixed columns, no prior."""
         b, mine = self.blocks, self.blocks.r_label == kind
         blocks = Blocks(
-            b.ee, b.er[..., ~mine], b.rr[np.ix_(~mine, ~mine)],
+            b.ee,
+            b.er[..., ~mine],
+            b.rr[np.ix_(~mine, ~mine)],
             np.concatenate([b.er[..., mine], b.ex], axis=-1),
             np.concatenate([b.rr[np.ix_(~mine, mine)], b.rx[~mine]], axis=-1),
             np.block([[b.rr[np.ix_(mine, mine)], b.rx[mine]], [b.rx[mine].T, b.xx]]),
-            b.e_label, b.r_label[~mine],
+            b.e_label,
+            b.r_label[~mine],
         )
         return replace(self, blocks=blocks)
 
@@ -232,8 +238,7 @@ class Equations:
         if not self.by_group:
             return e
         count = len(self.units)
-        return r[len(r) - self.unit_width * count :].reshape(
-            count, self.unit_width, *r.shape[1:])
+        return r[len(r) - self.unit_width * count :].reshape(count, self.unit_width, *r.shape[1:])
 
 
 def make_equations(random: RandomColumns, group_fixed: Array, border: Array) -> Equations:
@@ -253,13 +258,24 @@ def make_equations(random: RandomColumns, group_fixed: Array, border: Array) -> 
     by_group = groups * (width - numerous) >= unit_label.size
     group_label = np.concatenate([np.full(fixed, FIXED), random.group_label])
     blocks = arrange_blocks(
-        products, np.broadcast_to(group_label, (groups, width)), unit_label,
-        random.shared_label, by_group,
+        products,
+        np.broadcast_to(group_label, (groups, width)),
+        unit_label,
+        random.shared_label,
+        by_group,
     )
     rows = int((np.abs(group_fixed).sum(axis=-1) + np.abs(border).sum(axis=-1) > 0).sum())
     return Equations(
-        blocks, random.components, by_group, rows, int(np.isfinite(scale).sum()), scale, width,
-        np.arange(len(unit_label)), unit_label.shape[1])
+        blocks,
+        random.components,
+        by_group,
+        rows,
+        int(np.isfinite(scale).sum()),
+        scale,
+        width,
+        np.arange(len(unit_label)),
+        unit_label.shape[1],
+    )
 
 
 @dataclass(frozen=True)
@@ -340,16 +356,18 @@ class FactoredEquations:
         label = self.equations.label
         squares = np.concatenate([(self.precision[0] * e**2).ravel(), self.precision[1] * r**2])
         random = label >= 0
-        return np.asarray(np.bincount(
-            label[random], weights=squares[random], minlength=self.equations.components.count
-        ), dtype=float)
+        return np.asarray(
+            np.bincount(
+                label[random], weights=squares[random], minlength=self.equations.components.count
+            ),
+            dtype=float,
+        )
 
     def _substitute(self, e: Array, r: Array, x: Array) -> tuple[Array, Array, Array]:
         """Return the right-hand sides (E, k, C), (R, C), (X, C) after forward substitution."""
         first = self.inverse @ e
         flat = first.reshape(-1, first.shape[-1])
-        second = solve_lower(
-            self.factor, r - self.coupled.reshape(len(flat), len(r)).T @ flat)
+        second = solve_lower(self.factor, r - self.coupled.reshape(len(flat), len(r)).T @ flat)
         border = self.block_border.reshape(len(flat), len(x) + 1)[:, :-1]
         return first, second, x - border.T @ flat - self.border[:, :-1].T @ second
 
@@ -382,7 +400,8 @@ def factor_equations(eq: Equations, lam: Array, weight: Array) -> FactoredEquati
 
     cut = len(e) // 2  # most of the time goes here
     (rr, rx), (more, more_border) = map_in_threads(
-        eliminate_blocks, (slice(cut), slice(cut, None)), e.size * len(b.rr) ** 2)
+        eliminate_blocks, (slice(cut), slice(cut, None)), e.size * len(b.rr) ** 2
+    )
     # In place: these may be as large as all else together.
     rr += more
     rx += more_border
@@ -397,4 +416,5 @@ def factor_equations(eq: Equations, lam: Array, weight: Array) -> FactoredEquati
         factor, border = rr, b.rx
     information = b.xx - flat_border.T @ flat_border - border.T @ border
     return FactoredEquations(
-        eq, (e, r), inverse, coupled, block_border, factor, border, information)
+        eq, (e, r), inverse, coupled, block_border, factor, border, information
+    )

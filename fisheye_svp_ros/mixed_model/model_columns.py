@@ -65,14 +65,17 @@ class RandomColumns(NamedTuple):
         unit, values = self.unit[present], self.offset[present]
         column = np.repeat(width * unit[:, None] + np.arange(width), rows, axis=0)
         ends = np.cumsum(np.repeat(width * present, rows))
-        return sparse.csr_array((values.ravel(), column.ravel(), np.append(0, ends)),
-                                (self.unit.size * rows, self.unit_label.size))
+        return sparse.csr_array(
+            (values.ravel(), column.ravel(), np.append(0, ends)),
+            (self.unit.size * rows, self.unit_label.size),
+        )
 
     @property
     def shared_columns(self) -> sparse.csr_array:
         """All shared columns (G M, Q), fields last."""
         return sparse.csr_array(
-            sparse.hstack([self.shared, self.unit_columns @ self.fields], format='csr'))
+            sparse.hstack([self.shared, self.unit_columns @ self.fields], format='csr')
+        )
 
     def select(self, alive: Mask) -> RandomColumns:
         """Return the columns of some of the components (K,) only."""
@@ -80,9 +83,11 @@ class RandomColumns(NamedTuple):
         columns, shared = present[self.group_label], present[self.shared_label]
         count = self.shared.shape[1]
         return self._replace(
-            group=self.group[..., columns], group_label=self.group_label[columns],
+            group=self.group[..., columns],
+            group_label=self.group_label[columns],
             unit_label=np.where(present[self.unit_label], self.unit_label, -1),
-            shared=self.shared[:, shared[:count]], fields=self.fields[:, shared[count:]],
+            shared=self.shared[:, shared[:count]],
+            fields=self.fields[:, shared[count:]],
             shared_label=self.shared_label[shared],
         )
 
@@ -142,8 +147,18 @@ def multiply_columns(random: RandomColumns, group_fixed: Array, border: Array) -
         part[~present.ravel()] = 0.0
     uu *= present[:, :, None] & present[:, None, :]
     of_units = [part.reshape(*present.shape, *part.shape[1:]) for part in (ug, us, ux)]
-    return Products(across @ own, uu, of_units[0], ss, sg, of_units[1], across @ border,
-                    of_units[2], np.concatenate([shared.T @ flat, fx]), flat.T @ flat)
+    return Products(
+        across @ own,
+        uu,
+        of_units[0],
+        ss,
+        sg,
+        of_units[1],
+        across @ border,
+        of_units[2],
+        np.concatenate([shared.T @ flat, fx]),
+        flat.T @ flat,
+    )
 
 
 def _square_offsets(random: RandomColumns) -> Array:
@@ -158,8 +173,9 @@ def _square_offsets(random: RandomColumns) -> Array:
 def _multiply_units(squares: Array, random: RandomColumns) -> Array:
     """Return the products (U w, P) of the offsets of units with the fields."""
     units, width, _ = squares.shape
-    blocks = sparse.bsr_array((squares, np.arange(units), np.arange(units + 1)),
-                              shape=(units * width, units * width))
+    blocks = sparse.bsr_array(
+        (squares, np.arange(units), np.arange(units + 1)), shape=(units * width, units * width)
+    )
     return np.asarray((blocks @ random.fields).toarray())
 
 
@@ -168,8 +184,10 @@ def _multiply_groups(shared: sparse.csr_array, own: Array) -> Array:
     groups, height, width = own.shape
     count = shared.shape[1]
     group = np.repeat(np.arange(groups * height) // height, np.diff(shared.indptr))
-    apart = sparse.csr_array((shared.data, shared.indices + count * group, shared.indptr),
-                             (groups * height, groups * count))
+    apart = sparse.csr_array(
+        (shared.data, shared.indices + count * group, shared.indptr),
+        (groups * height, groups * count),
+    )
     products = apart.T @ own.reshape(groups * height, width)
     return np.moveaxis(products.reshape(groups, count, width), 0, 1)
 
@@ -187,7 +205,11 @@ def multiply_rows(
 
 
 def predict_rows(
-    random: RandomColumns, group_fixed: Array, group: Array, unit: Array, shared: Array,
+    random: RandomColumns,
+    group_fixed: Array,
+    group: Array,
+    unit: Array,
+    shared: Array,
     units: Index,
 ) -> Array:
     """Return what coefficients add to the rows (G, M, C).

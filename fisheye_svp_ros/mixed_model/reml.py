@@ -56,9 +56,11 @@ _UNDECIDED_RATIOS = (2.7, 25.0)  # likelihood ratios between which the other var
 def initial_variances(eq: Equations, share: float = 0.03) -> Variances:
     """Return variances with which every component adds a share of the noise."""
     squares = _sum_by_component(
-        eq, np.diagonal(eq.blocks.ee, axis1=-2, axis2=-1), np.diag(eq.blocks.rr))
+        eq, np.diagonal(eq.blocks.ee, axis1=-2, axis2=-1), np.diag(eq.blocks.rr)
+    )
     counts = _sum_by_component(
-        eq, np.ones(eq.blocks.e_label.shape), np.ones(len(eq.blocks.r_label)))
+        eq, np.ones(eq.blocks.e_label.shape), np.ones(len(eq.blocks.r_label))
+    )
     lam = np.where(counts > 0, squares / share / eq.rows, LAMBDA_ABSENT)
     return Variances(1.0, np.maximum(lam, 1e-9), np.ones(len(eq.units)))
 
@@ -120,13 +122,14 @@ def update_variances(
     lam = np.where(alive, now.lam * np.exp(-change), LAMBDA_ABSENT)
     ceiling = initial_variances(eq, _VANISHING_SHARE).lam
     vanished = (slope < 0) & ((lam > ceiling) | (gamma < 0.3))
-    return Variances(float(np.sqrt(solution.variance)), np.where(vanished, LAMBDA_ABSENT, lam),
-                     _unit_weights(eq, now, solution))
+    return Variances(
+        float(np.sqrt(solution.variance)),
+        np.where(vanished, LAMBDA_ABSENT, lam),
+        _unit_weights(eq, now, solution),
+    )
 
 
-def _newton_step(
-    f: FactoredEquations, solution: Solution, now: Variances, slope: Array
-) -> Array:
+def _newton_step(f: FactoredEquations, solution: Solution, now: Variances, slope: Array) -> Array:
     """Return the change of log tau^2 (K,) by average information, noise profiled out."""
     information = average_information(f, solution)
     free = np.append(now.alive, True)
@@ -199,7 +202,8 @@ def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
     first, numerous = initial_variances(eq, _INITIAL_SHARE), eq.components.numerous
     if before is None:
         p = score_components(
-            eq, no_variances(len(numerous), len(first.weight)), np.flatnonzero(~numerous))
+            eq, no_variances(len(numerous), len(first.weight)), np.flatnonzero(~numerous)
+        )
         lam = np.where(p < _SCREENING_P, first.lam, LAMBDA_ABSENT)
         now, _ = estimate_variances(eq, Variances(1.0, lam, first.weight))
     else:

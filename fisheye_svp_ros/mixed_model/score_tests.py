@@ -71,14 +71,13 @@ def score_each(
         p = special.chdtrc(np.maximum(rank, 1), np.maximum(statistic, 0.0))
         p = np.where(rank > 0, p, 1.0)
         for j, i in enumerate(mine):
-            scores[i] = Score(float(statistic[j]), int(rank[j]), float(p[j]),
-                              estimate[j] / scale[at[j]], np.inf)
+            scores[i] = Score(
+                float(statistic[j]), int(rank[j]), float(p[j]), estimate[j] / scale[at[j]], np.inf
+            )
     return [scores[i] for i in range(len(choices))]
 
 
-def satterthwaite_freedom(
-    f: FactoredEquations, combination: Array, covariance: Array
-) -> float:
+def satterthwaite_freedom(f: FactoredEquations, combination: Array, covariance: Array) -> float:
     """Return the degrees of freedom of the information of a combination (X,) of the border.
 
     covariance: of log tau^2 and, last, log sigma^2.
@@ -226,9 +225,12 @@ def _component_columns(eq: Equations, alive: Mask, kind: int) -> _ComponentColum
     in_r = np.flatnonzero(b.r_label == kind)
     if len(in_r):
         return _ComponentColumns(
-            b.rr[np.ix_(in_r, in_r)][None], np.arange(int(keep.sum())),
-            b.er[..., in_r][keep][:, columns], b.rr[np.ix_(rest, in_r)][:, None],
-            b.rx[in_r].T[:, None])
+            b.rr[np.ix_(in_r, in_r)][None],
+            np.arange(int(keep.sum())),
+            b.er[..., in_r][keep][:, columns],
+            b.rr[np.ix_(rest, in_r)][:, None],
+            b.rx[in_r].T[:, None],
+        )
     mine = b.e_label == kind
     block = np.flatnonzero(mine.any(axis=1))
     if not len(block):
@@ -238,8 +240,7 @@ def _component_columns(eq: Equations, alive: Mask, kind: int) -> _ComponentColum
     place, chosen = np.where(keep, np.cumsum(keep) - 1, -1), np.flatnonzero(columns)
     e = b.ee[block[:, None, None], chosen[:, None], column[:, None]]
     r, x = b.er[block[:, None], column][..., rest], b.ex[block[:, None], column]
-    return _ComponentColumns(
-        own, place[block], e, np.moveaxis(r, -1, 0), np.moveaxis(x, -1, 0))
+    return _ComponentColumns(own, place[block], e, np.moveaxis(r, -1, 0), np.moveaxis(x, -1, 0))
 
 
 def _score(c: _ComponentColumns, solution: Solution) -> Array:

@@ -152,9 +152,7 @@ class Solution(NamedTuple):
     spread_r: Array
 
 
-def solve_equations(
-    f: FactoredEquations, spread: tuple[Array, Array] | None = None
-) -> Solution:
+def solve_equations(f: FactoredEquations, spread: tuple[Array, Array] | None = None) -> Solution:
     """Solve for all coefficients; the border must be of full rank.
 
     spread: their variances, where the solution is to have them.
@@ -186,9 +184,7 @@ def deviance_without(
     return float(f.freedom * growth + logs + np.log(prior).sum())
 
 
-def _whiten_coefficients(
-    posterior: Posterior, mine: Index, values: Array
-) -> tuple[float, float]:
+def _whiten_coefficients(posterior: Posterior, mine: Index, values: Array) -> tuple[float, float]:
     """Return b' inv(S) b of coefficients (n,), by place, and the log determinant of S.
 
     S = D + r r' with D in blocks; of many small blocks nothing so large as S itself is made.
@@ -196,10 +192,12 @@ def _whiten_coefficients(
     root, (count, width, _) = posterior.root[mine], posterior.block.shape
     if mine[0] >= count * width:
         return _whiten(linalg.cholesky(root @ root.T, lower=True), values)
-    block, column = (part.reshape(len(np.unique(mine // width)), -1)
-                     for part in np.divmod(mine, width))
-    own = np.asarray(np.linalg.cholesky(
-        posterior.block[block[:, :, None], column[:, :, None], column[:, None]]))
+    block, column = (
+        part.reshape(len(np.unique(mine // width)), -1) for part in np.divmod(mine, width)
+    )
+    own = np.asarray(
+        np.linalg.cholesky(posterior.block[block[:, :, None], column[:, :, None], column[:, None]])
+    )
     split = np.column_stack([root, values]).reshape(*block.shape, -1)
     both = np.linalg.solve(own, split).reshape(len(mine), -1)
     root, values = both[:, :-1], both[:, -1]
@@ -235,7 +233,8 @@ def solution_without(
     return solution._replace(
         variance=solution.variance + float(half @ half) / max(f.freedom, 1),
         deviance=solution.deviance + ratio,
-        e=solution.e - change[:count].reshape(shape), r=solution.r - change[count:],
+        e=solution.e - change[:count].reshape(shape),
+        r=solution.r - change[count:],
         spread_e=solution.spread_e - less[:count].reshape(shape),
         spread_r=solution.spread_r - less[count:],
     )
@@ -266,8 +265,7 @@ def leave_groups_out(
     e, r = (np.concatenate([root, root @ f.border], axis=1) for root in (e, r))
     group, unit, shared = eq.split(e.reshape(*f.coupled.shape[:2], r.shape[1]), r)
     roots = group, combine_offsets(random, unit, shared, eq.units), shared
-    found = LeaveOneOut(
-        np.empty((len(border), *f.information.shape)), np.zeros_like(border))
+    found = LeaveOneOut(np.empty((len(border), *f.information.shape)), np.zeros_like(border))
 
     def leave_out(group: int) -> None:
         rows = found.rows[group]
@@ -279,8 +277,13 @@ def leave_groups_out(
 
 
 def _leave_out(
-    f: FactoredEquations, roots: tuple[Array, Array, Array], random: RandomColumns, group: int,
-    fixed: Array, border: Array, rows: Array,
+    f: FactoredEquations,
+    roots: tuple[Array, Array, Array],
+    random: RandomColumns,
+    group: int,
+    fixed: Array,
+    border: Array,
+    rows: Array,
 ) -> Array:
     """Write what the others leave of a group's rows (M, X); return it before inv(P_gg), as wide.
 
@@ -304,11 +307,12 @@ def _leave_out(
     root, predicted = np.split(both, [len(f.factor)], axis=1)
     rows_of_unit, width = np.repeat(unit, offset.shape[1])[used], offset.shape[2]
     inside, at_border = _eliminated_products(
-        f, group, own, rows_of_unit, offset.reshape(height, width)[used])
+        f, group, own, rows_of_unit, offset.reshape(height, width)[used]
+    )
     # P of this group's rows, and P border
     p = np.eye(len(used)) - inside - root @ root.T
     remaining = border[used] - at_border - predicted
-    basis, = group_basis(fixed[None, used])
+    (basis,) = group_basis(fixed[None, used])
     remaining -= basis @ (basis.T @ remaining)
     rows[used], found[used] = np.linalg.solve(p + basis @ basis.T, remaining), remaining
     return found
@@ -335,5 +339,7 @@ def _eliminated_products(
         return np.zeros((len(own), len(own))), np.zeros((len(own), f.border.shape[1]))
     step = (f.inverse[unit] @ offset[..., None])[..., 0]
     same = unit[:, None] == unit
-    return (np.where(same, step @ step.T, 0.0),
-            np.einsum('mi,mix->mx', step, f.block_border[unit]))
+    return (
+        np.where(same, step @ step.T, 0.0),
+        np.einsum('mi,mix->mx', step, f.block_border[unit]),
+    )

@@ -61,16 +61,21 @@ class BaseNode(Node):  # type: ignore[misc]
     def __init__(self, node_name: str | None = None, **options: Any) -> None:
         """Create the node; options: as those of rclpy.node.Node, such as its namespace."""
         try:
-            super().__init__(node_name or self.NAME,
-                             automatically_declare_parameters_from_overrides=True, **options)
+            super().__init__(
+                node_name or self.NAME,
+                automatically_declare_parameters_from_overrides=True,
+                **options,
+            )
         except NameValidationException:  # a ValueError, too
             raise
         except ValueError as cause:  # an empty list has no type, and rclpy does not say which
             raise ParameterError(f'parameters: {cause}; a list must not be empty') from cause
         # The public way to learn what was given; what is known is declared anew, with its type.
-        self.given = {name: parameter.value
-                      for name, parameter in self.get_parameters_by_prefix('').items()
-                      if name not in _OF_ROS}
+        self.given = {
+            name: parameter.value
+            for name, parameter in self.get_parameters_by_prefix('').items()
+            if name not in _OF_ROS
+        }
         for name in self.given:
             self.undeclare_parameter(name)
         self.settings = declare(self, self.SETTINGS, self.given)
@@ -158,8 +163,11 @@ class BaseNode(Node):  # type: ignore[misc]
     def unheard_topics(self) -> list[str]:
         """Return the topics with fewer subscriptions than the parameters ask for."""
         wanted = self.settings.wait_for_subscribers
-        return [one.topic_name for one in self._waited_for
-                if wanted and one.get_subscription_count() < wanted]
+        return [
+            one.topic_name
+            for one in self._waited_for
+            if wanted and one.get_subscription_count() < wanted
+        ]
 
     def listen(
         self,
@@ -175,7 +183,8 @@ class BaseNode(Node):  # type: ignore[misc]
         published before counts as well.
         """
         self.collect(
-            kind, topic, read, lambda stamp, unread: use(stamp, unread.read()), latched=latched)
+            kind, topic, read, lambda stamp, unread: use(stamp, unread.read()), latched=latched
+        )
 
     def collect(
         self,
@@ -191,6 +200,7 @@ class BaseNode(Node):  # type: ignore[misc]
 
         name: of the topic where it is not what the node calls it.
         """
+
         def receive(data: bytes) -> None:
             count = self._inputs[topic].count
             count.received += 1
@@ -279,8 +289,11 @@ class BaseNode(Node):  # type: ignore[misc]
     def _publish_diagnostics(self) -> None:
         counts: dict[str, object] = {}
         for topic, one in self._inputs.items():
-            counts |= {f'{topic}: received': one.count.received, f'{topic}: read': one.count.read,
-                       f'{topic}: dropped': one.count.dropped}
+            counts |= {
+                f'{topic}: received': one.count.received,
+                f'{topic}: read': one.count.read,
+                f'{topic}: dropped': one.count.dropped,
+            }
             one.adapt()
         more, trouble = self.report()
         now = self.get_clock().now().nanoseconds
@@ -293,8 +306,11 @@ class BaseNode(Node):  # type: ignore[misc]
         if self._failures:
             level, text = DiagnosticStatus.ERROR, f'{self._failures} internal errors; {text}'
         name = f'{self.get_fully_qualified_name()}: inputs'
-        self._diagnostics.publish(messages.key_values_message(
-            name, {**counts, **more, 'internal errors': self._failures}, now, text, level))
+        self._diagnostics.publish(
+            messages.key_values_message(
+                name, {**counts, **more, 'internal errors': self._failures}, now, text, level
+            )
+        )
 
     def _explain_silence(self) -> str:
         """Say what does not come, or comes no more; log it once, until it comes again."""

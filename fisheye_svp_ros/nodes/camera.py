@@ -43,9 +43,7 @@ class CameraTopics:
     has_truth: whether true poses are known; a solver waits for them if they are announced.
     """
 
-    def __init__(
-        self, node: CameraNode, name: str, photographs: bool, has_truth: bool
-    ) -> None:
+    def __init__(self, node: CameraNode, name: str, photographs: bool, has_truth: bool) -> None:
         prefix, settings = f'{name}/' if name else '', node.settings
         self._prefix, self._photographs = prefix, photographs
         self._world, self._transforms = settings.world_frame, node.transforms
@@ -68,7 +66,8 @@ class CameraTopics:
         if self._pose is None:
             # Who solves listens to the true pose, but not to images.
             self._pose = node.announce(
-                PoseStamped, f'{self._prefix}true_pose', wait=self._photographs)
+                PoseStamped, f'{self._prefix}true_pose', wait=self._photographs
+            )
 
     @property
     def unwatched_topic(self) -> str:
@@ -88,7 +87,8 @@ class CameraTopics:
             self._transforms.publish(pose, stamp, self._world, f'{self.frame}_true')
         if self._points is not None and isinstance(seen, Observations):
             self._points.publish(
-                messages.image_points_message(seen.landmark, seen.uv, stamp, self.frame))
+                messages.image_points_message(seen.landmark, seen.uv, stamp, self.frame)
+            )
         if self._images is not None and isinstance(seen, np.ndarray):
             self._images.publish(messages.image_message(seen, stamp, self.frame))
 
@@ -102,7 +102,8 @@ class CameraNode(BaseNode):
     def __init__(self, node_name: str | None = None, **options: Any) -> None:
         super().__init__(node_name, **options)
         self._landmarks = (
-            None if self.photographs else self.announce(PointCloud2, 'landmarks', LATCHED_SETS))
+            None if self.photographs else self.announce(PointCloud2, 'landmarks', LATCHED_SETS)
+        )
         self._scenario = self.announce(DiagnosticArray, 'scenario')
         self.transforms = Transforms(self, self.settings.publish_tf)
         self._cameras: dict[str, CameraTopics] = {}
@@ -170,8 +171,9 @@ class CameraNode(BaseNode):
     def publish_landmarks(self, landmarks: Landmarks, stamp: int) -> None:
         """Publish landmarks; stamp 0: they hold for every set."""
         if self._landmarks is not None:
-            self._landmarks.publish(messages.landmarks_message(
-                landmarks, stamp, self.settings.world_frame))
+            self._landmarks.publish(
+                messages.landmarks_message(landmarks, stamp, self.settings.world_frame)
+            )
 
     def _hear_answers_on(self, topic: str) -> None:
         def use(stamp: int, _: Any) -> None:
@@ -202,7 +204,8 @@ class CameraNode(BaseNode):
             self.get_logger().warning(
                 'nothing is published yet: wait_for_subscribers is '
                 f'{self.settings.wait_for_subscribers}, and too few listen to '
-                + ', '.join(self.unheard_topics()))
+                + ', '.join(self.unheard_topics())
+            )
 
     def _advance(self) -> None:
         try:

@@ -77,16 +77,28 @@ class ImageTopics:
     """
 
     def __init__(
-        self, node: BaseNode, topic: str, decode: tuple[Callable[[Any, str], Any], ...],
-        take: Callable[[int, Unread], None], info: str, infos: CameraInfos,
+        self,
+        node: BaseNode,
+        topic: str,
+        decode: tuple[Callable[[Any, str], Any], ...],
+        take: Callable[[int, Unread], None],
+        info: str,
+        infos: CameraInfos,
     ) -> None:
         self._taken: deque[tuple[int, str]] = deque(maxlen=_MAX_LEAD)
         compressed = topic + COMPRESSED_SUFFIX
         node.collect(Image, topic, decode[0], take, SENSOR)
-        node.collect(CompressedImage, compressed, decode[1], take, SENSOR,
-                     name=_compressed_topic(node, topic))
-        node.collect(CameraInfo, info, read_camera_info, partial(infos.hear, info), INFO_INPUT,
-                     latched=True)
+        node.collect(
+            CompressedImage,
+            compressed,
+            decode[1],
+            take,
+            SENSOR,
+            name=_compressed_topic(node, topic),
+        )
+        node.collect(
+            CameraInfo, info, read_camera_info, partial(infos.hear, info), INFO_INPUT, latched=True
+        )
 
     def remember(self, stamp: int, image: Unread) -> None:
         """Take note of an image that is taken."""

@@ -34,8 +34,11 @@ def declare(node: Any, kind: type[S], given: Mapping[str, Any]) -> S:
     for row in rows(kind):
         value = getattr(settings, row.name)
         node.declare_parameter(
-            row.name, list(value) if isinstance(value, tuple) else value, descriptor(row),
-            ignore_override=True)
+            row.name,
+            list(value) if isinstance(value, tuple) else value,
+            descriptor(row),
+            ignore_override=True,
+        )
     return settings
 
 
@@ -88,7 +91,8 @@ def descriptor(row: Row) -> Any:
     """Return the ParameterDescriptor of a row."""
     unit = f' [{row.unit}]' if row.unit else ''
     message = ParameterDescriptor(
-        name=row.name, description=row.description + unit, read_only=row.fixed)
+        name=row.name, description=row.description + unit, read_only=row.fixed
+    )
     # A parameter of one type would not let both `auto` and YAML's true be given.
     message.dynamic_typing = row.takes_booleans
     if row.choices:
@@ -112,8 +116,10 @@ def check_access(name: str, folder: str, what: str) -> str:
     if _NAME.fullmatch(name) and not Path(name).is_file():
         return name
     if not folder:
-        raise ParameterError(f'{what}: {name[:100]!r} is a file, but a running node takes only '
-                             'names in config/; start it with folder:=DIR')
+        raise ParameterError(
+            f'{what}: {name[:100]!r} is a file, but a running node takes only '
+            'names in config/; start it with folder:=DIR'
+        )
     try:
         path = Path(name).resolve()
         inside = path.is_relative_to(Path(folder).resolve())
@@ -121,9 +127,11 @@ def check_access(name: str, folder: str, what: str) -> str:
     except (OSError, ValueError) as cause:
         raise ParameterError(f'{what}: {name[:100]!r} is not a path ({cause})') from cause
     if not inside:
-        raise ParameterError(f'{what}: {name[:100]!r} is not below {folder}, the folder of this '
-                             'node')
+        raise ParameterError(
+            f'{what}: {name[:100]!r} is not below {folder}, the folder of this node'
+        )
     if not 0 <= size <= MAX_FILE_BYTES:
         raise ParameterError(
-            f'{what}: {name[:100]!r} is no file, or above {MAX_FILE_BYTES >> 20} MB')
+            f'{what}: {name[:100]!r} is no file, or above {MAX_FILE_BYTES >> 20} MB'
+        )
     return name

@@ -50,41 +50,60 @@ class DetectorSettings(Settings):
     """Parameters of the detector."""
 
     board: str = parameter(
-        'chessboard:9x6:25mm', 'The board: chessboard:COLUMNSxROWS:SIZE (inner corners), '
-        'charuco:..., aprilgrid:FILE, circles:..., squares:..., as for `fisheye-svp detect`'
+        'chessboard:9x6:25mm',
+        'The board: chessboard:COLUMNSxROWS:SIZE (inner corners), '
+        'charuco:..., aprilgrid:FILE, circles:..., squares:..., as for `fisheye-svp detect`',
     )
     board_frame: str = parameter('board', 'Frame id of the landmarks', frame=True)
     longest_search: float = parameter(
-        1.0, 'Longest search in one image; after it, the image counts as without '
-        'board', 's', (0.05, 60.0)
+        1.0,
+        'Longest search in one image; after it, the image counts as without board',
+        's',
+        (0.05, 60.0),
     )
     detections: bool = parameter(
-        False, 'Use AprilTags found by another node in raw (not rectified) images, from the topic '
-        '`detections`, in place of images; needs apriltag_msgs', fixed=True
+        False,
+        'Use AprilTags found by another node in raw (not rectified) images, from the topic '
+        '`detections`, in place of images; needs apriltag_msgs',
+        fixed=True,
     )
     guide: str = parameter(
-        '', 'Parameter of the lens that the live guide determines (e0: the viewpoint shift); '
-        'empty: no guide', choices=('', *_GUIDE_PARAMETERS), fixed=True
+        '',
+        'Parameter of the lens that the live guide determines (e0: the viewpoint shift); '
+        'empty: no guide',
+        choices=('', *_GUIDE_PARAMETERS),
+        fixed=True,
     )
     goal: float = parameter(
-        0.0002, 'Standard error at which that parameter is determined, m for e0, px for fx, fy, '
-        'cx and cy', span=(1e-9, 1e3), fixed=True
+        0.0002,
+        'Standard error at which that parameter is determined, m for e0, px for fx, fy, cx and cy',
+        span=(1e-9, 1e3),
+        fixed=True,
     )
     lens: str = parameter(
-        '', 'Initial lens of the guide: a file, or a name in config/lenses; `camera_info`: from '
-        'that topic; empty: one with the parameter `field_of_view`', fixed=True, file=True
+        '',
+        'Initial lens of the guide: a file, or a name in config/lenses; `camera_info`: from '
+        'that topic; empty: one with the parameter `field_of_view`',
+        fixed=True,
+        file=True,
     )
     field_of_view: float = parameter(
-        3.1, 'Field of view over the width of the image, from the data sheet', 'rad',
-        (0.3, 6.0), fixed=True
+        3.1,
+        'Field of view over the width of the image, from the data sheet',
+        'rad',
+        (0.3, 6.0),
+        fixed=True,
     )
-    near: float = parameter(0.15, 'Nearest distance at which the board is sharp', 'm',
-                            (1e-3, 1e3), fixed=True)
-    far: float = parameter(0.8, 'Furthest distance at which the board can be held', 'm',
-                           (1e-3, 1e3), fixed=True)
+    near: float = parameter(
+        0.15, 'Nearest distance at which the board is sharp', 'm', (1e-3, 1e3), fixed=True
+    )
+    far: float = parameter(
+        0.8, 'Furthest distance at which the board can be held', 'm', (1e-3, 1e3), fixed=True
+    )
     guide_output: str = parameter(
-        'guided', 'Folder for the photographs that the guide takes and observations.csv; it must '
-        'be empty', fixed=True
+        'guided',
+        'Folder for the photographs that the guide takes and observations.csv; it must be empty',
+        fixed=True,
     )
 
 
@@ -124,6 +143,7 @@ class Detector(BaseNode):
         if self.settings.guide:
             # The diagnosis and the plots behind it take half a second to import.
             from fisheye_svp_ros.nodes.guiding import Guiding
+
             self._guiding = Guiding(self, self.settings, self._pattern, self._infos)
         # A search may take long, and nothing but the end of its process breaks it off.
         blank = np.zeros((16, 16), np.uint8), self._pattern, self._detector, None
@@ -151,8 +171,9 @@ class Detector(BaseNode):
         if kind == 'aprilgrid' and settings is not self.settings:
             check_access(file, self.settings.folder, 'board')
         if settings.detections and kind != 'aprilgrid':
-            raise ParameterError(f'board is {settings.board!r}; with detections it must be an '
-                                 'aprilgrid')
+            raise ParameterError(
+                f'board is {settings.board!r}; with detections it must be an aprilgrid'
+            )
         if settings.guide and settings.detections:
             raise ParameterError('guide needs images; it cannot be used with detections')
         if settings.guide and settings.board != self.settings.board:
@@ -179,8 +200,10 @@ class Detector(BaseNode):
     def _missing_board(self) -> str:
         if self._size is not None or self._failures_at_first < _MIN_FAILURES:
             return ''
-        return (f'image: no {self.settings.board} in the first {self._failures_at_first} images; '
-                + check_of_board(self._pattern))
+        return (
+            f'image: no {self.settings.board} in the first {self._failures_at_first} images; '
+            + check_of_board(self._pattern)
+        )
 
     def _take(self, stamp: int, image: Unread) -> None:
         """Keep the newest image, if anybody wants to know what is in it."""
@@ -236,8 +259,7 @@ class Detector(BaseNode):
     def _finish(self, found: Any, stamp: int, frame: str, pixels: Pixels) -> None:
         if isinstance(found, Points):
             self._near, self._size = found.uv, pixels.shape
-            self._points.publish(
-                messages.image_points_message(found.ids, found.uv, stamp, frame))
+            self._points.publish(messages.image_points_message(found.ids, found.uv, stamp, frame))
         else:
             self._near = None
             self._counts['images without board'] += 1
@@ -255,11 +277,15 @@ class Detector(BaseNode):
 
     def _read_tags(self, message: Any, topic: str) -> tuple[str, Index, Array]:
         """Return the points of tags; libapriltag puts pixel centres at a half."""
-        tags = [tag for tag in message.detections
-                if 0 <= tag.id < self._pattern.columns * self._pattern.rows]
+        tags = [
+            tag
+            for tag in message.detections
+            if 0 <= tag.id < self._pattern.columns * self._pattern.rows
+        ]
         if not tags:
-            raise ObservationError(f'{topic}: none of {len(message.detections)} tags belongs to '
-                                   'the board')
+            raise ObservationError(
+                f'{topic}: none of {len(message.detections)} tags belongs to the board'
+            )
         # Both go round a tag from its lower left, against the clock.
         ids = np.concatenate([4 * tag.id + np.arange(4) for tag in tags])
         uv = np.array([[corner.x, corner.y] for tag in tags for corner in tag.corners]) - 0.5
@@ -276,14 +302,21 @@ class Detector(BaseNode):
         if self._size is not None and pixels.shape != self._size:
             raise ObservationError(
                 f'image: {pixels.shape[1]}x{pixels.shape[0]} px, but it was '
-                f'{self._size[1]}x{self._size[0]}; restart the node for another camera')
+                f'{self._size[1]}x{self._size[0]}; restart the node for another camera'
+            )
 
     def _compare(self, told: tuple[int, int] | None, pixels: Pixels) -> None:
         """Take note where the camera_info is not of these images: the solvers cannot know."""
         height, width = pixels.shape
-        self._misfit = '' if told in (None, (width, height)) else (
-            f'image: {width}x{height} px, but {CAMERA_INFO} is for {told[0]}x{told[1]} px; have '
-            'the driver send the calibration of its images')
+        self._misfit = (
+            ''
+            if told in (None, (width, height))
+            else (
+                f'image: {width}x{height} px, but {CAMERA_INFO} is for '
+                f'{told[0]}x{told[1]} px; have '
+                'the driver send the calibration of its images'
+            )
+        )
         if self._misfit:
             self.get_logger().warning(self._misfit, throttle_duration_sec=10.0)
 
@@ -294,6 +327,8 @@ def _read(kind: Any, message: Any, topic: str) -> tuple[str, Pixels]:
 
 def _tag_array() -> Any:
     if find_spec('apriltag_msgs') is None:
-        raise ParameterError('detections is true, but apriltag_msgs is not installed: '
-                             'apt install ros-jazzy-apriltag-msgs')
+        raise ParameterError(
+            'detections is true, but apriltag_msgs is not installed: '
+            'apt install ros-jazzy-apriltag-msgs'
+        )
     return import_module('apriltag_msgs.msg').AprilTagDetectionArray

@@ -30,8 +30,10 @@ set_thread_count()  # other nodes use the other cores
 @contextmanager
 def ending_quietly() -> Iterator[None]:
     """End the process at once on SIGINT or SIGTERM: while modules load, nothing is to be saved."""
-    before = {number: signal.signal(number, lambda *_: os._exit(0))
-              for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        number: signal.signal(number, lambda *_: os._exit(0))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         yield
     finally:
@@ -54,8 +56,9 @@ def parameters(name: str) -> list[Row]:
     """Return the parameters of a node, its own before those of every node; rclpy must be there."""
     from fisheye_svp_ros.io.parameters import rows
 
-    return sorted(rows(_node_class(name).SETTINGS),
-                  key=lambda row: row.name == 'wait_for_subscribers')
+    return sorted(
+        rows(_node_class(name).SETTINGS), key=lambda row: row.name == 'wait_for_subscribers'
+    )
 
 
 def _node_class(name: str) -> type[BaseNode]:
@@ -90,8 +93,11 @@ def _main(name: str) -> int:
     elif '--version' in words:
         print(f'{name} {__version__}')
     elif misplaced:
-        print(f'{name}: {misplaced[0]!r} comes before --ros-args; ROS arguments follow it: {name} '
-              '--ros-args ...', file=sys.stderr)
+        print(
+            f'{name}: {misplaced[0]!r} comes before --ros-args; ROS arguments follow it: {name} '
+            '--ros-args ...',
+            file=sys.stderr,
+        )
         return 2
     else:
         return run(name)

@@ -62,17 +62,22 @@ class Guiding:
         with suppress(OSError):
             self._folder.mkdir(parents=True, exist_ok=True)
         if not (self._folder.is_dir() and os.access(self._folder, os.W_OK)) or any(
-                self._folder.iterdir()):
-            raise ParameterError(f'guide_output: {self._folder} is not an empty, writable folder; '
-                                 'choose another one')
+            self._folder.iterdir()
+        ):
+            raise ParameterError(
+                f'guide_output: {self._folder} is not an empty, writable folder; '
+                'choose another one'
+            )
         self._infos = infos
         self._lens: Lens | None = None
         if settings.lens not in ('', CAMERA_INFO):
             self._lens = load_lens(lens_path(settings.lens))
         self._pictures = node.announce(Image, '~/guide', _PICTURES)
         self._wanted = node.announce(PoseStamped, '~/wanted', LATCHED)
-        self._metrics = {name: node.announce(Float64, f'~/metrics/{name}')
-                         for name in ('score', 'photographs', 'stderr')}
+        self._metrics = {
+            name: node.announce(Float64, f'~/metrics/{name}')
+            for name in ('score', 'photographs', 'stderr')
+        }
         self._guide: Guide | None = None
         self._calls: BoundedCalls | None = None
         self._considering = False  # beyond the call that warms the process up
@@ -93,9 +98,12 @@ class Guiding:
         if self._guide is None:
             return {'guide': 'waiting for the first image'}, self._trouble
         do, where, known = guide_words(self._guide)
-        return {'guide': f'{do}; {where}', 'guide: taken': known,
-                'guide: unreachable views': len(self._guide.session.room.taken),
-                'guide: failures': self._failures}, self._trouble
+        return {
+            'guide': f'{do}; {where}',
+            'guide: taken': known,
+            'guide: unreachable views': len(self._guide.session.room.taken),
+            'guide: failures': self._failures,
+        }, self._trouble
 
     def look(self, stamp: int, frame: str, pixels: Pixels, found: Any) -> None:
         """Take note of an image and of what was found in it; publish the picture.
@@ -115,7 +123,8 @@ class Guiding:
         self._publish_next_board(guide)
         if self.heard():
             self._pictures.publish(
-                messages.image_message(draw_guide(pixels, guide, seen), stamp, frame))
+                messages.image_message(draw_guide(pixels, guide, seen), stamp, frame)
+            )
 
     def work(self) -> None:
         """Take up what has been considered; have the next considered."""
@@ -141,10 +150,17 @@ class Guiding:
         if lens is None:
             lens = nominal_lens((width, height), settings.field_of_view)
         if (lens.width, lens.height) != (width, height):
-            raise ObservationError(f'image: {width}x{height} px, but lens {lens.name!r} is for '
-                                   f'{lens.width}x{lens.height}')
-        session = start_session(kannala_brandt_equivalent(lens), self._pattern.points,
-                                (settings.near, settings.far), settings.guide, settings.goal)
+            raise ObservationError(
+                f'image: {width}x{height} px, but lens {lens.name!r} is for '
+                f'{lens.width}x{lens.height}'
+            )
+        session = start_session(
+            kannala_brandt_equivalent(lens),
+            self._pattern.points,
+            (settings.near, settings.far),
+            settings.guide,
+            settings.goal,
+        )
         orders = np.stack([turn.source for turn in self._pattern.symmetries])
         self._guide = Guide(session, orders)
         # Which loads all and fails: a warm process
@@ -187,8 +203,9 @@ class Guiding:
         with replacing(self._folder / 'photographs' / f'{len(taken) - 1:03d}.png') as path:
             if not cv2.imwrite(str(path), pixels, _FAST):
                 raise OutputError(f'{self._folder}: the photograph cannot be written')
-        write_observations(self._folder / 'observations.csv',
-                           observations_of(taken, self._pattern.points))
+        write_observations(
+            self._folder / 'observations.csv', observations_of(taken, self._pattern.points)
+        )
 
     def _publish_metric(self, name: str, value: float) -> None:
         self._metrics[name].publish(messages.number_message(value))

@@ -74,11 +74,11 @@ class _Track:
         after = bisect_left(self._stamps, stamp)
         if not 0 < after < len(self._stamps):
             return None
-        first, second = self._stamps[after - 1:after + 1]
+        first, second = self._stamps[after - 1 : after + 1]
         # What has the stamp of another set belongs to that one.
         if second - first > reach or first in taken or second in taken:
             return None
-        before, behind = self._latest[after - 1:after + 1]
+        before, behind = self._latest[after - 1 : after + 1]
         if before is None or behind is None:
             return None
         return NeighborPair(before, behind, (stamp - first) / (second - first))
@@ -90,7 +90,7 @@ class _Track:
     def distance(self, stamp: int) -> int | None:
         """Return how far the nearest stamp is, ns; None where nothing has come."""
         after = bisect_left(self._stamps, stamp)
-        near = self._stamps[max(after - 1, 0):after + 1]
+        near = self._stamps[max(after - 1, 0) : after + 1]
         return min((abs(stamp - one) for one in near), default=None)
 
 
@@ -177,11 +177,17 @@ class StampJoin:
         for one in list(self._pending.values()):
             if any(topic not in one.items for topic in self._required):
                 continue
-            found = {topic: self._find(topic, one.stamps[shared])
-                     for topic, shared in self._shares.items()}
-            awaited = [topic for topic, item in found.items() if item is None
-                       and self._tracks[topic].expected
-                       and not self._tracks[topic].is_past(one.stamps[self._shares[topic]])]
+            found = {
+                topic: self._find(topic, one.stamps[shared])
+                for topic, shared in self._shares.items()
+            }
+            awaited = [
+                topic
+                for topic, item in found.items()
+                if item is None
+                and self._tracks[topic].expected
+                and not self._tracks[topic].is_past(one.stamps[self._shares[topic]])
+            ]
             if awaited and now - one.since <= patience:
                 continue
             for topic, item in found.items():
@@ -218,10 +224,12 @@ class StampJoin:
         """Return the set that an item belongs to, if it is there: of those that lack it."""
         if not self.tolerance:
             return self._pending.get(stamp)
-        near = [one for one in self._pending.values() if topic not in one.items
-                and abs(one.stamp - stamp) <= self.tolerance]
-        return min(near, key=lambda one: abs(one.stamp - stamp),
-                   default=self._pending.get(stamp))
+        near = [
+            one
+            for one in self._pending.values()
+            if topic not in one.items and abs(one.stamp - stamp) <= self.tolerance
+        ]
+        return min(near, key=lambda one: abs(one.stamp - stamp), default=self._pending.get(stamp))
 
     def _holding(self, topic: str, stamp: int) -> Pending | None:
         own = [self._pending[stamp]] if stamp in self._pending else []
@@ -263,7 +271,8 @@ class StandingLandmarks:
             raise ObservationError(
                 f'no landmarks of its stamp, the nearest is {1e-6 * (distance or 0):.1f} ms off: '
                 'they were late, lost, or never sent; publish landmarks that hold for all sets '
-                'with stamp 0')
+                'with stamp 0'
+            )
         if self._latest is None:
             raise ObservationError('no landmarks; publish them on `landmarks`')
         return self._latest

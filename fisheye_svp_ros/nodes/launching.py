@@ -21,24 +21,40 @@ PROGRAM = 'fisheye-svp'
 STYLES = ('parallel', 'vergent', 'divergent')
 _LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 _FLAG = ('true', 'false', 'True', 'False')  # launch itself and Python's own words
-_NODE_ARGUMENTS = {'detector': (), **dict.fromkeys(('synthetic_camera', 'measured_camera'),
-                                         ('lens', 'world_frame', 'camera_frame'))}
+_NODE_ARGUMENTS = {
+    'detector': (),
+    **dict.fromkeys(
+        ('synthetic_camera', 'measured_camera'), ('lens', 'world_frame', 'camera_frame')
+    ),
+}
 _OF_TF = ('synthetic_camera', 'measured_camera', 'localizer', 'stereo_calibrator')
 
 # By name: what it is for, the default, and the choices if there are any.
 COMMON: Mapping[str, tuple[str, str, Sequence[str]]] = {
     'lens': ('lens file, or name in config/lenses; empty: from the parameter files', '', ()),
-    'svp': ('solve without the viewpoint shift of the lens; empty: from the parameter files',
-            '', ('', 'auto', *_FLAG)),
+    'svp': (
+        'solve without the viewpoint shift of the lens; empty: from the parameter files',
+        '',
+        ('', 'auto', *_FLAG),
+    ),
     'namespace': ('namespace of the nodes', '', ()),
     'params': ('parameter file for all nodes, after their own; empty: none', '', ()),
-    'publish_tf': ('publish estimated and true cameras and the rig on tf2; empty: from the '
-                   'parameter files', '', ('', *_FLAG)),
+    'publish_tf': (
+        'publish estimated and true cameras and the rig on tf2; empty: from the parameter files',
+        '',
+        ('', *_FLAG),
+    ),
     'world_frame': ('frame of the landmarks; empty: from the parameter files', '', ()),
-    'camera_frame': ('frame of the camera, for a rig without left_ and right_; empty: from the '
-                     'parameter files', '', ()),
-    'use_sim_time': ('take the time from /clock; empty: from the parameter files', '',
-                     ('', *_FLAG)),
+    'camera_frame': (
+        'frame of the camera, for a rig without left_ and right_; empty: from the parameter files',
+        '',
+        (),
+    ),
+    'use_sim_time': (
+        'take the time from /clock; empty: from the parameter files',
+        '',
+        ('', *_FLAG),
+    ),
     'log_level': ('lowest severity that the nodes log', 'info', _LEVELS),
     'respawn': ('restart a node when it ends', 'false', _FLAG),
 }
@@ -48,24 +64,36 @@ def arguments(names: Iterable[str] = COMMON) -> list[Any]:
     """Return declarations of common arguments."""
     wanted = set(names)
     return [
-        DeclareLaunchArgument(name, description=text, default_value=default,
-                              **({'choices': list(choices)} if choices else {}))
-        for name, (text, default, choices) in COMMON.items() if name in wanted
+        DeclareLaunchArgument(
+            name,
+            description=text,
+            default_value=default,
+            **({'choices': list(choices)} if choices else {}),
+        )
+        for name, (text, default, choices) in COMMON.items()
+        if name in wanted
     ]
 
 
 def style_argument() -> Any:
     """Return the declaration of the style of a rig."""
-    return DeclareLaunchArgument('style', default_value=STYLES[0], choices=list(STYLES),
-                                 description='arrangement of the cameras of the rig')
+    return DeclareLaunchArgument(
+        'style',
+        default_value=STYLES[0],
+        choices=list(STYLES),
+        description='arrangement of the cameras of the rig',
+    )
 
 
 def file_arguments(names: Iterable[str]) -> list[Any]:
     """Return declarations of a parameter file for each node."""
     config = PathJoinSubstitution([FindPackageShare(PACKAGE), 'config'])
     return [
-        DeclareLaunchArgument(f'{name}_params', description=f'parameter file of {name}',
-                              default_value=PathJoinSubstitution([config, f'{name}.yaml']))
+        DeclareLaunchArgument(
+            f'{name}_params',
+            description=f'parameter file of {name}',
+            default_value=PathJoinSubstitution([config, f'{name}.yaml']),
+        )
         for name in names
     ]
 
@@ -76,18 +104,18 @@ def value(context: Any, name: str) -> str:
     return text.lower() if text in _FLAG else text
 
 
-def node(
-    context: Any, name: str, given: Mapping[str, Any], remappings: Sequence[Any] = ()
-) -> Any:
+def node(context: Any, name: str, given: Mapping[str, Any], remappings: Sequence[Any] = ()) -> Any:
     """Return a node with its files, then what was given; lens, svp and frames where it has them.
 
     Raises ParameterError for a file that is not there, of which launch_ros would only warn.
     """
     return Node(
         # With its name, since what is for one node wins over what a file says of all.
-        executable=name, name=name,
+        executable=name,
+        name=name,
         parameters=[*_files(context, name), {**_node_parameters(context, name), **given}],
-        remappings=list(remappings), **_node_options(context),
+        remappings=list(remappings),
+        **_node_options(context),
     )
 
 
@@ -109,16 +137,22 @@ def compose_nodes(
     with NamedTemporaryFile('w', prefix='composed_', suffix='.yaml', delete=False) as stream:
         yaml.safe_dump(document, stream)
     return Node(
-        executable=PROGRAM, arguments=['run', *given], parameters=[stream.name],
-        remappings=list(remappings), **_node_options(context),
+        executable=PROGRAM,
+        arguments=['run', *given],
+        parameters=[stream.name],
+        remappings=list(remappings),
+        **_node_options(context),
     )
 
 
 def _node_options(context: Any) -> dict[str, Any]:
     return {
-        'package': PACKAGE, 'namespace': value(context, 'namespace'), 'output': 'screen',
+        'package': PACKAGE,
+        'namespace': value(context, 'namespace'),
+        'output': 'screen',
         'ros_arguments': ['--log-level', value(context, 'log_level')],
-        'respawn': value(context, 'respawn') == 'true', 'respawn_delay': 1.0,
+        'respawn': value(context, 'respawn') == 'true',
+        'respawn_delay': 1.0,
     }
 
 
@@ -135,11 +169,14 @@ def _node_parameters(context: Any, name: str) -> dict[str, Any]:
     words = _NODE_ARGUMENTS.get(name, ('lens', 'svp'))
     flags = ('use_sim_time', 'publish_tf') if name in _OF_TF else ('use_sim_time',)
     return {word: value(context, word) for word in words if value(context, word)} | {
-        flag: value(context, flag) == 'true' for flag in flags if value(context, flag)}
+        flag: value(context, flag) == 'true' for flag in flags if value(context, flag)
+    }
 
 
 def fail(event: Any, context: Any) -> None:
     """End a launch that cannot do its work without a process, and say which one it was."""
     if event.returncode and not context.is_shutdown:
-        raise GraphError(f'{event.process_name} ended with status {event.returncode}; its '
-                              'last lines above say why')
+        raise GraphError(
+            f'{event.process_name} ended with status {event.returncode}; its '
+            'last lines above say why'
+        )

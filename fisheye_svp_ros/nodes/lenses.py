@@ -23,8 +23,10 @@ def lenses_of(settings: SolverSettings, cameras: Sequence[str]) -> dict[str, Len
     names = cameras_in(lens_path(settings.lens))
     if len(cameras) < 2 or not names:
         return dict.fromkeys(('', *cameras), lens_of(settings.lens, 1.0, settings))
-    return {camera: lens_of(f'{settings.lens}#{name}', 1.0, settings)
-            for camera, name in zip(cameras, names, strict=False)}
+    return {
+        camera: lens_of(f'{settings.lens}#{name}', 1.0, settings)
+        for camera, name in zip(cameras, names, strict=False)
+    }
 
 
 def lens_of(name: str, scale: float, settings: SolverSettings) -> Lens:
@@ -39,5 +41,6 @@ def shift_scale(text: str) -> float:
         value = float(text)
     except ValueError:
         raise ObservationError(
-            f'scenario: shift_scale is {text[:40]!r}; a number is needed') from None
+            f'scenario: shift_scale is {text[:40]!r}; a number is needed'
+        ) from None
     return float(_SHIFT_SCALE.check(value))

@@ -143,5 +143,7 @@ def _is_near(start: Pose, pose: Pose, views: Views) -> bool:
     """Say whether a camera that went from one pose (1,) to another sees nearly the same."""
     change = pose.difference(start)[0]
     nearest = np.linalg.norm(pose.into_body(views.points)[0], axis=-1).min()
-    return bool(np.linalg.norm(change[:3]) < MAX_POSE_CHANGE * nearest
-                and np.linalg.norm(change[3:]) < MAX_POSE_CHANGE)
+    return bool(
+        np.linalg.norm(change[:3]) < MAX_POSE_CHANGE * nearest
+        and np.linalg.norm(change[3:]) < MAX_POSE_CHANGE
+    )

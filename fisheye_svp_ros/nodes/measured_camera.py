@@ -36,8 +36,10 @@ class MeasuredCameraSettings(CameraSettings):
         '', 'Poses CSV with the true pose of each frame; empty: unknown', file=True
     )
     lens: str = parameter(
-        '', 'Lens for `camera_info` and `scenario`: a file, or a name in config/lenses; empty: '
-        'unknown', file=True
+        '',
+        'Lens for `camera_info` and `scenario`: a file, or a name in config/lenses; empty: '
+        'unknown',
+        file=True,
     )
 
 
@@ -107,7 +109,8 @@ class MeasuredCamera(CameraNode):
             if rows is not None:
                 seen = recording.observations.take(rows)
                 self.camera(name, bool(recording.poses)).publish(
-                    stamp, seen, recording.poses.get(step), recording.lens)
+                    stamp, seen, recording.poses.get(step), recording.lens
+                )
 
 
 def frame_stamps(table: Observations) -> dict[int, int]:

@@ -93,9 +93,15 @@ def image_points_message(landmark: Index, uv: Array, stamp: int, frame: str) -> 
 def image_message(pixels: NDArray[Any], stamp: int, frame: str, encoding: str = '') -> Any:
     """Return sensor_msgs/Image; without an encoding mono8 of (H, W) or bgr8 of (H, W, 3)."""
     height, width, *colored = pixels.shape
-    return Image(header=header(stamp, frame), height=height, width=width,
-                 encoding=encoding or ('bgr8' if colored else 'mono8'), is_bigendian=0,
-                 step=pixels.strides[0], data=array('B', pixels.tobytes()))
+    return Image(
+        header=header(stamp, frame),
+        height=height,
+        width=width,
+        encoding=encoding or ('bgr8' if colored else 'mono8'),
+        is_bigendian=0,
+        step=pixels.strides[0],
+        data=array('B', pixels.tobytes()),
+    )
 
 
 def camera_info_message(lens: Lens, stamp: int, frame: str) -> Any:
@@ -113,8 +119,12 @@ def camera_info_message(lens: Lens, stamp: int, frame: str) -> Any:
 
 def rectified_info_message(side: Rectification, stamp: int, frame: str) -> Any:
     """Return CameraInfo of a rectified pinhole camera: no distortion; P has the baseline."""
-    message = CameraInfo(header=header(stamp, frame), width=side.camera.width,
-                         height=side.camera.height, distortion_model='plumb_bob')
+    message = CameraInfo(
+        header=header(stamp, frame),
+        width=side.camera.width,
+        height=side.camera.height,
+        distortion_model='plumb_bob',
+    )
     message.d = [0.0] * 5
     message.k = side.k.ravel().tolist()
     message.r = np.eye(3).ravel().tolist()
@@ -152,7 +162,10 @@ def number_message(value: float) -> Any:
 
 
 def key_values_message(
-    name: str, values: Mapping[str, object], stamp: int, text: str = '',
+    name: str,
+    values: Mapping[str, object],
+    stamp: int,
+    text: str = '',
     level: bytes = DiagnosticStatus.OK,
 ) -> Any:
     """Return a DiagnosticArray with one status; numbers are written so that they read back."""
@@ -205,7 +218,8 @@ def camera_shape(pose: Pose, name: str, alpha: float) -> Segments:
     corners = np.array([[x, y, _CAMERA_SIZE] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
     corners[:, :2] *= _HALF_BASE
     edges = [
-        edge for i in range(4)
+        edge
+        for i in range(4)
         for edge in (np.zeros(3), corners[i], corners[i], corners[(i + 1) % 4])
     ]
     world = np.stack(edges) @ pose.rotation.T + pose.position
@@ -227,6 +241,7 @@ def epipolar_shapes(lens: Lens, pose: Pose, curves: Array, uv: Array) -> list[Se
 
     The longer side of the image is the side of the base; curves are cut where they are NaN.
     """
+
     def to_frustum(pixels: Array) -> Array:
         size = np.array([lens.width, lens.height])
         sideways = (pixels - (size - 1) / 2) * 2 * _HALF_BASE / size.max()

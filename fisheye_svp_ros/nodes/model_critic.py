@@ -59,11 +59,14 @@ class ModelCriticSettings(RigSettings):
         False, 'Fit the intrinsics too; always done for a lens from `calibrate`'
     )
     min_frames: int = parameter(
-        20, 'Number of frames before the first diagnosis', span=(5, 100_000))
+        20, 'Number of frames before the first diagnosis', span=(5, 100_000)
+    )
     every_frames: int = parameter(
-        20, 'Number of further frames before the next one', span=(1, 100_000))
+        20, 'Number of further frames before the next one', span=(1, 100_000)
+    )
     max_frames: int = parameter(
-        100, 'Largest number of frames to diagnose: the latest', span=(5, 100_000))
+        100, 'Largest number of frames to diagnose: the latest', span=(5, 100_000)
+    )
     output: str = parameter(
         'extended_lens.yaml', 'File that the service write_extended_lens writes', fixed=True
     )
@@ -83,8 +86,16 @@ class ModelCritic(SolverNode):
     NAME = 'model_critic'
     SETTINGS = ModelCriticSettings
     METRICS = (
-        'frames', 'points', 'noise_px', 'base_rms_px', 'base_heldout_rms_px', 'extended_rms_px',
-        'extended_heldout_rms_px', 'gain', 'gain_low', 'gain_high',
+        'frames',
+        'points',
+        'noise_px',
+        'base_rms_px',
+        'base_heldout_rms_px',
+        'extended_rms_px',
+        'extended_heldout_rms_px',
+        'gain',
+        'gain_low',
+        'gain_high',
     )
     BY_SCENARIO = True
     settings: ModelCriticSettings
@@ -103,7 +114,8 @@ class ModelCritic(SolverNode):
         self._running: _Running | None = None
         self._verdict: Diagnosis | None = None
         self.create_service(
-            Trigger, '~/write_extended_lens', self.guard_callback(self._write_extended_lens))
+            Trigger, '~/write_extended_lens', self.guard_callback(self._write_extended_lens)
+        )
         self.start_timer(0.2, self._tick)
         self.start()
 
@@ -117,8 +129,9 @@ class ModelCritic(SolverNode):
         if settings.min_frames > settings.max_frames:
             raise ParameterError('min_frames is above max_frames, so no diagnosis would start')
         if settings.stereo and settings.lens == CAMERA_INFO:
-            raise ParameterError('with rig, lens cannot be camera_info; name one lens file for '
-                                 'both cameras')
+            raise ParameterError(
+                'with rig, lens cannot be camera_info; name one lens file for both cameras'
+            )
         if Path(settings.output).is_dir():
             raise ParameterError(f'output is {settings.output!r}, a folder; name a file')
         return super().prepare(settings)
@@ -126,8 +139,13 @@ class ModelCritic(SolverNode):
     def configure(self, settings: Any) -> None:
         """Judge what has come so far anew where other settings make that another question."""
         super().configure(settings)
-        asked = (settings.lens, settings.svp, settings.sigma_px, settings.free_intrinsics,
-                 settings.max_frames)
+        asked = (
+            settings.lens,
+            settings.svp,
+            settings.sigma_px,
+            settings.free_intrinsics,
+            settings.max_frames,
+        )
         if asked != self._asked:
             self._asked = asked
             self._restart()
@@ -194,15 +212,20 @@ class ModelCritic(SolverNode):
         self._result.publish(self._verdict_message(found, done.stamp, numbers))
         self._publish_diagnostics()
 
-    def _verdict_message(
-        self, found: Diagnosis, stamp: int, numbers: Mapping[str, float]
-    ) -> Any:
-        words = {'verdict': found.verdict, 'causes': ' '.join(c.effect for c in found.causes),
-                 'candidates': ' '.join(c.effect for c in found.candidates), **decisions(found)}
+    def _verdict_message(self, found: Diagnosis, stamp: int, numbers: Mapping[str, float]) -> Any:
+        words = {
+            'verdict': found.verdict,
+            'causes': ' '.join(c.effect for c in found.causes),
+            'candidates': ' '.join(c.effect for c in found.candidates),
+            **decisions(found),
+        }
         return messages.key_values_message(
-            f'{self.get_fully_qualified_name()}: verdict', {**words, **numbers}, stamp,
+            f'{self.get_fully_qualified_name()}: verdict',
+            {**words, **numbers},
+            stamp,
             ' '.join(_lines(found)),
-            DiagnosticStatus.WARN if _ALARMING & {one.say for one in found.decision.values()}
+            DiagnosticStatus.WARN
+            if _ALARMING & {one.say for one in found.decision.values()}
             else DiagnosticStatus.OK,
         )
 
@@ -216,20 +239,29 @@ class ModelCritic(SolverNode):
             self._diagnostics.publish(self._verdict_message(self._verdict, now, numbers))
 
     def _publish_too_few(self) -> None:
-        views = {'views': len(self._frames), 'repeated': self._repeated,
-                 'min_frames': self.settings.min_frames}
-        self._diagnostics.publish(messages.key_values_message(
-            f'{self.get_fully_qualified_name()}: views', views,
-            self.get_clock().now().nanoseconds,
-            f'too few different views: {views["views"]} of {views["min_frames"]}, '
-            f'{self._repeated} repeated; move the camera or the target', DiagnosticStatus.WARN))
+        views = {
+            'views': len(self._frames),
+            'repeated': self._repeated,
+            'min_frames': self.settings.min_frames,
+        }
+        self._diagnostics.publish(
+            messages.key_values_message(
+                f'{self.get_fully_qualified_name()}: views',
+                views,
+                self.get_clock().now().nanoseconds,
+                f'too few different views: {views["views"]} of {views["min_frames"]}, '
+                f'{self._repeated} repeated; move the camera or the target',
+                DiagnosticStatus.WARN,
+            )
+        )
 
     def _write_extended_lens(self, request: Any, response: Any) -> Any:
         path = Path(self.settings.output).absolute()
         try:
             if self._verdict is None:
-                raise ObservationError(f'no diagnosis yet: {len(self._frames)} of '
-                                       f'{self.settings.min_frames} frames')
+                raise ObservationError(
+                    f'no diagnosis yet: {len(self._frames)} of {self.settings.min_frames} frames'
+                )
             save_lens(self._verdict.lens, path, refusal_reason(self._verdict))
         except FisheyeSvpError as error:
             response.success, response.message = False, str(error)
@@ -246,8 +278,9 @@ def judge(table: Observations, lens: Lens, free_intrinsics: bool) -> Diagnosis:
 
 def _lines(found: Diagnosis) -> list[str]:
     """Return the first screen of a report as sentences."""
-    return [line.rstrip('.') + '.' for line in terminal_lines(
-        first_screen(found, 'image_points'), '')]
+    return [
+        line.rstrip('.') + '.' for line in terminal_lines(first_screen(found, 'image_points'), '')
+    ]
 
 
 def decisions(found: Diagnosis) -> dict[str, object]:
@@ -255,12 +288,14 @@ def decisions(found: Diagnosis) -> dict[str, object]:
     words: dict[str, object] = {}
     for name, one in found.decision.items():
         unit = _suffix(one.figure.unit)
-        words |= {f'decision_{name}': one.say, f'decision_{name}_why': one.why,
-                  f'decision_{name}_{one.figure.name}{unit}': one.figure.value}
+        words |= {
+            f'decision_{name}': one.say,
+            f'decision_{name}_why': one.why,
+            f'decision_{name}_{one.figure.name}{unit}': one.figure.value,
+        }
         if one.confidence is not None:
             words[f'decision_{name}_confidence'] = one.confidence
-        words |= {f'bound_{bound.effect}{_suffix(bound.unit)}': bound.value
-                  for bound in one.bound}
+        words |= {f'bound_{bound.effect}{_suffix(bound.unit)}': bound.value for bound in one.bound}
     return words
 
 
@@ -268,10 +303,16 @@ def figures(found: Diagnosis) -> dict[str, float]:
     """Return METRICS, and the parameters of the causes with their standard errors."""
     base, extended, gain = found.figures.base, found.figures.extended, found.figures.gain
     numbers = {
-        'frames': found.frames, 'points': found.observations, 'noise_px': found.noise_px,
-        'base_rms_px': base.rms_px, 'base_heldout_rms_px': base.heldout_rms_px,
-        'extended_rms_px': extended.rms_px, 'extended_heldout_rms_px': extended.heldout_rms_px,
-        'gain': gain.value, 'gain_low': gain.low, 'gain_high': gain.high,
+        'frames': found.frames,
+        'points': found.observations,
+        'noise_px': found.noise_px,
+        'base_rms_px': base.rms_px,
+        'base_heldout_rms_px': base.heldout_rms_px,
+        'extended_rms_px': extended.rms_px,
+        'extended_heldout_rms_px': extended.heldout_rms_px,
+        'gain': gain.value,
+        'gain_low': gain.low,
+        'gain_high': gain.high,
     }
     for cause in found.causes:
         if len(cause.parameters) > _MAX_PARAMETER_TOPICS:

@@ -21,12 +21,18 @@ SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 INPUT = QoSProfile(depth=1000)
 # Of camera_info: drivers send it as sensor data, and each set has one of its own.
 INFO_INPUT = QoSProfile(depth=INPUT.depth, reliability=ReliabilityPolicy.BEST_EFFORT)
-TRANSFORMS = {'/tf': RELIABLE,
-              '/tf_static': QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)}
+TRANSFORMS = {
+    '/tf': RELIABLE,
+    '/tf_static': QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+}
 
 PREFIX = 'qos_overrides.'
-_POLICIES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
-             QoSPolicyKind.DURABILITY)
+_POLICIES = (
+    QoSPolicyKind.HISTORY,
+    QoSPolicyKind.DEPTH,
+    QoSPolicyKind.RELIABILITY,
+    QoSPolicyKind.DURABILITY,
+)
 
 
 def overridden(node: Any, topic: str, entity: str) -> tuple[QoSPolicyKind, ...]:
@@ -34,12 +40,20 @@ def overridden(node: Any, topic: str, entity: str) -> tuple[QoSPolicyKind, ...]:
 
     entity: publisher or subscription.
     """
-    return tuple(policy for policy in _POLICIES
-                 if f'{PREFIX}{topic}.{entity}.{policy.name.lower()}' in node.given)
+    return tuple(
+        policy
+        for policy in _POLICIES
+        if f'{PREFIX}{topic}.{entity}.{policy.name.lower()}' in node.given
+    )
 
 
 def create_with_qos(
-    node: Any, create: Callable[..., Any], kind: Any, topic: str, *arguments: Any, qos: Any,
+    node: Any,
+    create: Callable[..., Any],
+    kind: Any,
+    topic: str,
+    *arguments: Any,
+    qos: Any,
     **more: Any,
 ) -> Any:
     """Create a publisher or subscription of which parameters may override the QoS.
@@ -55,8 +69,14 @@ def create_with_qos(
         more = {'event_callbacks': PublisherEventCallbacks(use_default_callbacks=False), **more}
     try:
         # A copy, because rclpy changes the profile that it is given.
-        return create(kind, topic, *arguments, copy(qos),
-                      qos_overriding_options=QoSOverridingOptions(policies), **more)
+        return create(
+            kind,
+            topic,
+            *arguments,
+            copy(qos),
+            qos_overriding_options=QoSOverridingOptions(policies),
+            **more,
+        )
     except RuntimeError as cause:
         if not node.context.ok():
             raise
@@ -65,5 +85,7 @@ def create_with_qos(
 
 def qos_words(profile: Any) -> str:
     """Return reliability and durability as words of a sentence."""
-    return ', '.join(str(policy.name).lower().replace('_', ' ')
-                     for policy in (profile.reliability, profile.durability))
+    return ', '.join(
+        str(policy.name).lower().replace('_', ' ')
+        for policy in (profile.reliability, profile.durability)
+    )

@@ -56,8 +56,11 @@ class Recorder(Node):  # type: ignore[misc]
         # sees this node there, this node must be on its other topics already.  That topic is the
         # last a node publishes, so where its publisher is known, those found now are all.
         names = [name for name, _ in self.get_topic_names_and_types()]
-        complete = {name for name in names
-                    if name.endswith(_COUNTED_TOPICS) and self.count_publishers(name)}
+        complete = {
+            name
+            for name in names
+            if name.endswith(_COUNTED_TOPICS) and self.count_publishers(name)
+        }
         found = self.get_topic_names_and_types()
         for topic, types in sorted(found, key=lambda entry: entry[0].endswith(_COUNTED_TOPICS)):
             if topic in self.topics or (topic.endswith(_COUNTED_TOPICS) and topic not in complete):
@@ -70,9 +73,12 @@ class Recorder(Node):  # type: ignore[misc]
         publishers = self.get_publishers_info_by_topic(topic)
         for typename in types:
             offered = [
-                OfferedQos(one.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT,
-                        one.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
-                for one in publishers if one.topic_type == typename
+                OfferedQos(
+                    one.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT,
+                    one.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+                )
+                for one in publishers
+                if one.topic_type == typename
             ]
             if not offered:
                 continue
@@ -93,15 +99,20 @@ class Recorder(Node):  # type: ignore[misc]
     ) -> None:
         self._bag.add(topic, typename, offered)
         # What everybody offers is asked for; who asks for more does not hear the others.
-        latched, reliable = (all(values) for values in
-                             ([o.latched for o in offered], [o.reliable for o in offered]))
+        latched, reliable = (
+            all(values) for values in ([o.latched for o in offered], [o.reliable for o in offered])
+        )
         self.create_subscription(
-            kind, topic, lambda data: self._bag.write(topic, typename, data),
+            kind,
+            topic,
+            lambda data: self._bag.write(topic, typename, data),
             QoSProfile(
                 depth=1000,
-                durability=DurabilityPolicy.TRANSIENT_LOCAL if latched
+                durability=DurabilityPolicy.TRANSIENT_LOCAL
+                if latched
                 else DurabilityPolicy.VOLATILE,
-                reliability=ReliabilityPolicy.RELIABLE if reliable
+                reliability=ReliabilityPolicy.RELIABLE
+                if reliable
                 else ReliabilityPolicy.BEST_EFFORT,
             ),
             raw=True,

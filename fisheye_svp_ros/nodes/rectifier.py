@@ -43,26 +43,35 @@ class RectifierSettings(Settings):
     """Parameters of the rectifier."""
 
     lens: str = parameter(
-        CAMERA_INFO, 'Lens: a file, or a name in config/lenses; for a rig, a file or folder with '
-        'both; `camera_info`: from the topic `image/camera_info`', file=True
+        CAMERA_INFO,
+        'Lens: a file, or a name in config/lenses; for a rig, a file or folder with '
+        'both; `camera_info`: from the topic `image/camera_info`',
+        file=True,
     )
     stereo: bool = parameter(
         False, 'Rectify a stereo pair, the cameras in the namespaces left and right', fixed=True
     )
     rig: str = parameter(
-        '', 'Rig of the stereo pair: `rig.yaml` or its folder, a file of Kalibr, Basalt, OpenCV, '
-        'or a URDF; empty: that of the lenses', file=True
+        '',
+        'Rig of the stereo pair: `rig.yaml` or its folder, a file of Kalibr, Basalt, OpenCV, '
+        'or a URDF; empty: that of the lenses',
+        file=True,
     )
     field_of_view: float = parameter(
         1.5708, 'Field of view of the rectified images over their width', 'rad', (0.01, 3.05)
     )
     width: int = parameter(
-        0, 'Width of the rectified images; 0: that of the images', 'px', (0, 8192))
+        0, 'Width of the rectified images; 0: that of the images', 'px', (0, 8192)
+    )
     height: int = parameter(
-        0, 'Height of the rectified images; 0: that of the images', 'px', (0, 8192))
+        0, 'Height of the rectified images; 0: that of the images', 'px', (0, 8192)
+    )
     range: float = parameter(
-        RANGE, 'Range at which images of a lens with a moving viewpoint are exact; for a pair, '
-        'from the middle of the baseline', 'm', (0.01, 1e6)
+        RANGE,
+        'Range at which images of a lens with a moving viewpoint are exact; for a pair, '
+        'from the middle of the baseline',
+        'm',
+        (0.01, 1e6),
     )
 
 
@@ -103,13 +112,20 @@ class Rectifier(BaseNode):
         if own == raw:
             raise ParameterError(
                 f'the node would subscribe to its own output {raw}; choose another namespace, for '
-                'example -r __ns:=/rectified')
+                'example -r __ns:=/rectified'
+            )
         self._outputs[camera] = (
             self.announce(Image, f'{camera}image_rect', SENSOR, wait=True),
-            self.announce(CameraInfo, f'{camera}{CAMERA_INFO}', SENSOR))
+            self.announce(CameraInfo, f'{camera}{CAMERA_INFO}', SENSOR),
+        )
         self._images[camera] = ImageTopics(
-            self, f'{camera}image', (_read_raw, _read_compressed), partial(self._take, camera),
-            f'{camera}{_INFO}', self._infos)
+            self,
+            f'{camera}image',
+            (_read_raw, _read_compressed),
+            partial(self._take, camera),
+            f'{camera}{_INFO}',
+            self._infos,
+        )
 
     def needed_inputs(self) -> Sequence[Sequence[str]]:
         """Return the topics without which there is nothing to rectify."""
@@ -125,7 +141,8 @@ class Rectifier(BaseNode):
         path = lens_path(settings.lens)
         names = cameras_in(path) if rig is not None else ()
         lenses = tuple(load_lens(f'{path}#{name}') for name in names[:2]) or tuple(
-            load_lens(path) for _ in self._cameras)
+            load_lens(path) for _ in self._cameras
+        )
         sides = self._rectifications(settings, rig, lenses)
         for side in sides.values():
             _ = side.maps
@@ -139,20 +156,25 @@ class Rectifier(BaseNode):
         """Return the rig of a pair, None for one camera; raise FisheyeSvpError where it lacks."""
         if not settings.stereo:
             if settings.rig:
-                raise ParameterError(f'rig is {settings.rig!r}, but stereo is false; start the '
-                                     'node with stereo:=true, or leave rig empty')
+                raise ParameterError(
+                    f'rig is {settings.rig!r}, but stereo is false; start the '
+                    'node with stereo:=true, or leave rig empty'
+                )
             return None
         path = None if settings.lens == CAMERA_INFO else lens_path(settings.lens)
         names = cameras_in(path) if path else ()
         if settings.rig:
             return load_pair(settings.rig, names[:2] or STEREO)
         if len(names) > 2:
-            raise ParameterError(f'lens {settings.lens!r} holds {len(names)} cameras, '
-                                 f'{", ".join(names)}; give a file or folder of two')
+            raise ParameterError(
+                f'lens {settings.lens!r} holds {len(names)} cameras, '
+                f'{", ".join(names)}; give a file or folder of two'
+            )
         rig = pair_of_lenses(path, names) if path else None
         if rig is None:
-            raise ParameterError(f'rig is empty, and lens {settings.lens!r} holds none; name the '
-                                 'file of the rig')
+            raise ParameterError(
+                f'rig is empty, and lens {settings.lens!r} holds none; name the file of the rig'
+            )
         return rig
 
     def _rectifications(
@@ -170,7 +192,8 @@ class Rectifier(BaseNode):
         """Rectify an image, if somebody listens."""
         rectified, info = self._outputs[camera]
         if not self.has_listeners() or not (
-                rectified.get_subscription_count() or info.get_subscription_count()):
+            rectified.get_subscription_count() or info.get_subscription_count()
+        ):
             return
         if self._images[camera].is_repeated(stamp, image):
             return
@@ -180,11 +203,11 @@ class Rectifier(BaseNode):
         if (width, height) != (side.lens.width, side.lens.height):
             raise ObservationError(
                 f'{image.topic}: {width}x{height} px, but the lens is for '
-                f'{side.lens.width}x{side.lens.height} px; give the lens of these images')
+                f'{side.lens.width}x{side.lens.height} px; give the lens of these images'
+            )
         self._images[camera].remember(stamp, image)
         if rectified.get_subscription_count():
-            rectified.publish(
-                messages.image_message(side.remap(pixels), stamp, frame, encoding))
+            rectified.publish(messages.image_message(side.remap(pixels), stamp, frame, encoding))
         info.publish(messages.rectified_info_message(side, stamp, frame))
 
     def _side(self, camera: str, stamp: int) -> Rectification:

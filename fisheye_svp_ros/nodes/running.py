@@ -50,7 +50,7 @@ def _run(
     except NodeExit:
         pass
     except (FisheyeSvpError, ParameterException, NameValidationException) as error:
-        return _refuse(kinds[len(nodes):][:1] or kinds, error)
+        return _refuse(kinds[len(nodes) :][:1] or kinds, error)
     except Exception as error:
         # A signal ends the context between any two calls; what fails then is no failure.
         if rclpy.ok():

@@ -89,8 +89,9 @@ def ros_session(arguments: Sequence[str]) -> Iterator[SignalHandler]:
     signals = SignalHandler()
     try:
         try:
-            rclpy.init(args=['--ros-args', *arguments],
-                       signal_handler_options=SignalHandlerOptions.NO)
+            rclpy.init(
+                args=['--ros-args', *arguments], signal_handler_options=SignalHandlerOptions.NO
+            )
         except Exception as error:  # of a kind of its own for each argument
             raise GraphError(f'ROS arguments or environment: {error}') from error
         yield signals

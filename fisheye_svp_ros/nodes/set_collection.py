@@ -51,14 +51,16 @@ def is_repeated(seen: CollectedSet, earlier: Sequence[CollectedSet]) -> bool:
     """
     if not earlier:
         return False
-    copies = any(np.array_equal(seen.landmark, one.landmark) and np.array_equal(seen.uv, one.uv)
-                 for one in earlier)
+    copies = any(
+        np.array_equal(seen.landmark, one.landmark) and np.array_equal(seen.uv, one.uv)
+        for one in earlier
+    )
     return copies or _median_move(seen, earlier[-1]) < _MAX_MOTION_PX
 
 
 def _median_move(one: CollectedSet, other: CollectedSet) -> float:
     """Return how far, px, the image points that two sets share moved; infinite for none."""
-    mine, theirs = (2 ** 32 * seen.camera + seen.landmark for seen in (one, other))
+    mine, theirs = (2**32 * seen.camera + seen.landmark for seen in (one, other))
     _, mine, theirs = np.intersect1d(mine, theirs, return_indices=True)
     if not len(mine):
         return float('inf')
@@ -72,9 +74,14 @@ def table_of(window: Sequence[CollectedSet], cameras: Sequence[str]) -> Observat
     )
     counts = [len(seen.landmark) for seen in window]
     return make_observations(
-        np.repeat(np.arange(len(window)), counts), landmark, uv, xyz, camera=camera,
+        np.repeat(np.arange(len(window)), counts),
+        landmark,
+        uv,
+        xyz,
+        camera=camera,
         t=np.repeat([seen.stamp / 1e9 for seen in window], counts),
-        cameras=tuple(camera.rstrip('/') for camera in cameras), source='image_points',
+        cameras=tuple(camera.rstrip('/') for camera in cameras),
+        source='image_points',
     )
 
 

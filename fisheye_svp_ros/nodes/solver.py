@@ -69,15 +69,18 @@ class Pace:
         came = (counts['taken'] - before['taken']) / seconds
         done = sum(counts[end] - before[end] for end in ('solved', 'not solved')) / seconds
         told: dict[str, object] = {
-            **{f'sets: {end}': counts[end] for end in _ENDS}, 'sets: waiting': waiting,
-            'sets: received per second': round(came, 1), 'sets: solved per second': round(done, 1),
+            **{f'sets: {end}': counts[end] for end in _ENDS},
+            'sets: waiting': waiting,
+            'sets: received per second': round(came, 1),
+            'sets: solved per second': round(done, 1),
             'sets: latency_s': round(self.latency, 4),
         }
         if counts['dropped'] == before['dropped']:
             return told, ''
         return told, (
             f'too slow: {came:.0f} sets per second are received and {done:.0f} are solved, '
-            f'{self.latency:.2f} s late; {waiting} wait, {counts["dropped"]} are dropped')
+            f'{self.latency:.2f} s late; {waiting} wait, {counts["dropped"]} are dropped'
+        )
 
 
 class SolverNode(ManagedNode):
@@ -102,7 +105,8 @@ class SolverNode(ManagedNode):
         self._poses = {f'{camera}true_pose': f'{camera}image_points' for camera in self.cameras}
         first = self._image_points[0]
         self._join = StampJoin(
-            self._image_points, {**self._poses, 'landmarks': first, 'scenario': first})
+            self._image_points, {**self._poses, 'landmarks': first, 'scenario': first}
+        )
         self._backlog: deque[Pending] = deque()
         self._unread: deque[tuple[int, str]] = deque(maxlen=_UNREAD)
         self._pace = Pace()
@@ -113,8 +117,7 @@ class SolverNode(ManagedNode):
         self._models: dict[str, tuple[Lens, ForwardModel]] = {}  # the latest, by camera
         self._guarded_work = self.guard_callback(self._work)
         self._rest = self.create_guard_condition(self._guarded_work)
-        self.collect(
-            PointCloud2, 'landmarks', read_landmarks, self._hear_landmarks, latched=True)
+        self.collect(PointCloud2, 'landmarks', read_landmarks, self._hear_landmarks, latched=True)
         self._collect(DiagnosticArray, 'scenario', read_key_values)
         for topic in self._poses:
             self._collect(PoseStamped, topic, read_pose)
@@ -148,8 +151,13 @@ class SolverNode(ManagedNode):
             self._listen_to_camera_info()
         if settings.lens and not self.BY_SCENARIO:
             self._join.expect_no_more('scenario')
-        lens = (f'lens {settings.lens}' if not told else
-                f'lens of {CAMERA_INFO}' if settings.lens else 'lens that scenario names')
+        lens = (
+            f'lens {settings.lens}'
+            if not told
+            else f'lens of {CAMERA_INFO}'
+            if settings.lens
+            else 'lens that scenario names'
+        )
         how = 'without its viewpoint shift' if settings.solves_svp else 'with its viewpoint shift'
         text = f'solving with the {lens} {how} (svp: {settings.svp})'
         if text != self._said:
@@ -187,8 +195,10 @@ class SolverNode(ManagedNode):
         """
         if self._lenses:
             if camera not in self._lenses:
-                raise ParameterError(f'lens {self.settings.lens}: it holds several cameras; add # '
-                                     'and the name of one')
+                raise ParameterError(
+                    f'lens {self.settings.lens}: it holds several cameras; add # '
+                    'and the name of one'
+                )
             return self._lenses[camera]
         if self.settings.lens == CAMERA_INFO:
             return self._infos.lens(f'{camera}{CAMERA_INFO}', stamp)
@@ -215,9 +225,7 @@ class SolverNode(ManagedNode):
             row=np.arange(len(points))[None],
         )
 
-    def publish_result(
-        self, stamp: int, metrics: Mapping[str, Array], problem: str = ''
-    ) -> None:
+    def publish_result(self, stamp: int, metrics: Mapping[str, Array], problem: str = '') -> None:
         """Publish the metrics (1,) of one set, together and one by one."""
         name = self.get_fully_qualified_name()
         values = {key: float(value[0]) for key, value in metrics.items()}
@@ -238,8 +246,14 @@ class SolverNode(ManagedNode):
         for topic in (f'{camera}{CAMERA_INFO}' for camera in self.cameras):
             if not self.listens_to(topic):
                 self._join.expect(topic)
-                self.collect(CameraInfo, topic, read_camera_info, functools.partial(hear, topic),
-                             INFO_INPUT, latched=True)
+                self.collect(
+                    CameraInfo,
+                    topic,
+                    read_camera_info,
+                    functools.partial(hear, topic),
+                    INFO_INPUT,
+                    latched=True,
+                )
 
     def _collect(self, kind: Any, topic: str, read: Any) -> None:
         self.collect(kind, topic, read, functools.partial(self._add, topic))
@@ -303,9 +317,11 @@ class SolverNode(ManagedNode):
         for topic, points in self._poses.items():
             off = self._join.distance(topic, one.stamps[points])
             if topic not in one.items and off is not None:
-                self.warn(f'{topic}: the nearest stamp is {1e-6 * off:.1f} ms from that of the '
-                          'image points; true poses are interpolated only over gaps up to '
-                          f'true_pose_gap ({self.settings.true_pose_gap:g} s)')
+                self.warn(
+                    f'{topic}: the nearest stamp is {1e-6 * off:.1f} ms from that of the '
+                    'image points; true poses are interpolated only over gaps up to '
+                    f'true_pose_gap ({self.settings.true_pose_gap:g} s)'
+                )
 
     def _look_at_next(self) -> None:
         """Decode what waits for the rest of its set, so that bad input is told of at once."""
@@ -328,7 +344,8 @@ class SolverNode(ManagedNode):
         try:
             items = self._contents(one.items)
             landmarks = self._standing.find_for_set(
-                items.get('landmarks'), self._join.distance('landmarks', one.stamp))
+                items.get('landmarks'), self._join.distance('landmarks', one.stamp)
+            )
             self.solve(one.stamp, landmarks, items)
             self._pace.counts['solved'] += 1
         except FisheyeSvpError as error:
@@ -343,8 +360,9 @@ class SolverNode(ManagedNode):
         items = {}
         for topic, item in unread.items():
             try:
-                items[topic] = (_interpolated_pose(item) if isinstance(item, NeighborPair)
-                                else item.read())
+                items[topic] = (
+                    _interpolated_pose(item) if isinstance(item, NeighborPair) else item.read()
+                )
             except FisheyeSvpError as error:
                 if topic in (*self._image_points, 'landmarks'):
                     raise
@@ -366,8 +384,10 @@ class SolverNode(ManagedNode):
         off = self._join.distance(missing, stamp)
         if off is None:
             return f'no message on {missing}'
-        return (f'the nearest stamp on {missing} is {1e-6 * off:.1f} ms off; with '
-                'approximate_sync:=true, up to approximate_sync_tolerance_seconds is allowed')
+        return (
+            f'the nearest stamp on {missing} is {1e-6 * off:.1f} ms off; with '
+            'approximate_sync:=true, up to approximate_sync_tolerance_seconds is allowed'
+        )
 
 
 def _interpolated_pose(poses: NeighborPair) -> Pose:

@@ -42,10 +42,13 @@ class StereoCalibrator(SolverNode):
         """Calibrate with one more set; raise GeometryError where the views fix no rig."""
         scenario = scenario_of(items)
         # A recording that starts over tells nothing new.
-        known = ([seen for seen in self._window if seen.stamp != stamp]
-                 if scenario == self._scenario else [])
+        known = (
+            [seen for seen in self._window if seen.stamp != stamp]
+            if scenario == self._scenario
+            else []
+        )
         one = make_set(stamp, landmarks, items, self.CAMERAS)
-        window = [*known, one][-self.settings.views:]
+        window = [*known, one][-self.settings.views :]
         left, right = stereo_views(table_of(window, self.CAMERAS), self.settings.sigma_px)
         found = solve_rigs(self.models(stamp, items), left, right, true=true_rig(items)).require()
         # Only now: a set that cannot be used must not spoil those to come.

@@ -78,8 +78,12 @@ class StereoDepth(SolverNode):
         true: Pose | None = items.get('right/true_pose')
         known = known_points(landmarks, right)[in_right]
         found = measure_points(
-            models, rig.take(None), uv[0][None], uv[1][None],
-            None if true is None else true.into_body(known)[None], self.settings.optimal,
+            models,
+            rig.take(None),
+            uv[0][None],
+            uv[1][None],
+            None if true is None else true.into_body(known)[None],
+            self.settings.optimal,
         ).require()
         points = found.solution.points[0]
         seen = np.isfinite(points[:, 0])
@@ -96,8 +100,10 @@ class StereoDepth(SolverNode):
     def _rig(self, items: Items) -> Pose:
         known = true_rig(items) if self.settings.rig == 'true' else self._given or self._latest
         if known is None:
-            raise ObservationError('no rig: true poses of both cameras are needed, or rig:=topic '
-                                   'and a calibrated one, or rig:=FILE')
+            raise ObservationError(
+                'no rig: true poses of both cameras are needed, or rig:=topic '
+                'and a calibrated one, or rig:=FILE'
+            )
         return known
 
 
@@ -109,7 +115,8 @@ def _rig_file(settings: SolverSettings) -> Pose | None:
         return None if rig in ('true', 'topic') else load_rig(rig)
     except LensError as cause:
         raise ParameterError(
-            f'rig is {rig!r}; true, topic or the file of a rig is needed ({cause})') from cause
+            f'rig is {rig!r}; true, topic or the file of a rig is needed ({cause})'
+        ) from cause
 
 
 def _shapes(
@@ -119,5 +126,8 @@ def _shapes(
     place = left.compose(rig.inverse()).transform(points)
     found = landmarks_shape(place)._replace(name='measured points', colour=(0.8, 0.2, 0.2, 1.0))
     curves = epipolar_curves(*models, rig, uv_right)
-    return [camera_shape(left, 'left', alpha=0.6),
-            *epipolar_shapes(models[0].lens, left, curves, uv_left), found]
+    return [
+        camera_shape(left, 'left', alpha=0.6),
+        *epipolar_shapes(models[0].lens, left, curves, uv_left),
+        found,
+    ]

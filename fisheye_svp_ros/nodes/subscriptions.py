@@ -112,7 +112,12 @@ class Input:
     """
 
     def __init__(
-        self, node: Any, kind: Any, name: str, receive: Callable[[bytes], None], qos: Any,
+        self,
+        node: Any,
+        kind: Any,
+        name: str,
+        receive: Callable[[bytes], None],
+        qos: Any,
         latched: bool,
     ) -> None:
         self.name, self.count = name, Count()
@@ -194,8 +199,9 @@ class Input:
             needed = reliable and (usual[0] or latched), latched
             if publisher.topic_type == self.typename and needed not in self._subscriptions:
                 qos = copy(self.profiles[0])
-                qos.reliability = (ReliabilityPolicy.RELIABLE if needed[0]
-                                   else ReliabilityPolicy.BEST_EFFORT)
+                qos.reliability = (
+                    ReliabilityPolicy.RELIABLE if needed[0] else ReliabilityPolicy.BEST_EFFORT
+                )
                 if latched:
                     qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
                 self._add_subscription(needed, qos)
@@ -210,16 +216,27 @@ class Input:
         adapt = node.guard_callback(lambda _: self.adapt())
         events = SubscriptionEventCallbacks(
             matched=adapt if self._latched else None,
-            incompatible_qos=None if self._is_fixed() else adapt)
+            incompatible_qos=None if self._is_fixed() else adapt,
+        )
         hear = self._filter.callback()
 
         def receive(data: bytes) -> None:
             hear(data)
             node.after_message()
 
-        self._subscriptions[kind] = _Subscription(create_with_qos(
-            node, node.create_subscription, self._kind, self.name, receive,
-            qos=qos, raw=True, event_callbacks=events), hear)
+        self._subscriptions[kind] = _Subscription(
+            create_with_qos(
+                node,
+                node.create_subscription,
+                self._kind,
+                self.name,
+                receive,
+                qos=qos,
+                raw=True,
+                event_callbacks=events,
+            ),
+            hear,
+        )
 
 
 class DuplicateFilter:
@@ -278,8 +295,7 @@ def explain_silence(node: Any, inputs: Sequence[Input]) -> tuple[str, str]:
     one = next((one for one, found in publishers.items() if found), inputs[0])
     one = next((known for known in inputs if known.has_messages), one)
     since = f' for {one.silent_for():.0f} s' if one.has_messages else ''
-    return (f'no message on {one.resolved}{since}',
-            _reason(node, inputs, one, publishers[one]))
+    return (f'no message on {one.resolved}{since}', _reason(node, inputs, one, publishers[one]))
 
 
 def _reason(node: Any, inputs: Sequence[Input], one: Input, publishers: Sequence[Any]) -> str:
@@ -290,39 +306,58 @@ def _reason(node: Any, inputs: Sequence[Input], one: Input, publishers: Sequence
     right = [info for info in publishers if info.topic_type == one.typename]
     if not right:
         kinds = ', '.join(sorted({info.topic_type for info in publishers}))
-        return (f'its type is {kinds}, but {one.typename} is needed; '
-                + _proposal(node, inputs))
+        return f'its type is {kinds}, but {one.typename} is needed; ' + _proposal(node, inputs)
     names = ', '.join(sorted({info.node_name for info in right}))
     if one.has_messages:
-        return (f'{names} is still connected; check its own input, and run ros2 topic hz '
-                f'{one.resolved}')
+        return (
+            f'{names} is still connected; check its own input, and run ros2 topic hz '
+            f'{one.resolved}'
+        )
     offers = [info.qos_profile for info in right]
-    if all(qos_check_compatible(offered, asked)[0] == QoSCompatibility.ERROR
-           for offered in offers for asked in one.profiles):
-        return (f'{names} offers {qos_words(offers[0])}, but this node requests '
-                f'{qos_words(one.profiles[0])}; remove {PREFIX}{one.resolved}.subscription.*')
+    if all(
+        qos_check_compatible(offered, asked)[0] == QoSCompatibility.ERROR
+        for offered in offers
+        for asked in one.profiles
+    ):
+        return (
+            f'{names} offers {qos_words(offers[0])}, but this node requests '
+            f'{qos_words(one.profiles[0])}; remove {PREFIX}{one.resolved}.subscription.*'
+        )
     lossy = all(asked.reliability == ReliabilityPolicy.BEST_EFFORT for asked in one.profiles)
-    large = (' (best effort loses large messages: raise net.core.rmem_max, or set '
-             f'{PREFIX}{one.resolved}.subscription.reliability:=reliable)' if lossy else '')
+    large = (
+        ' (best effort loses large messages: raise net.core.rmem_max, or set '
+        f'{PREFIX}{one.resolved}.subscription.reliability:=reliable)'
+        if lossy
+        else ''
+    )
     return f'{names} is connected, but no message has arrived{large}'
 
 
 def _comes_from_elsewhere(node: Any, topic: str) -> bool:
     own = node.get_name(), node.get_namespace()
-    return any((info.node_name, info.node_namespace) != own
-               for info in node.get_publishers_info_by_topic(topic))
+    return any(
+        (info.node_name, info.node_namespace) != own
+        for info in node.get_publishers_info_by_topic(topic)
+    )
 
 
 def _proposal(node: Any, inputs: Sequence[Input]) -> str:
     """Return the topics of the same type that are most alike, and how to listen to the first."""
     wanted, known = inputs[0], {one.typename for one in inputs}
     own = {one.resolved for one in inputs}
-    found = [topic for topic, kinds in node.get_topic_names_and_types()
-             if known & {*kinds} and topic not in own and _comes_from_elsewhere(node, topic)]
+    found = [
+        topic
+        for topic, kinds in node.get_topic_names_and_types()
+        if known & {*kinds} and topic not in own and _comes_from_elsewhere(node, topic)
+    ]
     if not found:
-        return (f'no topic here has type {wanted.typename}; start its publisher with the same '
-                'ROS_DOMAIN_ID')
+        return (
+            f'no topic here has type {wanted.typename}; start its publisher with the same '
+            'ROS_DOMAIN_ID'
+        )
     found.sort(key=lambda topic: -SequenceMatcher(None, topic, wanted.resolved).ratio())
     topic = found[0].removesuffix('/compressed') if len(inputs) > 1 else found[0]
-    return (f'{wanted.typename} is on {", ".join(found[:_MAX_PROPOSALS])}; subscribe to it with '
-            f'-r {wanted.name}:={topic}')
+    return (
+        f'{wanted.typename} is on {", ".join(found[:_MAX_PROPOSALS])}; subscribe to it with '
+        f'-r {wanted.name}:={topic}'
+    )

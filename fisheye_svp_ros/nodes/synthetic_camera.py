@@ -42,9 +42,11 @@ class PhotographingSettings(SyntheticCameraSettings):
     """Parameters of the synthetic camera and of what it photographs."""
 
     photograph: str = parameter(
-        '', 'Board, chessboard:COLUMNSxROWS:SIZE: publish rendered images of it on `image`, in '
+        '',
+        'Board, chessboard:COLUMNSxROWS:SIZE: publish rendered images of it on `image`, in '
         'place of landmarks and image points. Its first inner corner is the origin of the '
-        'world, x right, y down, z away from the camera', fixed=True
+        'world, x right, y down, z away from the camera',
+        fixed=True,
     )
 
 
@@ -76,8 +78,9 @@ class SyntheticCamera(CameraNode):
         super().__init__(node_name, **options)
         self._sweep = sweep_of(Scenario, self.given)
         for name, values in self._sweep.lists.items():
-            self.declare_parameter(SWEEP + name, values, ParameterDescriptor(read_only=True),
-                                   ignore_override=True)
+            self.declare_parameter(
+                SWEEP + name, values, ParameterDescriptor(read_only=True), ignore_override=True
+            )
         self._markers = self.announce(MarkerArray, 'markers', LATCHED)
         self.start()
 
@@ -97,8 +100,9 @@ class SyntheticCamera(CameraNode):
     def configure(self, settings: SyntheticCameraSettings) -> None:
         """Start over with new settings."""
         lists = self._sweep.lists
-        for style, rig in itertools.product(lists.get('style', (settings.style,)),
-                                            lists.get('rig_file', (settings.rig_file,))):
+        for style, rig in itertools.product(
+            lists.get('style', (settings.style,)), lists.get('rig_file', (settings.rig_file,))
+        ):
             for name in camera_names(style, rig):
                 self.camera(name)
         self.play(steps(settings, self._sweep))
@@ -106,11 +110,17 @@ class SyntheticCamera(CameraNode):
     def publish_set(self, step: SweepSet, stamp: int) -> None:
         """Publish a set."""
         if self._sweep.lists:
-            self.get_logger().info(f'scenario {step.number + 1} of {len(self._sweep)}',
-                                   throttle_duration_sec=_SAY_EVERY)
+            self.get_logger().info(
+                f'scenario {step.number + 1} of {len(self._sweep)}',
+                throttle_duration_sec=_SAY_EVERY,
+            )
         simulation = step.simulation
-        place = {'scenario': step.number, 'scenarios': len(self._sweep),
-                 'set': step.place, 'sets': step.sets}
+        place = {
+            'scenario': step.number,
+            'scenarios': len(self._sweep),
+            'set': step.place,
+            'sets': step.sets,
+        }
         text = ', '.join(f'{name} {value}' for name, value in step.swept.items())
         self.tag(stamp, {**place, **scalars(step.scenario)}, text)
         self.publish_landmarks(simulation.landmarks, stamp)
@@ -146,10 +156,21 @@ def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[SweepSet]
                 table = simulation.observations
                 rows_of = rows_by_frame(table)
                 for frame in range(len(simulation.poses[0].position)):
-                    seen = {camera: table.take(rows_of.get((frame, camera), nothing))
-                            for camera in table.cameras}
-                    yield SweepSet(number, first + frame, sets, frame, scenario, swept,
-                                   simulation, seen, svp_lenses)
+                    seen = {
+                        camera: table.take(rows_of.get((frame, camera), nothing))
+                        for camera in table.cameras
+                    }
+                    yield SweepSet(
+                        number,
+                        first + frame,
+                        sets,
+                        frame,
+                        scenario,
+                        swept,
+                        simulation,
+                        seen,
+                        svp_lenses,
+                    )
         if not settings.repeat:
             return
 

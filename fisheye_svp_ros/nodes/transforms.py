@@ -30,11 +30,15 @@ class Transforms:
         self._children: set[str] = set()
         if wanted:
             self._kind = _message_class()
-            self._publisher = (node.announce(self._kind, '/tf_static', LATCHED) if static
-                               else node.announce(self._kind, '/tf'))
+            self._publisher = (
+                node.announce(self._kind, '/tf_static', LATCHED)
+                if static
+                else node.announce(self._kind, '/tf')
+            )
             for topic, asked in TRANSFORMS.items():
                 node.create_subscription(
-                    self._kind, topic, node.guard_callback(self._compare), asked, raw=True)
+                    self._kind, topic, node.guard_callback(self._compare), asked, raw=True
+                )
 
     def publish(self, pose: Pose, stamp: int, frame: str, child: str) -> None:
         """Publish the pose of a frame in its parent; warn where frame ids cannot be used."""
@@ -58,7 +62,8 @@ class Transforms:
                 self._node.warn(
                     f'/tf: another node also publishes {child!r}, with parent '
                     f'{transform.header.frame_id!r}; set another camera_frame in one of them, or '
-                    'publish_tf:=false')
+                    'publish_tf:=false'
+                )
 
 
 def _message_class() -> Any:
@@ -68,5 +73,6 @@ def _message_class() -> Any:
     except ImportError as cause:
         raise ParameterError(
             'publish_tf: tf2_msgs is not installed; source a ROS 2 that has it (apt install '
-            'ros-jazzy-tf2-msgs; it has no wheel), or set publish_tf:=false') from cause
+            'ros-jazzy-tf2-msgs; it has no wheel), or set publish_tf:=false'
+        ) from cause
     return TFMessage

@@ -54,8 +54,9 @@ class LinearImage:
     def incidence(self) -> Incidence:
         """Where the points have their ray through the lens."""
         if self.lens.port is not None:
-            return _reshape(port_projection.met(self.lens, self._sight, self.limited),
-                           self.points.shape[:-1])
+            return _reshape(
+                port_projection.met(self.lens, self._sight, self.limited), self.points.shape[:-1]
+            )
         return incidence(self.lens, self.points, self.limited)
 
     @property
@@ -79,8 +80,13 @@ class LinearImage:
         h = self._along_radius * height[..., None]
         u, v = h[..., 0] / self.lens.fx, h[..., 1] / self.lens.fy
         zero, one = np.zeros_like(u), np.ones_like(u)
-        columns = np.stack([np.stack([u, u, zero, one, zero], axis=-1),
-                            np.stack([v, zero, v, zero, one], axis=-1)], axis=-2)
+        columns = np.stack(
+            [
+                np.stack([u, u, zero, one, zero], axis=-1),
+                np.stack([v, zero, v, zero, one], axis=-1),
+            ],
+            axis=-2,
+        )
         columns = self.through_field(columns)
         return dict(zip(('f', *INTRINSICS), np.moveaxis(columns, -1, 0), strict=True))
 
@@ -121,8 +127,12 @@ class Rays(NamedTuple):
 
     def reshape(self, shape: tuple[int, ...]) -> Rays:
         """Return as many rays in another leading shape."""
-        return Rays(self.origin.reshape(*shape, 3), self.direction.reshape(*shape, 3),
-                    self.theta.reshape(shape), self.valid.reshape(shape))
+        return Rays(
+            self.origin.reshape(*shape, 3),
+            self.direction.reshape(*shape, 3),
+            self.theta.reshape(shape),
+            self.valid.reshape(shape),
+        )
 
 
 def incidence(lens: Lens, points: Array, limited: bool = True) -> Incidence:
@@ -153,8 +163,14 @@ def project_with_jacobian(lens: Lens, points: Array) -> LinearImage:
     still = np.eye(3)[None], np.zeros((1, 3))
     uv, valid, d_pose = engines.linearise_views(lens, *still, points.reshape(1, -1, 3), True)
     d_point = -d_pose[..., :3]  # the camera moves the other way
-    return LinearImage(lens, points, True, uv.reshape(*shape, 2), valid.reshape(shape),
-                       d_point.reshape(*shape, 2, 3))
+    return LinearImage(
+        lens,
+        points,
+        True,
+        uv.reshape(*shape, 2),
+        valid.reshape(shape),
+        d_point.reshape(*shape, 2, 3),
+    )
 
 
 def lens_columns(lens: Lens, image: LinearImage, names: Sequence[str]) -> Array:

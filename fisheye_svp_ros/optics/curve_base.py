@@ -229,7 +229,7 @@ class SumOfShifts(ViewpointShift):
         for part in self.parts:
             names = part.coefficient_names
             parts.append(part.with_values(**dict(zip(names, left, strict=False))))
-            left = left[len(names):]
+            left = left[len(names) :]
         return replace(self, parts=tuple(parts))
 
     def check(self) -> str:
@@ -257,7 +257,7 @@ class SumOfShifts(ViewpointShift):
         for number, part in enumerate(self.parts):
             merged = part.merge(other)
             if merged is not None:
-                return SumOfShifts((*self.parts[:number], merged, *self.parts[number + 1:]))
+                return SumOfShifts((*self.parts[:number], merged, *self.parts[number + 1 :]))
         return SumOfShifts((*self.parts, other))
 
 

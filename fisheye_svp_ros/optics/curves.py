@@ -146,18 +146,26 @@ class FlatPort(ViewpointShift):
         return '' if index > 1.0 else f'refractive_index is {index}; it must be above 1'
 
 
-IMAGE_HEIGHTS: Registry[type[ImageHeight]] = Registry('image_heights', {
-    'orthographic': Orthographic,
-    'equidistant': Equidistant,
-    'equisolid': Equisolid,
-    'stereographic': Stereographic,
-    'kannala_brandt': KannalaBrandt,
-}, ImageHeight)
+IMAGE_HEIGHTS: Registry[type[ImageHeight]] = Registry(
+    'image_heights',
+    {
+        'orthographic': Orthographic,
+        'equidistant': Equidistant,
+        'equisolid': Equisolid,
+        'stereographic': Stereographic,
+        'kannala_brandt': KannalaBrandt,
+    },
+    ImageHeight,
+)
 
-VIEWPOINT_SHIFTS: Registry[type[ViewpointShift]] = Registry('viewpoint_shifts', {
-    'gennery': Gennery,
-    'flat_port': FlatPort,
-}, ViewpointShift)
+VIEWPOINT_SHIFTS: Registry[type[ViewpointShift]] = Registry(
+    'viewpoint_shifts',
+    {
+        'gennery': Gennery,
+        'flat_port': FlatPort,
+    },
+    ViewpointShift,
+)
 
 
 def kannala_brandt_equivalent(lens: Lens) -> Lens:

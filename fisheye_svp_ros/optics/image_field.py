@@ -49,7 +49,8 @@ class ImageField:
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ImageField) and all(
             np.array_equal(getattr(self, name), getattr(other, name))
-            for name in ('low', 'pitch', 'values', 'stderr'))
+            for name in ('low', 'pitch', 'values', 'stderr')
+        )
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -61,8 +62,10 @@ class ImageField:
     def slope(self, uv: Array) -> Array:
         """Return derivatives (..., 2, 2) of the displacement: row of u, of v; by u, by v."""
         basis = self._basis(uv)
-        slopes = [self._sum(basis, basis.slope[:, 0], basis.value[:, 1]),
-                  self._sum(basis, basis.value[:, 0], basis.slope[:, 1])]
+        slopes = [
+            self._sum(basis, basis.slope[:, 0], basis.value[:, 1]),
+            self._sum(basis, basis.value[:, 0], basis.slope[:, 1]),
+        ]
         return np.stack(slopes, axis=-1).reshape(*uv.shape, 2)
 
     def apply(self, uv: Array) -> Array:
@@ -87,14 +90,19 @@ class ImageField:
 
     def check(self, width: int, height: int) -> str:
         """Say what is wrong with it in an image of so many px; empty if nothing is."""
-        sides = zip((width, height), np.maximum(self.pitch, max(width, height) / MAX_NODES) / 2,
-                    strict=True)
+        sides = zip(
+            (width, height),
+            np.maximum(self.pitch, max(width, height) / MAX_NODES) / 2,
+            strict=True,
+        )
         uv = np.stack(np.meshgrid(*(np.arange(0.0, side, step) for side, step in sides)), axis=-1)
         fold = np.linalg.det(self.slope(uv) + np.eye(2))
         if fold.min() <= 0:
             u, v = uv.reshape(-1, 2)[fold.argmin()]
-            return (f'image_field folds the image at ({u:.0f}, {v:.0f}) px; its values must '
-                    'change by less than the pitch from node to node')
+            return (
+                f'image_field folds the image at ({u:.0f}, {v:.0f}) px; its values must '
+                'change by less than the pitch from node to node'
+            )
         return ''
 
     @classmethod
@@ -147,10 +155,14 @@ class ImageField:
         """Return the field of a lens file; raise LensError naming `where` and the field."""
         where = f'{where}: corrections.image_field'
         if unknown := sorted(set(map(str, entry)) - set(_FIELDS)):
-            raise LensError(f'{where}: unknown field {unknown[0]!r}; known are '
-                            + ', '.join(_FIELDS))
-        arrays = {name: _numbers(entry, name, where) for name in _FIELDS
-                  if name in entry or name != 'stderr'}
+            raise LensError(
+                f'{where}: unknown field {unknown[0]!r}; known are ' + ', '.join(_FIELDS)
+            )
+        arrays = {
+            name: _numbers(entry, name, where)
+            for name in _FIELDS
+            if name in entry or name != 'stderr'
+        }
         u, v = arrays['u'], arrays['v']
         for name in ('low', 'pitch'):
             if arrays[name].shape != (2,):
@@ -162,12 +174,13 @@ class ImageField:
             if one.ndim != 2 or one.shape != u.shape:
                 raise LensError(f'{where}.{name} must be rows of numbers, as many as those of u')
         if not all(MIN_NODES <= count <= MAX_NODES for count in u.shape):
-            raise LensError(f'{where}: {u.shape[0]} rows of {u.shape[1]} nodes; {MIN_NODES} to '
-                            f'{MAX_NODES} are needed of each')
+            raise LensError(
+                f'{where}: {u.shape[0]} rows of {u.shape[1]} nodes; {MIN_NODES} to '
+                f'{MAX_NODES} are needed of each'
+            )
         if 'stderr' in arrays and (arrays['stderr'] < 0).any():
             raise LensError(f'{where}.stderr has a number below 0')
-        return cls(arrays['low'], arrays['pitch'], np.stack([u, v], axis=-1),
-                   arrays.get('stderr'))
+        return cls(arrays['low'], arrays['pitch'], np.stack([u, v], axis=-1), arrays.get('stderr'))
 
     @cached_property
     def _padded_values(self) -> Array:
@@ -189,7 +202,7 @@ class ImageField:
         t = place - first - 1
         left = 1 - t
         value = np.stack([left**3, 3 * t**3 - 6 * t**2 + 4, 3 * left**3 - 6 * left**2 + 4, t**3])
-        slope = np.stack([-left**2, 3 * t**2 - 4 * t, 4 * left - 3 * left**2, t**2])
+        slope = np.stack([-(left**2), 3 * t**2 - 4 * t, 4 * left - 3 * left**2, t**2])
         return _Basis(first, value / 6, slope / 2 / self.pitch[:, None])
 
     def _sum(self, basis: _Basis, by_u: Array, by_v: Array) -> Array:
@@ -216,8 +229,9 @@ def _numbers(entry: Mapping[str, Any], name: str, where: str) -> Array:
     try:
         found = np.array(entry[name], dtype=float)
     except (TypeError, ValueError, OverflowError) as cause:
-        raise LensError(f'{where}.{name} must be lists of numbers, as long as each other'
-                        ) from cause
+        raise LensError(
+            f'{where}.{name} must be lists of numbers, as long as each other'
+        ) from cause
     if not np.isfinite(found).all():
         raise LensError(f'{where}.{name} holds a number that is not finite')
     return found

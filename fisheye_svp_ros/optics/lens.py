@@ -183,8 +183,10 @@ def check_lens(lens: Lens, where: str) -> Lens:
     """Return the lens; raise LensError, naming `where` and the field, if it is impossible."""
     wrong, limit = lens.check(), curve_limit(lens)
     if not wrong and not 0 < lens.max_incidence <= limit + 1e-9:
-        wrong = (f'max_incidence_deg is {np.degrees(lens.max_incidence):.6g}; '
-                 f'these curves allow a value above 0 and up to {np.degrees(limit):.6g}')
+        wrong = (
+            f'max_incidence_deg is {np.degrees(lens.max_incidence):.6g}; '
+            f'these curves allow a value above 0 and up to {np.degrees(limit):.6g}'
+        )
     if wrong:
         raise LensError(f'{where}: {wrong}')
     return lens

@@ -46,8 +46,9 @@ class Varying:
         return Varying(self.value - other.value, self.slope - other.slope)
 
     def __mul__(self, other: Varying) -> Varying:
-        return Varying(self.value * other.value,
-                       self.slope * other.value + self.value * other.slope)
+        return Varying(
+            self.value * other.value, self.slope * other.value + self.value * other.slope
+        )
 
     def __truediv__(self, other: Varying) -> Varying:
         ratio = self.value / other.value
@@ -59,8 +60,9 @@ class Varying:
     def dot(self, other: Varying) -> Varying:
         """Return the inner product of two vectors, (1, M)."""
         both = self * other
-        return Varying(both.value.sum(axis=-2, keepdims=True),
-                       both.slope.sum(axis=-2, keepdims=True))
+        return Varying(
+            both.value.sum(axis=-2, keepdims=True), both.slope.sum(axis=-2, keepdims=True)
+        )
 
     def root(self) -> Varying:
         """Return the square root; NaN below 0."""
@@ -79,8 +81,10 @@ class Varying:
 
 def stack_vector(x: Varying, y: Varying, z: Varying) -> Varying:
     """Return the vector (3, M) of three numbers."""
-    return Varying(np.concatenate([x.value, y.value, z.value], axis=-2),
-                   np.concatenate([x.slope, y.slope, z.slope], axis=-2))
+    return Varying(
+        np.concatenate([x.value, y.value, z.value], axis=-2),
+        np.concatenate([x.slope, y.slope, z.slope], axis=-2),
+    )
 
 
 def constant(value: float, variables: int) -> Varying:
@@ -159,7 +163,12 @@ class FlatGlass(Port):
     thickness: float = 0.0
     glass_index: float = 1.5
     coefficient_names = (
-        'distance', 'medium_index', 'tilt_x', 'tilt_y', 'thickness', 'glass_index'
+        'distance',
+        'medium_index',
+        'tilt_x',
+        'tilt_y',
+        'thickness',
+        'glass_index',
     )
     placed = ('distance', 'tilt_x', 'tilt_y')
 
@@ -196,8 +205,11 @@ class FlatGlass(Port):
         z = points @ normal
         across = points - z[:, None] * normal
         r, deep = np.linalg.norm(across, axis=-1), z - self.reach
-        layers = ((self.distance, 1.0), (self.thickness, self.glass_index**2),
-                  (deep, self.medium_index**2))
+        layers = (
+            (self.distance, 1.0),
+            (self.thickness, self.glass_index**2),
+            (deep, self.medium_index**2),
+        )
         u = np.zeros_like(r)
         for _ in range(_STEPS):
             height, slope = np.zeros_like(r), np.zeros_like(r)
@@ -211,8 +223,9 @@ class FlatGlass(Port):
                 break
         way = across / np.maximum(r, 1e-300)[:, None]
         seen = (deep > 0) & np.isfinite(u) & (np.abs(r - height) < 1e-6 * (1 + r))
-        return np.where(seen[:, None], (normal + u[:, None] * way) / np.hypot(1, u)[:, None],
-                        np.nan)
+        return np.where(
+            seen[:, None], (normal + u[:, None] * way) / np.hypot(1, u)[:, None], np.nan
+        )
 
 
 @dataclass(frozen=True)

@@ -129,8 +129,14 @@ def _shifted_rays(
 
 
 def _newton(
-    shift: ViewpointShift, r: Array, z: Array, theta: Array, sin: Array, cos: Array,
-    steps: int = NEWTON_STEPS, more: int = MORE_STEPS,
+    shift: ViewpointShift,
+    r: Array,
+    z: Array,
+    theta: Array,
+    sin: Array,
+    cos: Array,
+    steps: int = NEWTON_STEPS,
+    more: int = MORE_STEPS,
 ) -> tuple[Array, Array, Array, Array, Mask]:
     """Take Newton steps, and up to so many more with the points that have not settled.
 

@@ -34,9 +34,7 @@ from fisheye_svp_ros.study.solutions import localize_sets, residual_points
 from fisheye_svp_ros.study.sweep import CAMERA, plan_sweep, sweep_rows
 
 # Poses of the right camera for depth, x, y, z, qx, qy, qz, qw: one a lens (section 5).
-DEPTH_POSES = [
-    [0.0, 0.0, RIGHT_CAMERA_Z.get(lens, 0.0), 1.0, 0.0, 0.0, 0.0] for lens in LENSES
-]
+DEPTH_POSES = [[0.0, 0.0, RIGHT_CAMERA_Z.get(lens, 0.0), 1.0, 0.0, 0.0, 0.0] for lens in LENSES]
 _MM, _DEGREE = 1e-3, np.radians(1.0)
 _PAIR_RANGE = 0.5  # m, of the paper's nearer landmarks
 _BOARD = Print(9, 6, 0.065)
@@ -56,15 +54,34 @@ class Task(NamedTuple):
 
 
 TASKS = (
-    Task('localization', 'Self-localization as SVP. error: of the position along the axis; image: '
-         'mean residual', 'environment', SPREADS, 'localizer', 'position_error_z_m',
-         'mean_residual_px'),
-    Task('calibration', 'Stereo calibration as SVP. error: of the place of the left camera; '
-         'image: mean residual', 'style', STYLE_NAMES, 'stereo_calibrator', 'position_error_m',
-         'mean_residual_px'),
-    Task('depth', 'Stereo depth as SVP. error: Error3, mean distance from the true points; image: '
-         'Error2, mean distance from the epipolar curves; published: over all panels', 'style',
-         STYLE_NAMES, 'stereo_depth', 'error3_m', 'error2_px'),
+    Task(
+        'localization',
+        'Self-localization as SVP. error: of the position along the axis; image: mean residual',
+        'environment',
+        SPREADS,
+        'localizer',
+        'position_error_z_m',
+        'mean_residual_px',
+    ),
+    Task(
+        'calibration',
+        'Stereo calibration as SVP. error: of the place of the left camera; image: mean residual',
+        'style',
+        STYLE_NAMES,
+        'stereo_calibrator',
+        'position_error_m',
+        'mean_residual_px',
+    ),
+    Task(
+        'depth',
+        'Stereo depth as SVP. error: Error3, mean distance from the true points; image: '
+        'Error2, mean distance from the epipolar curves; published: over all panels',
+        'style',
+        STYLE_NAMES,
+        'stereo_depth',
+        'error3_m',
+        'error2_px',
+    ),
 )
 
 
@@ -87,12 +104,11 @@ class DemoRow(NamedTuple):
     published_pixels: tuple[float, float]
 
 
-def camera_parameters(
-    task: Task, lenses: Sequence[str], radii: Sequence[float]
-) -> dict[str, Any]:
+def camera_parameters(task: Task, lenses: Sequence[str], radii: Sequence[float]) -> dict[str, Any]:
     """Return the camera's parameters for the scenarios of a task."""
     parameters: dict[str, Any] = {
-        'sweep.lens': list(lenses), 'sweep.radius': list(radii),
+        'sweep.lens': list(lenses),
+        'sweep.radius': list(radii),
         f'sweep.{task.swept}': list(task.values),
     }
     if task.name == 'calibration':
@@ -114,10 +130,14 @@ def compute_demo(
         count = len(part['set'])
         parts.append((count, {NAMESPACE: [f'/{task.name}'] * count, **part}))
     names = dict.fromkeys(name for _, part in parts for name in part)
-    columns = {name: [cell for count, part in parts for cell in part.get(name, [None] * count)]
-               for name in names}
-    fields = [_residual_field(Scenario(lens=lens, radius=radius))
-              for lens, radius in itertools.product(lenses, radii)]
+    columns = {
+        name: [cell for count, part in parts for cell in part.get(name, [None] * count)]
+        for name in names
+    }
+    fields = [
+        _residual_field(Scenario(lens=lens, radius=radius))
+        for lens, radius in itertools.product(lenses, radii)
+    ]
     return columns, fields
 
 
@@ -148,8 +168,10 @@ def demo_rows(columns: Columns, lenses: Sequence[str], radii: Sequence[float]) -
     for lens, task, radius in itertools.product(lenses, TASKS, radii):
         for where in task.values:
             if (task.name, lens, radius, where) not in found:
-                raise BagError(f'no result of {task.node} for {lens}, {where}, {radius} m; see '
-                               'the logs next to the recording')
+                raise BagError(
+                    f'no result of {task.node} for {lens}, {where}, {radius} m; see '
+                    'the logs next to the recording'
+                )
             rows.append(_row(task, lens, radius, where, found[task.name, lens, radius, where]))
     return rows
 
@@ -172,8 +194,16 @@ def _row(task: Task, lens: str, radius: float, where: str, row: dict[str, Any]) 
 
     error, axis, pixels = _published_cells(task, lens, radius, where)
     return DemoRow(
-        task.name, lens, radius, where, metric(task.error), metric('axis_error_rad'),
-        metric(task.pixels), error, axis, pixels
+        task.name,
+        lens,
+        radius,
+        where,
+        metric(task.error),
+        metric('axis_error_rad'),
+        metric(task.pixels),
+        error,
+        axis,
+        pixels,
     )
 
 
@@ -198,8 +228,10 @@ def rectified_pair(lens: Lens) -> tuple[RectifiedPair, tuple[NDArray[Any], ...]]
     camera = camera_for([lens], 'pinhole', (640, 480), np.radians(110.0), along_baseline=True)
     pair = rectify_pair(lens, lens, both, camera, _PAIR_RANGE)
     left = place.inverse()
-    images = [side.remap(render(lens, _BOARD, pose, Exposure(), np.random.default_rng(0)))
-              for side, pose in ((pair.left, left), (pair.right, left.compose(both.inverse())))]
+    images = [
+        side.remap(render(lens, _BOARD, pose, Exposure(), np.random.default_rng(0)))
+        for side, pose in ((pair.left, left), (pair.right, left.compose(both.inverse())))
+    ]
     return pair, tuple(images)
 
 

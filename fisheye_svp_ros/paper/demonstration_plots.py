@@ -52,8 +52,9 @@ def _draw_errors(axis: Any, rows: Sequence[DemoRow]) -> None:
     ours = 1e3 * np.array([row.error for row in rows])
     low, high = 1e3 * np.array([row.published_error for row in rows]).T
     if rows[0].task == 'depth':
-        axis.axvspan(low[0], high[0], color=PUBLISHED, alpha=0.15, linewidth=0,
-                     label='published range')
+        axis.axvspan(
+            low[0], high[0], color=PUBLISHED, alpha=0.15, linewidth=0, label='published range'
+        )
         axis.set_xscale('log')
         axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.xaxis.set_minor_formatter('')
@@ -88,13 +89,23 @@ def _draw_field(axis: Any, field: ResidualSet, lens: Lens) -> None:
     size = np.linalg.norm(residual, axis=-1)
     # The longest residual takes an eighth of the image, whatever it is.
     factor = round_number(lens.width / 8 / size.max())
-    axis.quiver(*uv.T, *(factor * residual.T), angles='xy', scale_units='xy', scale=1,
-                color=OURS, width=0.005)
+    axis.quiver(
+        *uv.T,
+        *(factor * residual.T),
+        angles='xy',
+        scale_units='xy',
+        scale=1,
+        color=OURS,
+        width=0.005,
+    )
     axis.plot(*uv.T, 'o', markersize=3, color='#404850')
     corner, margin = (-0.5, -0.5), 0.1 * lens.width
     axis.add_patch(Rectangle(corner, lens.width, lens.height, fill=False, color=FAINT))
     axis.set(xlim=(-margin, lens.width + margin), ylim=(lens.height + margin, -margin))
     axis.set_aspect('equal')
     axis.axis('off')
-    axis.set_title(f'{field.tags["lens"]}, landmarks at {float(field.tags["radius"]):g} m\n'
-                   f'residual {size.mean():.2g} px on average, x {factor:g}', loc='left')
+    axis.set_title(
+        f'{field.tags["lens"]}, landmarks at {float(field.tags["radius"]):g} m\n'
+        f'residual {size.mean():.2g} px on average, x {factor:g}',
+        loc='left',
+    )

@@ -84,7 +84,8 @@ def calibrated_shift(lens: Lens) -> Lens:
     right = Pose.concatenate(poses)
     points = np.repeat(
         np.stack([landmarks_at('whole', radius) for radius in RADII]),
-        len(poses[0].position), axis=0,
+        len(poses[0].position),
+        axis=0,
     )
     exact = ForwardModel(lens).predict(right, views_of(points))
     noise = CALIBRATION_NOISE * np.random.default_rng(0).standard_normal(exact.uv.shape)
@@ -119,14 +120,16 @@ def crossings(lens: Lens) -> list[Crossings]:
         localized = localize_environments(lens, points)
         deviation = 1e3 * np.sqrt(localized.solved.covariance[:, 2, 2])  # mm for 1 px
         error = np.abs(localized.rows[:, 2])
-        found.append(Crossings(lens.name, 'position', spread,
-                               _drops_under(_RANGES, error / deviation)))
-        found.append(Crossings(lens.name, 'residual', spread,
-                               _drops_under(_RANGES, localized.rows[:, -1])))
+        found.append(
+            Crossings(lens.name, 'position', spread, _drops_under(_RANGES, error / deviation))
+        )
+        found.append(
+            Crossings(lens.name, 'residual', spread, _drops_under(_RANGES, localized.rows[:, -1]))
+        )
     for style in STYLE_NAMES:
-        error2 = np.array([
-            measure(lens, radius, style).metrics['error2_px'] for radius in _STEREO_RANGES
-        ])
+        error2 = np.array(
+            [measure(lens, radius, style).metrics['error2_px'] for radius in _STEREO_RANGES]
+        )
         found.append(Crossings(lens.name, 'Error2', style, _drops_under(_STEREO_RANGES, error2)))
     return found
 
@@ -145,7 +148,7 @@ def _drops_under(ranges: Array, error: Array) -> Array:
         if last == len(ranges) - 1:
             found[i] = np.nan
             continue
-        low, high = np.log(error[last:last + 2])
+        low, high = np.log(error[last : last + 2])
         along = (low - np.log(noise)) / (low - high)
         found[i] = ranges[last] * (ranges[last + 1] / ranges[last]) ** along
     return found

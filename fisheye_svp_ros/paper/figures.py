@@ -1,6 +1,5 @@
 """Figures 4 to 10 of Kita's paper, in its arrangement, and pictures of what lies past it."""
 
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,8 +39,9 @@ _LINES = ('-', '--', ':')
 _VIEWS = (((0, 1), 'x / m', 'y / m'), ((0, 2), 'x / m', 'z / m'))
 _SUMMARIES: dict[str, Callable[[LensEvaluation], float]] = {
     'Localization: mean |z| / mm': lambda e: float(np.abs(e.localization[..., 2]).mean()),
-    'Stereo calibration:\nmean position error / mm':
-        lambda e: float(np.linalg.norm(e.calibration[..., :3], axis=-1).mean()),
+    'Stereo calibration:\nmean position error / mm': lambda e: float(
+        np.linalg.norm(e.calibration[..., :3], axis=-1).mean()
+    ),
     'Epipolar curves: mean Error2 / px': lambda e: float(e.panels('error2_px').mean()),
     'Stereo depth: mean Error3 / mm': lambda e: float(1e3 * e.panels('error3_m').mean()),
 }
@@ -55,11 +55,23 @@ def draw_shift(path: Path, lenses: dict[str, Lens], family: Family) -> None:
             theta = np.linspace(0, lens.max_incidence, 200)
             curves = 1e3 * shift_curves(family.matching, name, theta)
             axis.plot(np.degrees(theta), curves.T, color=_COLOURS[name], alpha=0.18, linewidth=0.8)
-            axis.plot(np.degrees(theta), 1e3 * lens.shift_at(theta), color=_COLOURS[name],
-                      linewidth=2, label=f'{NAMES[name]} (light: all {len(family.matching)} fits)')
+            axis.plot(
+                np.degrees(theta),
+                1e3 * lens.shift_at(theta),
+                color=_COLOURS[name],
+                linewidth=2,
+                label=f'{NAMES[name]} (light: all {len(family.matching)} fits)',
+            )
         axis.axvline(88, color=FAINT, linestyle=':')
-        axis.annotate('outermost landmarks', (88, axis.get_ylim()[1]), ha='right', va='top',
-                      rotation=90, color=_INK, fontsize=8)
+        axis.annotate(
+            'outermost landmarks',
+            (88, axis.get_ylim()[1]),
+            ha='right',
+            va='top',
+            rotation=90,
+            color=_INK,
+            fontsize=8,
+        )
         axis.set(xlabel='incident angle / degree', ylabel='viewpoint shift / mm', xlim=(0, 107))
         axis.legend(loc='upper left')
 
@@ -71,12 +83,21 @@ def draw_height(path: Path, lenses: dict[str, Lens]) -> None:
         for name, lens in lenses.items():
             theta = np.linspace(0, lens.max_incidence, 200)
             height, _ = lens.image_height.value_and_slope(theta)
-            axis.plot(np.degrees(theta), lens.fx * height, color=_COLOURS[name], linewidth=2,
-                      label=NAMES[name])
+            axis.plot(
+                np.degrees(theta),
+                lens.fx * height,
+                color=_COLOURS[name],
+                linewidth=2,
+                label=NAMES[name],
+            )
             axis.axhline(lens.width / 2, color=_COLOURS[name], linestyle=':', linewidth=1)
         axis.annotate('dotted: half the image', (2, 775), color=_INK, fontsize=8)
-        axis.set(xlabel='incident angle / degree', ylabel='image height / px', xlim=(0, 107),
-                 ylim=(0, 820))
+        axis.set(
+            xlabel='incident angle / degree',
+            ylabel='image height / px',
+            xlim=(0, 107),
+            ylim=(0, 820),
+        )
         axis.legend(loc='center left')
 
 
@@ -108,10 +129,15 @@ def draw_rigs(path: Path) -> None:
                 (left.position, left.rotation[:, 2], 'left'),
             ):
                 axis.plot(*position[[0, 2]], 's', color=_INK, markersize=8)
-                axis.annotate('', (position + 0.12 * axis_z)[[0, 2]], position[[0, 2]],
-                              arrowprops={'arrowstyle': '->', 'color': OURS, 'linewidth': 1.6})
-                axis.annotate(name, position[[0, 2]] - [0, 0.012], ha='center', va='top',
-                              color=_INK)
+                axis.annotate(
+                    '',
+                    (position + 0.12 * axis_z)[[0, 2]],
+                    position[[0, 2]],
+                    arrowprops={'arrowstyle': '->', 'color': OURS, 'linewidth': 1.6},
+                )
+                axis.annotate(
+                    name, position[[0, 2]] - [0, 0.012], ha='center', va='top', color=_INK
+                )
             axis.set(title=style, xlabel='x / m', xlim=(-0.24, 0.09), ylim=(-0.05, 0.15))
             axis.set_aspect('equal')
         figure.axes[0].set_ylabel('viewing direction / m')
@@ -129,10 +155,17 @@ def draw_calibration_poses(path: Path) -> None:
             for camera, colour, name in ((right, OURS, 'right'), (left, PUBLISHED, 'left')):
                 ends = camera.position + 0.12 * camera.rotation[..., 2]
                 for one, end in zip(camera.position, ends, strict=True):
-                    axis.plot([one[across], end[across]], [one[up], end[up]], color=colour,
-                              linewidth=1)
-                axis.plot(camera.position[:, across], camera.position[:, up], 's', color=colour,
-                          markersize=4, label=f'{name} camera and its viewing axis')
+                    axis.plot(
+                        [one[across], end[across]], [one[up], end[up]], color=colour, linewidth=1
+                    )
+                axis.plot(
+                    camera.position[:, across],
+                    camera.position[:, up],
+                    's',
+                    color=colour,
+                    markersize=4,
+                    label=f'{name} camera and its viewing axis',
+                )
             axis.set(xlabel=x_name, ylabel=y_name)
             axis.set_aspect('equal')
         legend_below(figure, axis)
@@ -153,7 +186,10 @@ def draw_stereo(path: Path, found: LensEvaluation, panels: list[Panel]) -> None:
         figure.suptitle(
             f'{NAMES[name]}: vertical errors x {_VERTICAL_MAGNIFIED[name]}; orange: true, blue: '
             'measured\nError2: mean distance from the epipolar curve; Error3: mean distance of '
-            'points in space', fontsize=10, y=0.998)
+            'points in space',
+            fontsize=10,
+            y=0.998,
+        )
 
 
 def draw_solvers(path: Path, found: Mapping[str, Mapping[str, LensEvaluation]]) -> None:
@@ -171,8 +207,15 @@ def draw_solvers(path: Path, found: Mapping[str, Mapping[str, LensEvaluation]]) 
             axis.xaxis.set_major_locator(LogLocator(numticks=6))
             low = axis.get_xlim()[0]
             exact = list(found).index('ShiftVP')
-            axis.annotate('none', (low, place[exact]), xytext=(4, 0), va='center', color=_INK,
-                          textcoords='offset points', fontsize=8)
+            axis.annotate(
+                'none',
+                (low, place[exact]),
+                xytext=(4, 0),
+                va='center',
+                color=_INK,
+                textcoords='offset points',
+                fontsize=8,
+            )
         axes[0].set_yticks(place, list(found))
         legend_below(figure, axes[0])
 
@@ -180,17 +223,26 @@ def draw_solvers(path: Path, found: Mapping[str, Mapping[str, LensEvaluation]]) 
 def draw_crossings(path: Path, crossings: Sequence[Crossings]) -> None:
     """Draw the range at which an SVP error drops under the noise, against the noise."""
     quantities = list(dict.fromkeys(c.quantity for c in crossings))
-    titles = {'position': 'z of localization', 'residual': 'residual of localization',
-              'Error2': 'Error2'}
+    titles = {
+        'position': 'z of localization',
+        'residual': 'residual of localization',
+        'Error2': 'Error2',
+    }
     with picture(path, 11.0, 4.2) as figure:
         axes = figure.subplots(1, len(quantities), sharey=True)
         for axis, quantity in zip(axes, quantities, strict=True):
             for name in LENSES:
                 mine = [c for c in crossings if (c.lens, c.quantity) == (name, quantity)]
                 for line, one in zip(_LINES, mine, strict=True):
-                    axis.plot(NOISES, np.where(one.ranges > 0, one.ranges, np.nan), line,
-                              color=_COLOURS[name], label=f'{NAMES[name]}, {one.where}',
-                              marker='o', markersize=3)
+                    axis.plot(
+                        NOISES,
+                        np.where(one.ranges > 0, one.ranges, np.nan),
+                        line,
+                        color=_COLOURS[name],
+                        label=f'{NAMES[name]}, {one.where}',
+                        marker='o',
+                        markersize=3,
+                    )
             axis.set(title=titles[quantity], xlabel='noise of u and of v / px', yscale='log')
             axis.legend(fontsize=7.5)
         axes[0].set_ylabel('SVP error is under the noise beyond / m')
@@ -200,16 +252,30 @@ def _fixed_grid(figure: Figure, rows: int, columns: int) -> Array:
     """Return axes at fixed places: a constrained layout of so many takes seconds."""
     figure.set_layout_engine('none')
     inch = 1 / figure.get_figheight()
-    return np.asarray(figure.subplots(rows, columns, gridspec_kw={
-        'left': 0.075, 'right': 0.985, 'bottom': 0.5 * inch, 'top': 1 - 0.75 * inch,
-        'wspace': 0.28, 'hspace': 0.3,
-    }))
+    return np.asarray(
+        figure.subplots(
+            rows,
+            columns,
+            gridspec_kw={
+                'left': 0.075,
+                'right': 0.985,
+                'bottom': 0.5 * inch,
+                'top': 1 - 0.75 * inch,
+                'wspace': 0.28,
+                'hspace': 0.3,
+            },
+        )
+    )
 
 
 def _frame_world(axis: Any, radius: float, x_name: str, y_name: str) -> None:
     """Set an axis to a square of the world about the origin that holds a sphere."""
-    axis.set(xlim=(-1.15 * radius, 1.15 * radius), ylim=(-1.15 * radius, 1.15 * radius),
-             xticks=[-radius, 0, radius], yticks=[-radius, 0, radius])
+    axis.set(
+        xlim=(-1.15 * radius, 1.15 * radius),
+        ylim=(-1.15 * radius, 1.15 * radius),
+        xticks=[-radius, 0, radius],
+        yticks=[-radius, 0, radius],
+    )
     axis.set_xlabel(x_name, fontsize=8, labelpad=1)
     axis.set_ylabel(y_name, fontsize=8, labelpad=1)
     axis.tick_params(labelsize=7, length=2)
@@ -221,8 +287,12 @@ def _draw_image_frame(axis: Any, lens: Lens) -> None:
     edge, _ = lens.image_height.value_and_slope(np.asarray(lens.max_incidence))
     axis.add_patch(Circle((lens.cx, lens.cy), lens.fx * float(edge), fill=False, color=FAINT))
     margin = 0.06 * lens.width
-    axis.set(xlim=(-margin, lens.width + margin), ylim=(lens.height + margin, -margin),
-             xticks=[0, lens.width], yticks=[0, lens.height])
+    axis.set(
+        xlim=(-margin, lens.width + margin),
+        ylim=(lens.height + margin, -margin),
+        xticks=[0, lens.width],
+        yticks=[0, lens.height],
+    )
     axis.tick_params(labelsize=7, length=2)
     axis.set_aspect('equal')
     axis.grid(visible=False)
@@ -244,8 +314,9 @@ def _draw_residuals(axis: Any, localized: LocalizedSpread, row: int, colour: str
     seen = localized.views.used[row]
     uv = localized.views.uv[row][seen]
     ends = uv - _RESIDUAL_MAGNIFICATION * localized.solved.residual[row][seen]
-    axis.plot(uv[:, 0], uv[:, 1], 'o', fillstyle='none', color=_INK, markersize=3,
-              markeredgewidth=0.6)
+    axis.plot(
+        uv[:, 0], uv[:, 1], 'o', fillstyle='none', color=_INK, markersize=3, markeredgewidth=0.6
+    )
     axis.plot([uv[:, 0], ends[:, 0]], [uv[:, 1], ends[:, 1]], color=colour, linewidth=1.2)
 
 
@@ -253,8 +324,7 @@ def _caption(panel: Panel) -> str:
     text = f'Error2 = {panel.error2:.3f} px, Error3 = {panel.error3:.2f} mm'
     if np.isnan(panel.published_error2):
         return text + '\npublished: no caption kept'
-    return (f'{text}\npublished: {panel.published_error2:.3f} px, '
-            f'{panel.published_error3:.2f} mm')
+    return f'{text}\npublished: {panel.published_error2:.3f} px, {panel.published_error3:.2f} mm'
 
 
 def _draw_left_image(axis: Any, found: LensEvaluation, measured: Measurement, style: str) -> None:
@@ -273,7 +343,11 @@ def _draw_left_image(axis: Any, found: LensEvaluation, measured: Measurement, st
 def _draw_points(axis: Any, measured: Measurement, across: int, up: int) -> None:
     known = np.isfinite(measured.measured[:, 0])
     true, solved = measured.true[known], measured.measured[known]
-    axis.plot([true[:, across], solved[:, across]], [true[:, up], solved[:, up]], color=FAINT,
-              linewidth=0.8)
+    axis.plot(
+        [true[:, across], solved[:, across]],
+        [true[:, up], solved[:, up]],
+        color=FAINT,
+        linewidth=0.8,
+    )
     axis.plot(true[:, across], true[:, up], 'o', color=_TRUE, markersize=3.2)
     axis.plot(solved[:, across], solved[:, up], 'o', color=_MEASURED, markersize=1.8)

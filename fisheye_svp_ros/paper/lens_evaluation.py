@@ -117,7 +117,9 @@ def localize_spreads(lens: Lens, solver: Lens | None = None) -> tuple[LocalizedS
 
 
 def calibrate_rigs(
-    lens: Lens, solver: Lens | None = None, poses: Pose | None = None,
+    lens: Lens,
+    solver: Lens | None = None,
+    poses: Pose | None = None,
     directions: Array | None = None,
 ) -> tuple[Array, StereoCalibration]:
     """Return table 3 or 4, rows (3 radii, 3 styles, 5), and the nine solved systems (section 4).
@@ -138,8 +140,13 @@ def calibrate_rigs(
             seen.append(views_of(points, model.predict(pose, blank).uv))
     left_views, right_views = map(Views.concatenate, views)
     known = ForwardModel(lens.svp() if solver is None else solver)
-    found = solve_rigs((known, known), left_views, right_views, len(systems),
-                       Pose.stack([true for _, true in systems]))
+    found = solve_rigs(
+        (known, known),
+        left_views,
+        right_views,
+        len(systems),
+        Pose.stack([true for _, true in systems]),
+    )
     table = _rows(found.metrics)
     table[:, :3] = table[:, :3] @ PAPER_FROM_OPTICAL
     return table.reshape(len(RADII), len(STYLE_NAMES), -1), found.solution
@@ -157,11 +164,17 @@ def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -
     uv_right = model.predict(right, blank).uv
     uv_left = model.predict(right.compose(left_in_right.take(None)), blank).uv
     known = ForwardModel(lens.svp() if solver is None else solver)
-    solved = measure_points((known, known), left_in_right.take(None), uv_left, uv_right,
-                      right.into_body(points))
+    solved = measure_points(
+        (known, known), left_in_right.take(None), uv_left, uv_right, right.into_body(points)
+    )
     found = solved.solution
     return Measurement(
-        uv_left[0], uv_right[0], found.foot[0], found.distance[0], found.vertical[0], points,
+        uv_left[0],
+        uv_right[0],
+        found.foot[0],
+        found.distance[0],
+        found.vertical[0],
+        points,
         found.points[0] @ right.rotation[0].T + right.position[0],
         {name: float(value[0]) for name, value in solved.metrics.items()},
     )
@@ -186,6 +199,6 @@ def captions_of(lens: str, error2: Array, error3: Array) -> dict[int, tuple[floa
 def _rows(metrics: Metrics) -> Array:
     """Return rows (E, 5) in the paper's units."""
     position = [1000 * metrics[f'position_error_{axis}_m'] for axis in 'xyz']
-    return np.column_stack([
-        *position, np.degrees(metrics['axis_error_rad']), metrics['mean_residual_px']
-    ])
+    return np.column_stack(
+        [*position, np.degrees(metrics['axis_error_rad']), metrics['mean_residual_px']]
+    )

@@ -46,8 +46,18 @@ def write_report(results: Results, folder: Path, executor: Executor) -> list[Pat
 
     Raises OutputError where one cannot be written.
     """
-    parts = (_summary, _recovery, _localization, _stopping, _calibration, _stereo, _claims,
-             _solvers, _noise, _differences)
+    parts = (
+        _summary,
+        _recovery,
+        _localization,
+        _stopping,
+        _calibration,
+        _stereo,
+        _claims,
+        _solvers,
+        _noise,
+        _differences,
+    )
     blocks = [block for part in parts for block in part(results)]
     with write_together():
         pictures = _drawn(results, folder, executor)
@@ -59,8 +69,10 @@ def _drawn(results: Results, folder: Path, executor: Executor) -> list[Path]:
     """Draw the pictures by the executor; return them."""
     drawings = _drawings(results)
     with ExitStack() as stack:
-        places = {folder / f'{name}.png': stack.enter_context(replacing(folder / f'{name}.png'))
-                  for name in drawings}
+        places = {
+            folder / f'{name}.png': stack.enter_context(replacing(folder / f'{name}.png'))
+            for name in drawings
+        }
         under_way: list[Future[None]] = []
         # Whatever ends this, nobody draws any longer when the temporary files go.
         stack.callback(lambda: wait([one for one in under_way if not one.cancel()]))
@@ -115,8 +127,10 @@ def _recovery(results: Results) -> Iterator[Block]:
         'here; figures 9 and 10 and tables 3 and 4 were not used. To repeat the search: '
         f'{COMMAND}.'
     )
-    yield Picture('figure4.png', 'Figure 4: incident angle and viewpoint shift. Bold: used here; '
-                  'light: the other fits.')
+    yield Picture(
+        'figure4.png',
+        'Figure 4: incident angle and viewpoint shift. Bold: used here; light: the other fits.',
+    )
     yield Picture('figure5.png', 'Figure 5: incident angle and image height.')
     theta = np.radians(_ANGLES)
     rows = []
@@ -146,8 +160,11 @@ def _localization(results: Results) -> Iterator[Block]:
         yield _comparison_table(results, table)
         if table == 1:
             yield Text('*: the row that is inconsistent in the paper itself, see below.')
-    yield Picture('figure6.png', 'Figure 6: two views of each environment, image points and '
-                  'residuals x 100 of Fish180 and Fish214.')
+    yield Picture(
+        'figure6.png',
+        'Figure 6: two views of each environment, image points and '
+        'residuals x 100 of Fish180 and Fish214.',
+    )
 
 
 def _stopping(results: Results) -> Iterator[Block]:
@@ -163,13 +180,20 @@ def _stopping(results: Results) -> Iterator[Block]:
         'same for every mm and rad (Levenberg). Each stops when the sum of squares falls by less '
         'than a limit in a step; the table has the median distance of z from the optimum, in %.'
     )
-    header = ['damping', 'limit, px²', *(
-        f'{NAMES[name]} {spread} {RADII[r]}' for name in LENSES
-        for r in (0, 1) for spread in SPREADS
-    )]
+    header = [
+        'damping',
+        'limit, px²',
+        *(
+            f'{NAMES[name]} {spread} {RADII[r]}'
+            for name in LENSES
+            for r in (0, 1)
+            for spread in SPREADS
+        ),
+    ]
     rows = [
         [damping, f'{gain:g}', *(f'{value:.2f}' for value in off[:, d, g, :2].ravel())]
-        for d, damping in enumerate(study.dampings) for g, gain in enumerate(study.gains)
+        for d, damping in enumerate(study.dampings)
+        for g, gain in enumerate(study.gains)
     ]
     yield TableBlock(header, rows, 1)
     levenberg = off[0, 1, study.gains.index(1e-3)]
@@ -185,8 +209,10 @@ def _stopping(results: Results) -> Iterator[Block]:
 def _calibration(results: Results) -> Iterator[Block]:
     yield Heading('Stereo calibration: tables 3 and 4, figures 7 and 8')
     yield Picture('figure7.png', 'Figure 7: stereo configurations, from above.')
-    yield Picture('figure8.png', 'Figure 8: the ten poses of a vergent rig among the Whole '
-                  'landmarks at 0.5 m.')
+    yield Picture(
+        'figure8.png',
+        'Figure 8: the ten poses of a vergent rig among the Whole landmarks at 0.5 m.',
+    )
     for table in (3, 4):
         yield Heading(f'Table {table}: {NAMES[LENSES[table - 3]]}', 3)
         yield _comparison_table(results, table)
@@ -203,13 +229,34 @@ def _stereo(results: Results) -> Iterator[Block]:
     yield Heading('Stereo measurement: figures 9 and 10')
     rows = []
     for panel in results.panels():
-        rows.append([
-            NAMES[panel.lens], f'{panel.radius} m', panel.style, str(panel.points),
-            _number(panel.published_error2, 3), f'{panel.error2:.4f}', f'{panel.vertical:.4f}',
-            _number(panel.published_error3, 2), f'{panel.error3:.2f}',
-        ])
-    yield TableBlock(['lens', 'radius', 'style', 'points', 'Error2 px published', 'Error2 px',
-                 'within the column px', 'Error3 mm published', 'Error3 mm'], rows, 3)
+        rows.append(
+            [
+                NAMES[panel.lens],
+                f'{panel.radius} m',
+                panel.style,
+                str(panel.points),
+                _number(panel.published_error2, 3),
+                f'{panel.error2:.4f}',
+                f'{panel.vertical:.4f}',
+                _number(panel.published_error3, 2),
+                f'{panel.error3:.2f}',
+            ]
+        )
+    yield TableBlock(
+        [
+            'lens',
+            'radius',
+            'style',
+            'points',
+            'Error2 px published',
+            'Error2 px',
+            'within the column px',
+            'Error3 mm published',
+            'Error3 mm',
+        ],
+        rows,
+        3,
+    )
     yield Text(
         'Points that one of the two cameras does not see are left out: the rig of Fish214 stands '
         '0.1 m ahead, so that half of the landmarks at 0.2 m are behind it. Error2 is the mean '
@@ -220,8 +267,11 @@ def _stereo(results: Results) -> Iterator[Block]:
         'points near the line through both cameras dominate it.'
     )
     for name, figure in zip(LENSES, (9, 10), strict=True):
-        yield Picture(f'figure{figure}.png', f'Figure {figure}: {NAMES[name]}. Left images with '
-                      'epipolar curves and vertical errors, and two views of the points.')
+        yield Picture(
+            f'figure{figure}.png',
+            f'Figure {figure}: {NAMES[name]}. Left images with '
+            'epipolar curves and vertical errors, and two views of the points.',
+        )
 
 
 def _claims(results: Results) -> Iterator[Block]:
@@ -229,10 +279,15 @@ def _claims(results: Results) -> Iterator[Block]:
     yield TableBlock(
         ['section', 'statement', 'verdict', 'numbers'],
         [
-            [str(claim.section), claim.statement, claim.verdict,
-             '; '.join(f'{name}: {value:.4g}' for name, value in claim.numbers.items())]
+            [
+                str(claim.section),
+                claim.statement,
+                claim.verdict,
+                '; '.join(f'{name}: {value:.4g}' for name, value in claim.numbers.items()),
+            ]
             for claim in results.claims
-        ], 4,
+        ],
+        4,
     )
 
 
@@ -249,15 +304,39 @@ def _solvers(results: Results) -> Iterator[Block]:
     for variant, found in results.found.items():
         for name in LENSES:
             one = found[name]
-            rows.append([variant, NAMES[name], *(f'{value:.4f}' for value in (
-                np.abs(one.localization[..., 2]).max(), one.localization[..., 3].max(),
-                one.localization[..., 4].max(),
-                np.linalg.norm(one.calibration[..., :3], axis=-1).max(),
-                one.calibration[..., 3].max(), one.panels('error2_px').max(),
-                _MM * one.panels('error3_m').max(),
-            ))])
-    yield TableBlock(['solver', 'lens', 'localization |z| mm', 'axis degree', 'residual px',
-                 'calibration position mm', 'axis degree', 'Error2 px', 'Error3 mm'], rows, 2)
+            rows.append(
+                [
+                    variant,
+                    NAMES[name],
+                    *(
+                        f'{value:.4f}'
+                        for value in (
+                            np.abs(one.localization[..., 2]).max(),
+                            one.localization[..., 3].max(),
+                            one.localization[..., 4].max(),
+                            np.linalg.norm(one.calibration[..., :3], axis=-1).max(),
+                            one.calibration[..., 3].max(),
+                            one.panels('error2_px').max(),
+                            _MM * one.panels('error3_m').max(),
+                        )
+                    ),
+                ]
+            )
+    yield TableBlock(
+        [
+            'solver',
+            'lens',
+            'localization |z| mm',
+            'axis degree',
+            'residual px',
+            'calibration position mm',
+            'axis degree',
+            'Error2 px',
+            'Error3 mm',
+        ],
+        rows,
+        2,
+    )
     yield Text('Each number is the largest of its nine cells.')
     yield Picture('solvers.png', 'Mean errors by solver, on a logarithmic scale.')
 
@@ -274,8 +353,11 @@ def _noise(results: Results) -> Iterator[Block]:
     ]
     header = ['lens', 'error', 'landmarks or style', *(f'{n} px' for n in NOISES)]
     yield TableBlock(header, rows, 3)
-    yield Picture('noise.png', 'The same as curves; where there is no point, the SVP error is '
-                               'below the noise even at 0.2 m.')
+    yield Picture(
+        'noise.png',
+        'The same as curves; where there is no point, the SVP error is '
+        'below the noise even at 0.2 m.',
+    )
 
 
 def _differences(results: Results) -> Iterator[Block]:
@@ -289,23 +371,42 @@ def _differences(results: Results) -> Iterator[Block]:
         ends = ['', '']
         if cell.table > 2:
             ends = [f'{end[cell.place]:.4f}' for end in (low, high)]
-        rows.append([
-            str(cell.table), f'{NAMES[cell.lens]} {cell.radius} m {cell.row}', cell.quantity,
-            cell.unit, _reason(cell, low, high), f'{cell.published:.4f}', f'{cell.ours:.4f}', *ends
-        ])
+        rows.append(
+            [
+                str(cell.table),
+                f'{NAMES[cell.lens]} {cell.radius} m {cell.row}',
+                cell.quantity,
+                cell.unit,
+                _reason(cell, low, high),
+                f'{cell.published:.4f}',
+                f'{cell.ours:.4f}',
+                *ends,
+            ]
+        )
     yield Text(
         'Sizes are compared, not signs. poses: between these two lie 90 % of what '
         f'{POSE_SETS} random sets of ten poses give; the ten in use are one set of many.'
     )
-    header = ['table', 'cell', 'quantity', 'unit', 'why', 'published', 'ours', 'poses: 5 %',
-              'poses: 95 %']
+    header = [
+        'table',
+        'cell',
+        'quantity',
+        'unit',
+        'why',
+        'published',
+        'ours',
+        'poses: 5 %',
+        'poses: 95 %',
+    ]
     yield TableBlock(header, rows, 5)
 
 
 def _reason(cell: Cell, low: Array, high: Array) -> str:
     if cell.table < 3:
-        return (f'{abs(cell.ours - cell.published):.4f} {cell.unit} that the recovered layout '
-                'does not reproduce')
+        return (
+            f'{abs(cell.ours - cell.published):.4f} {cell.unit} that the recovered layout '
+            'does not reproduce'
+        )
     place = cell.place
     if place[:3] == REPEATED_CELL:
         return 'a row of the paper that repeats another one'

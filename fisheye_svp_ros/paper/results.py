@@ -73,8 +73,10 @@ class Results(NamedTuple):
     def cells(self, variant: str = SVP) -> list[Cell]:
         """Return the 180 cells of tables 1 to 4 for a variant of the solver."""
         found = [self.found[variant][name] for name in LENSES]
-        return [*cells(LOCALIZATION, np.stack([one.localization for one in found]), 1, SPREADS),
-                *cells(CALIBRATION, np.stack([one.calibration for one in found]), 3, STYLE_NAMES)]
+        return [
+            *cells(LOCALIZATION, np.stack([one.localization for one in found]), 1, SPREADS),
+            *cells(CALIBRATION, np.stack([one.calibration for one in found]), 3, STYLE_NAMES),
+        ]
 
     def panels(self) -> list[Panel]:
         """Return the 18 panels of figures 9 and 10 with the captions that belong to them."""
@@ -102,8 +104,11 @@ class Results(NamedTuple):
             'cells': [_cell(cell) for cell in self.cells()],
             'panels': [
                 {
-                    'figure': 9 + LENSES.index(panel.lens), 'lens': panel.lens,
-                    'radius_m': panel.radius, 'style': panel.style, 'points': panel.points,
+                    'figure': 9 + LENSES.index(panel.lens),
+                    'lens': panel.lens,
+                    'radius_m': panel.radius,
+                    'style': panel.style,
+                    'points': panel.points,
                     'error2_px': _pair(panel.published_error2, panel.error2),
                     'error2_vertical_px': _pair(np.nan, panel.vertical),
                     'error3_mm': _pair(panel.published_error3, panel.error3),
@@ -115,8 +120,13 @@ class Results(NamedTuple):
                 variant: [_cell(cell) for cell in self.cells(variant)] for variant in self.found
             },
             'noise': [
-                {'lens': c.lens, 'quantity': c.quantity, 'where': c.where,
-                 'noise_px': list(NOISES), 'range_m': c.ranges.tolist()}
+                {
+                    'lens': c.lens,
+                    'quantity': c.quantity,
+                    'where': c.where,
+                    'noise_px': list(NOISES),
+                    'range_m': c.ranges.tolist(),
+                }
                 for c in self.crossings
             ],
             'out_of_line_cell': _out_of_line(self.stopping),
@@ -141,9 +151,14 @@ def compute(executor: Executor, done: Callable[[], None] = lambda: None) -> Resu
         variant: {name: evaluations[variant, name].result() for name in LENSES}
         for variant in VARIANTS
     }
-    return Results(lenses, found, claims(found[SVP]),
-                   [crossing for future in ranges for crossing in future.result()],
-                   load_family(), load_stopping())
+    return Results(
+        lenses,
+        found,
+        claims(found[SVP]),
+        [crossing for future in ranges for crossing in future.result()],
+        load_family(),
+        load_stopping(),
+    )
 
 
 def tasks() -> int:
@@ -156,8 +171,15 @@ def _panels(found: LensEvaluation) -> list[Panel]:
     vertical, points = found.panels('error2_vertical_px'), found.panels('points')
     captions = captions_of(found.lens.name, error2, error3)
     return [
-        Panel(found.lens.name, *panel, int(points[i]), float(error2[i]), float(vertical[i]),
-              float(error3[i]), *captions.get(i, (np.nan, np.nan)))
+        Panel(
+            found.lens.name,
+            *panel,
+            int(points[i]),
+            float(error2[i]),
+            float(vertical[i]),
+            float(error3[i]),
+            *captions.get(i, (np.nan, np.nan)),
+        )
         for i, panel in enumerate(PANELS)
     ]
 
@@ -167,8 +189,14 @@ def _out_of_line(study: Stopping) -> dict[str, Any]:
         'published_minus_ours_mm': study.offset_mm.tolist(),
         'relative_excess_of_squares': study.relative_cost,
         'stopped_early': [
-            {'lens': LENSES[k], 'damping': study.dampings[d], 'gain_px2': study.gains[g],
-             'radius_m': RADII[r], 'range': SPREADS[s], 'median_off_z': float(value)}
+            {
+                'lens': LENSES[k],
+                'damping': study.dampings[d],
+                'gain_px2': study.gains[g],
+                'radius_m': RADII[r],
+                'range': SPREADS[s],
+                'median_off_z': float(value),
+            }
             for (k, d, g, r, s), value in np.ndenumerate(study.off)
         ],
     }
@@ -176,9 +204,14 @@ def _out_of_line(study: Stopping) -> dict[str, Any]:
 
 def _cell(cell: Cell) -> dict[str, Any]:
     return {
-        'table': cell.table, 'lens': cell.lens, 'radius_m': cell.radius, 'row': cell.row,
-        'quantity': cell.quantity, 'unit': cell.unit,
-        **_pair(cell.published, cell.ours), 'new': bool(np.isnan(cell.published)),
+        'table': cell.table,
+        'lens': cell.lens,
+        'radius_m': cell.radius,
+        'row': cell.row,
+        'quantity': cell.quantity,
+        'unit': cell.unit,
+        **_pair(cell.published, cell.ours),
+        'new': bool(np.isnan(cell.published)),
     }
 
 

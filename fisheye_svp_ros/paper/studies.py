@@ -80,15 +80,20 @@ def load_family(path: str | Path | None = None) -> Family:
     try:
         members = tuple(
             Member(
-                one['seed'], one['misfit'], one['cost'], one['within_10'], one['within_5'],
+                one['seed'],
+                one['misfit'],
+                one['cost'],
+                one['within_10'],
+                one['within_5'],
                 np.array([[one[lens][name] for name in NAMES] for lens in LENSES]),
                 np.radians(np.array([one['incidence_deg'], one['azimuth_deg']], dtype=float)).T,
             )
             for one in document['members']
         )
         low, high = (
-            np.array([document['calibration_range'][lens][end] for lens in LENSES])
-            .reshape(CALIBRATION.shape)
+            np.array([document['calibration_range'][lens][end] for lens in LENSES]).reshape(
+                CALIBRATION.shape
+            )
             for end in ('low', 'high')
         )
     except (KeyError, TypeError, ValueError) as cause:
@@ -107,12 +112,15 @@ def load_stopping(path: str | Path | None = None) -> Stopping:
         off = np.array([document['median_off_z'][lens] for lens in LENSES], dtype=float)
         return Stopping(
             np.array(document['published_minus_ours_mm'], dtype=float),
-            float(document['relative_excess_of_squares']), dampings, gains,
+            float(document['relative_excess_of_squares']),
+            dampings,
+            gains,
             off.reshape(len(LENSES), len(dampings), len(gains), len(RADII), len(SPREADS)),
         )
     except (KeyError, TypeError, ValueError) as cause:
         raise ParameterError(
-            f'{path}: not a study of early stops; make one with: {COMMAND}') from cause
+            f'{path}: not a study of early stops; make one with: {COMMAND}'
+        ) from cause
 
 
 def shift_curves(members: Sequence[Member], lens: str, theta: Array) -> Array:

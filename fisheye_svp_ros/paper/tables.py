@@ -125,7 +125,17 @@ def agreeing(tables: Array, limit: float) -> int:
 def cells(published: Array, ours: Array, first_table: int, rows: Sequence[str]) -> list[Cell]:
     """Return the cells of a pair of tables (2, 3, 3, 5), one a lens, in printed order."""
     return [
-        Cell(first_table + lens, LENSES[lens], RADII[radius], rows[row], QUANTITIES[quantity],
-             UNITS[quantity], float(value), float(ours[place]), place)
-        for place, value in np.ndenumerate(published) for lens, radius, row, quantity in [place]
+        Cell(
+            first_table + lens,
+            LENSES[lens],
+            RADII[radius],
+            rows[row],
+            QUANTITIES[quantity],
+            UNITS[quantity],
+            float(value),
+            float(ours[place]),
+            place,
+        )
+        for place, value in np.ndenumerate(published)
+        for lens, radius, row, quantity in [place]
     ]

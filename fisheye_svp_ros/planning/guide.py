@@ -112,7 +112,8 @@ def _evaluate(session: Session) -> SessionState:
             return _diagnose_session(session, posable_observations(table, lens)[0], lens)
     wanted = next_photographs(linear, (), _noise(linear), _VIEWS_AHEAD, number, room)
     return _session_state(
-        session, _model(linear), wanted, _value(linear, number), wanted.answers[0])
+        session, _model(linear), wanted, _value(linear, number), wanted.answers[0]
+    )
 
 
 def _diagnose_session(session: Session, table: Observations, lens: Lens) -> SessionState:
@@ -129,41 +130,61 @@ def _diagnose_session(session: Session, table: Observations, lens: Lens) -> Sess
             continue
         wanted = next_photographs(found.model, (cause,), found.noise_px, _VIEWS_AHEAD, room=room)
         if wanted.answers[-1] > MIN_PROBABILITY and len(session.taken) < _MAX_UNDECIDED:
-            return _session_state(session, _model(found.model), wanted, named=(cause.effect,),
-                          alike=names[1:])
+            return _session_state(
+                session, _model(found.model), wanted, named=(cause.effect,), alike=names[1:]
+            )
         # No photograph will tell: what is it, if it is what is asked for?
         alike = tuple(name for name in names if name != _EFFECT.name)
         found = diagnose(
-            table, lens, free_intrinsics=True, options=DiagnosisOptions(left_out=alike))
+            table, lens, free_intrinsics=True, options=DiagnosisOptions(left_out=alike)
+        )
         break
     wanted = next_photographs(
-        found.model, found.causes, found.noise_px, _VIEWS_AHEAD, number, room)
+        found.model, found.causes, found.noise_px, _VIEWS_AHEAD, number, room
+    )
     value, stderr = _value(found.model, number), wanted.answers[0]
     for cause in found.causes:
         if number in cause.parameters:
             value = cause.parameters[number]['value']
             stderr = max(stderr, cause.parameters[number]['stderr'])
-    return _session_state(session, _model(found.model), wanted, value, stderr,
-                  tuple(cause.effect for cause in found.causes), alike, stderr <= session.goal)
+    return _session_state(
+        session,
+        _model(found.model),
+        wanted,
+        value,
+        stderr,
+        tuple(cause.effect for cause in found.causes),
+        alike,
+        stderr <= session.goal,
+    )
 
 
 def _model(linear: Linearization) -> ForwardModel:
     """Return how the lens images a board that is as it should be."""
-    terms = [term for term in linear.state.terms
-             if term[0].stage in ('ray', 'image') and not term[0].of_target]
+    terms = [
+        term
+        for term in linear.state.terms
+        if term[0].stage in ('ray', 'image') and not term[0].of_target
+    ]
     return ForwardModel(linear.state.lens, terms)
 
 
 def _session_state(
-    session: Session, model: ForwardModel, wanted: NextViews, value: float | None = None,
-    stderr: float | None = None, named: tuple[str, ...] = (), alike: tuple[str, ...] = (),
+    session: Session,
+    model: ForwardModel,
+    wanted: NextViews,
+    value: float | None = None,
+    stderr: float | None = None,
+    named: tuple[str, ...] = (),
+    alike: tuple[str, ...] = (),
     settled: bool = False,
 ) -> SessionState:
     count = len(session.points)
     views = blank_views(np.arange(count), session.points, len(wanted.shots.distance))
     outline = model.predict(wanted.shots.camera, views).uv
     return SessionState(
-        wanted, tuple(outline), value, stderr, named, alike, settled, session.latest)
+        wanted, tuple(outline), value, stderr, named, alike, settled, session.latest
+    )
 
 
 def _value(linear: Linearization, number: str) -> float:
@@ -188,9 +209,11 @@ def _prior(lens: Lens, free: Sequence[str]) -> Prior:
     """Return what a data sheet tells: a lens to some per cent, a shift of millimetres."""
     edge = lens.max_incidence
     loose = {'fx': 0.1 * lens.fx, 'fy': 0.1 * lens.fy, 'cx': 0.05 * lens.fx, 'cy': 0.05 * lens.fy}
-    loose |= {f'k{i}': 0.2 / edge**(2 * i) for i in range(1, 5)}
-    return Prior(np.array([*(lens.parameters[name] for name in free), 0.0]),
-                 np.diag([*(1 / loose[name] for name in free), 1 / _EFFECT.parameters[0].large]))
+    loose |= {f'k{i}': 0.2 / edge ** (2 * i) for i in range(1, 5)}
+    return Prior(
+        np.array([*(lens.parameters[name] for name in free), 0.0]),
+        np.diag([*(1 / loose[name] for name in free), 1 / _EFFECT.parameters[0].large]),
+    )
 
 
 def _noise(linear: Linearization) -> float:
@@ -208,9 +231,13 @@ def observations_of(taken: Sequence[DetectedBoard], points: Array) -> Observatio
     ids = np.concatenate([seen.ids for seen in taken])
     sigma = np.concatenate([seen.sigma for seen in taken])
     return make_observations(
-        np.repeat(np.arange(len(taken)), count), ids, np.concatenate([s.uv for s in taken]),
-        points[ids], t=np.repeat([seen.t for seen in taken], count),
-        sigma=np.where(np.isfinite(sigma), sigma, _DEFAULT_NOISE), source='guide',
+        np.repeat(np.arange(len(taken)), count),
+        ids,
+        np.concatenate([s.uv for s in taken]),
+        points[ids],
+        t=np.repeat([seen.t for seen in taken], count),
+        sigma=np.where(np.isfinite(sigma), sigma, _DEFAULT_NOISE),
+        source='guide',
     )
 
 
@@ -242,7 +269,8 @@ class Guide:
     def is_finished(self) -> bool:
         """Whether no further photograph is wanted."""
         return self.stand is not None and (
-            self.stand.settled or len(self.session.taken) >= MAX_PHOTOGRAPHS)
+            self.stand.settled or len(self.session.taken) >= MAX_PHOTOGRAPHS
+        )
 
     def adopt(self, stand: SessionState) -> None:
         """Go on with what has been considered."""
@@ -271,8 +299,10 @@ class Guide:
     def _likeness(self, seen: DetectedBoard, outline: Array) -> float:
         """Return 1 / (1 + d / r): d apart, r the size of the wanted view, root mean squares."""
         size = np.nanvar(outline, axis=0).sum()
-        apart = [np.nanmean(((outline[order[seen.ids]] - seen.uv) ** 2).sum(axis=1))
-                 for order in self.orders]
+        apart = [
+            np.nanmean(((outline[order[seen.ids]] - seen.uv) ** 2).sum(axis=1))
+            for order in self.orders
+        ]
         return float(1 / (1 + np.sqrt(min(apart) / size)))
 
     def _is_still(self, seen: DetectedBoard) -> bool:

@@ -178,8 +178,13 @@ class Design:
     """
 
     def __init__(
-        self, linear: Linearization, effects: Sequence[Effect], board: FlatBoard, shots: Shots,
-        noise: float, known: bool = True,
+        self,
+        linear: Linearization,
+        effects: Sequence[Effect],
+        board: FlatBoard,
+        shots: Shots,
+        noise: float,
+        known: bool = True,
     ) -> None:
         """Take a fit, and effects that are not in it but may be there; noise: of u and v, px.
 
@@ -187,22 +192,29 @@ class Design:
         """
         state, lens, free = linear.state, linear.state.lens, linear.free
         terms = [t for t in state.terms if t[0].stage != 'noise']
-        parameters = [(e.name, p, v) for e, values in terms
-                      for p, v in zip(e.parameters, values, strict=True)]
+        parameters = [
+            (e.name, p, v)
+            for e, values in terms
+            for p, v in zip(e.parameters, values, strict=True)
+        ]
         parameters += [(e.name, p, 0.0) for e in effects for p in e.parameters]
         self.names = (*free, *(f'{name}.{p.name}' for name, p, _ in parameters))
         self.units = (*(_unit(name) for name in free), *(p.unit for _, p, _ in parameters))
-        self.values = np.array([lens.parameters[name] for name in free]
-                               + [value for _, _, value in parameters])
-        wide = [lens.focal * _PRIOR_SIGMAS[name] if name in _PRIOR_SIGMAS else 1.0
-                for name in free]
+        self.values = np.array(
+            [lens.parameters[name] for name in free] + [value for _, _, value in parameters]
+        )
+        wide = [
+            lens.focal * _PRIOR_SIGMAS[name] if name in _PRIOR_SIGMAS else 1.0 for name in free
+        ]
         wide += [p.large for _, p, _ in parameters]
         self.shots, self.board, self.known_views = shots, board, known
         self.known: Array = np.diag(1 / np.square(wide))
         if known:
             used = linear.row_weight
             mean = float(np.sqrt(np.mean(used[used > 0] ** 2)))
-            self.known = self.known + information(linear, effects).sum(axis=0) / (mean * noise)**2
+            self.known = (
+                self.known + information(linear, effects).sum(axis=0) / (mean * noise) ** 2
+            )
         views = blank_views(board.landmark, board.points, len(shots.distance), board=board.board)
         data = RigViews.of_one_camera(views)
         posed = replace(state, pose=shots.camera, rig=identity(1), terms=tuple(terms))
@@ -217,8 +229,10 @@ class Design:
         found = [i for i, names in enumerate(parts) if name in names]
         if found:
             return np.array(found)
-        raise ParameterError(f'{name!r} is not a parameter of this lens and its causes; known are '
-                             + ', '.join(self.names))
+        raise ParameterError(
+            f'{name!r} is not a parameter of this lens and its causes; known are '
+            + ', '.join(self.names)
+        )
 
     def question(self, name: str, others: Sequence[str] = ()) -> Criterion:
         """Ask for the error of a number, or whether an effect is not one of some others."""
@@ -238,7 +252,8 @@ class Design:
             before = list(chosen)
             for i in range(count):
                 chosen[i] = self._best_view(
-                    question, range(len(self.added)), chosen[:i] + chosen[i + 1:])
+                    question, range(len(self.added)), chosen[:i] + chosen[i + 1 :]
+                )
             if chosen == before:
                 break
         ordered = self._add_views(question, chosen, count)
@@ -297,26 +312,34 @@ def candidate_shots(
     """
     lens, count = state.lens, _TRIES
     top = int(lens.max_incidence / _STEP)
-    angle = _STEP * np.minimum(np.arccos(rng.uniform(np.cos(lens.max_incidence), 1, count)) / _STEP
-                               + 0.5, top).astype(int)
-    azimuth, axis, roll = (step * rng.integers(0, round(2 * np.pi / step), count)
-                           for step in (np.radians(30.0), _QUARTER, _QUARTER))
+    angle = _STEP * np.minimum(
+        np.arccos(rng.uniform(np.cos(lens.max_incidence), 1, count)) / _STEP + 0.5, top
+    ).astype(int)
+    azimuth, axis, roll = (
+        step * rng.integers(0, round(2 * np.pi / step), count)
+        for step in (np.radians(30.0), _QUARTER, _QUARTER)
+    )
     distance = rng.choice(np.geomspace(room.near, room.far, _DISTANCES), count)
     tilt = rng.choice(_TILTS[room.tilt + 1e-9 >= _TILTS], count)
-    sight = np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth),
-                      np.cos(angle)], axis=-1)
+    sight = np.stack(
+        [np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], axis=-1
+    )
     zero = np.zeros(count)
     towards = rotation_from_vector(
-        angle[:, None] * np.stack([-np.sin(azimuth), np.cos(azimuth), zero], axis=-1))
+        angle[:, None] * np.stack([-np.sin(azimuth), np.cos(azimuth), zero], axis=-1)
+    )
     tilted = rotation_from_vector(
-        tilt[:, None] * np.stack([np.cos(axis), np.sin(axis), zero], axis=-1))
+        tilt[:, None] * np.stack([np.cos(axis), np.sin(axis), zero], axis=-1)
+    )
     rolled = rotation_from_vector(roll[:, None] * np.array([0.0, 0.0, 1.0]))
     turn = towards @ tilted @ rolled @ board.facing
     middle = distance[:, None] * sight
     place = middle - turn @ board.points.mean(axis=0)
     shots = Shots(Pose(turn, place).inverse(), distance, angle, azimuth, tilt, axis, roll)
-    away = (np.linalg.norm(middle[:, None] - room.taken, axis=-1)
-            > _EXCLUSION_RADIUS * distance[:, None])
+    away = (
+        np.linalg.norm(middle[:, None] - room.taken, axis=-1)
+        > _EXCLUSION_RADIUS * distance[:, None]
+    )
     allowed = away.all(axis=1) & _detectable(state, board, shots, room.field)
     possible = np.flatnonzero(allowed)[:CANDIDATES]
     if not possible.size:
@@ -371,7 +394,8 @@ def _unit(name: str) -> str:
 def information(linear: Linearization, effects: Sequence[Effect]) -> Array:
     """Return what each frame tells of all that is shared (F, K, K), its pose taken out."""
     columns = np.concatenate(
-        [linear.shared_columns, *(linear.effect_columns(effect) for effect in effects)], axis=-1)
+        [linear.shared_columns, *(linear.effect_columns(effect) for effect in effects)], axis=-1
+    )
     clean = project_out(columns, linear.frame_columns)
     return np.asarray(np.swapaxes(clean, -1, -2) @ clean)
 

@@ -58,24 +58,36 @@ class NextViews(NamedTuple):
 
     def to_list(self) -> list[dict[str, Any]]:
         """Return what diagnosis.json holds: a mapping a photograph, SI units."""
-        shots, kind = self.shots, 'certainty' if self.others else (
-            'stderr' if self.unit else 'relative_stderr')
+        shots, kind = (
+            self.shots,
+            'certainty' if self.others else ('stderr' if self.unit else 'relative_stderr'),
+        )
         return [
             {
-                'asked': self.asked, 'others': list(self.others),
-                **{f'{name}_{"m" if name == "distance" else "rad"}': float(getattr(shots, name)[i])
-                   for name in Shots._fields[1:]},
+                'asked': self.asked,
+                'others': list(self.others),
+                **{
+                    f'{name}_{"m" if name == "distance" else "rad"}': float(
+                        getattr(shots, name)[i]
+                    )
+                    for name in Shots._fields[1:]
+                },
                 'position': shots.camera.position[i].tolist(),
                 'quaternion': quaternion_from_rotation(shots.camera.rotation[i]).tolist(),
-                f'{kind}_before': self.answers[i], f'{kind}_after': self.answers[i + 1],
+                f'{kind}_before': self.answers[i],
+                f'{kind}_after': self.answers[i + 1],
             }
             for i in range(len(shots.distance))
         ]
 
 
 def next_photographs(
-    after: Linearization, causes: Sequence[Cause], noise: float, count: int,
-    number: str | None = None, room: ViewLimits | None = None,
+    after: Linearization,
+    causes: Sequence[Cause],
+    noise: float,
+    count: int,
+    number: str | None = None,
+    room: ViewLimits | None = None,
 ) -> NextViews:
     """Choose `count` photographs beside those of a fit, of the same board by the same camera.
 
@@ -90,8 +102,9 @@ def next_photographs(
     board = FlatBoard.from_observations(after.data.observations, pose)
     if room is None:
         away = np.linalg.norm(board.points.mean(axis=0) - pose.position, axis=-1)
-        room = ViewLimits(_MIN_DISTANCE_RATIO * float(away.min()),
-                          _MAX_DISTANCE_RATIO * float(away.max()))
+        room = ViewLimits(
+            _MIN_DISTANCE_RATIO * float(away.min()), _MAX_DISTANCE_RATIO * float(away.max())
+        )
     views = after.data.views
     seen = pose.into_body(views.points)[views.used]
     reached = float(np.arccos((seen[:, 2] / np.linalg.norm(seen, axis=-1)).min()))
@@ -106,7 +119,11 @@ def next_photographs(
 
 
 def next_views(
-    design: Design, asked: str, others: tuple[str, ...], question: Criterion, chosen: Index,
+    design: Design,
+    asked: str,
+    others: tuple[str, ...],
+    question: Criterion,
+    chosen: Index,
     answers: Sequence[float],
 ) -> NextViews:
     """Return chosen views with their answers, in the unit that they are told in."""
@@ -131,8 +148,7 @@ def _choose_question(
     if number is not None:
         return number, (), _effects_with(number, after)
     fitted = {effect.name for effect, _ in after.state.terms}
-    mine = [c for c in causes if c.effect in fitted
-            and c.stage in ('lens', 'target')]
+    mine = [c for c in causes if c.effect in fitted and c.stage in ('lens', 'target')]
     for cause in mine:
         if cause.indistinguishable_from:
             alike = tuple(cause.indistinguishable_from)
@@ -144,9 +160,7 @@ def _choose_question(
     return 'e0', (), [ViewpointShiftEffect(1)]
 
 
-def check_number(
-    number: str, observations: Observations, lens: Lens, free: Sequence[str]
-) -> None:
+def check_number(number: str, observations: Observations, lens: Lens, free: Sequence[str]) -> None:
     """Raise ParameterError for a number that no diagnosis of a table determines.
 
     How many parts an effect has, and their names (NAME.PART), only the diagnosis tells.
@@ -175,12 +189,17 @@ def _effects_with(number: str, after: Linearization) -> list[Effect]:
             if number in _names_of(form):
                 return [form]
         parts = [parameter.name for form in forms for parameter in form.parameters]
-        known += [name] if '.' in ''.join(parts) else [
-            f'{name}.{part}' for part in dict.fromkeys(parts)]
+        known += (
+            [name]
+            if '.' in ''.join(parts)
+            else [f'{name}.{part}' for part in dict.fromkeys(parts)]
+        )
     if number in intrinsic_names(after.state.lens):
         raise ParameterError(f'--for {number}: {number} is fixed; add --free intrinsics')
-    raise ParameterError(f'--for {number}: not a parameter of this lens or of an effect; known '
-                         f'are {", ".join(known)}')
+    raise ParameterError(
+        f'--for {number}: not a parameter of this lens or of an effect; known '
+        f'are {", ".join(known)}'
+    )
 
 
 def _names_of(effect: Effect) -> set[str]:
@@ -225,8 +244,10 @@ def plan(
     errors = np.sqrt(np.diag(np.linalg.inv(information)))
     return PhotographPlan(
         next_views(design, number or 'lens', (), question, chosen, answers),
-        {name.rpartition('.')[2]: float(error)
-         for name, error in zip(design.names, errors, strict=True)},
+        {
+            name.rpartition('.')[2]: float(error)
+            for name, error in zip(design.names, errors, strict=True)
+        },
     )
 
 
@@ -236,6 +257,15 @@ def nominal_lens(image_size: tuple[int, int], field: float) -> Lens:
     Where its image is a circle, corners beyond that hold nothing.
     """
     width, height = image_size
-    lens = Lens('lens', width, height, width / field, width / field, (width - 1) / 2,
-                (height - 1) / 2, KannalaBrandt(), 1.0)
+    lens = Lens(
+        'lens',
+        width,
+        height,
+        width / field,
+        width / field,
+        (width - 1) / 2,
+        (height - 1) / 2,
+        KannalaBrandt(),
+        1.0,
+    )
     return replace(lens, max_incidence=min(field / 2, field_of_view(lens)))

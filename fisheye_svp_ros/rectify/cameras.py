@@ -55,8 +55,9 @@ class RectifiedCamera:
     def field_of_view(self) -> float:
         """The field of view over the width of the image, rad."""
         half = self.width / 2 / self.f
-        return float(2 * (np.arctan(half) if _is_straight(self.projection, self.along_baseline)
-                          else half))
+        return float(
+            2 * (np.arctan(half) if _is_straight(self.projection, self.along_baseline) else half)
+        )
 
     def directions(self, u: Array, v: Array) -> Array:
         """Return unit vectors (..., 3) of pixels u, v, px, that broadcast together.
@@ -122,18 +123,30 @@ def rectified_camera(
         raise ParameterError(f'size is {width}x{height}; 1 to {_MAX_SIZE} px are needed')
     degrees = np.degrees(field_of_view)
     if not 0 < degrees <= widest + 1e-9:
-        raise ParameterError(f'field of view is {degrees:.6g} deg; above 0 and at most {widest:g} '
-                             f'are needed ({projection})')
-    camera = RectifiedCamera(projection, width, height, 1.0, (width - 1) / 2, (height - 1) / 2,
-                             along_baseline and projection != 'pinhole')
+        raise ParameterError(
+            f'field of view is {degrees:.6g} deg; above 0 and at most {widest:g} '
+            f'are needed ({projection})'
+        )
+    camera = RectifiedCamera(
+        projection,
+        width,
+        height,
+        1.0,
+        (width - 1) / 2,
+        (height - 1) / 2,
+        along_baseline and projection != 'pinhole',
+    )
     half = field_of_view / 2
     straight = _is_straight(projection, along_baseline)
     return replace(camera, f=float(width / 2 / (np.tan(half) if straight else half)))
 
 
 def camera_for(
-    lenses: Sequence[Lens], projection: str, size: tuple[int, int] | None = None,
-    field_of_view: float | None = None, along_baseline: bool = False,
+    lenses: Sequence[Lens],
+    projection: str,
+    size: tuple[int, int] | None = None,
+    field_of_view: float | None = None,
+    along_baseline: bool = False,
 ) -> RectifiedCamera:
     """Return the rectified camera of a lens, or of both lenses of a pair, as `rectified_camera`.
 
@@ -144,8 +157,9 @@ def camera_for(
         widest = np.radians(_widest_field(projection, along_baseline))
         most = _STRAIGHT_FIELD if _is_straight(projection, along_baseline) else widest
         field_of_view = min(float(most), *map(_field_over_width, lenses))
-    return rectified_camera(projection, size or (lenses[0].width, lenses[0].height), field_of_view,
-                            along_baseline)
+    return rectified_camera(
+        projection, size or (lenses[0].width, lenses[0].height), field_of_view, along_baseline
+    )
 
 
 def _field_over_width(lens: Lens) -> float:
@@ -159,8 +173,9 @@ def _widest_field(projection: str, along_baseline: bool) -> float:
     widest = _WIDEST_STEREO if along_baseline else _WIDEST
     if projection not in widest:
         reason = 'has no straight epipolar rows' if projection in _WIDEST else 'is unknown'
-        raise ParameterError(f'projection {projection!r} {reason}; take one of '
-                             + ', '.join(widest))
+        raise ParameterError(
+            f'projection {projection!r} {reason}; take one of ' + ', '.join(widest)
+        )
     return widest[projection]
 
 

@@ -105,8 +105,9 @@ def search_ranges(side: Rectification) -> Array:
 def quantiles(errors: Array) -> Array:
     """Return median, 95 % and largest size (R, 3) of errors (R, N); NaN where there is none."""
     rows = (np.abs(row[np.isfinite(row)]) for row in errors)
-    return np.array([np.quantile(row, (0.5, 0.95, 1.0)) if row.size else np.full(3, np.nan)
-                     for row in rows])
+    return np.array(
+        [np.quantile(row, (0.5, 0.95, 1.0)) if row.size else np.full(3, np.nan) for row in rows]
+    )
 
 
 def _distances(camera: RectifiedCamera, found: Array, pixels: Array) -> Array:
@@ -123,9 +124,12 @@ def _samples(side: Rectification) -> tuple[Array, Array]:
     """Return rectified pixels (N, 2) all over what the maps reach, and their directions (N, 3)."""
     camera = side.camera
     step = max(camera.width, camera.height) / _SAMPLES
-    u, v = np.meshgrid(*(
-        np.linspace(0, size - 1, max(round(size / step), 2)).round() for size in (
-            camera.width, camera.height)))
+    u, v = np.meshgrid(
+        *(
+            np.linspace(0, size - 1, max(round(size / step), 2)).round()
+            for size in (camera.width, camera.height)
+        )
+    )
     reached = side.maps.mask[v.astype(int), u.astype(int)]
     pixels = np.stack([u, v], axis=-1)[reached]
     return pixels, camera.directions(*pixels.T)

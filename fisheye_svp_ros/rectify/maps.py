@@ -72,8 +72,10 @@ class Rectification:
 
     def __repr__(self) -> str:
         camera = self.camera
-        return (f'Rectification({self.lens.name!r} to {camera.projection} '
-                f'{camera.width}x{camera.height} px, at {self.range:g} m)')
+        return (
+            f'Rectification({self.lens.name!r} to {camera.projection} '
+            f'{camera.width}x{camera.height} px, at {self.range:g} m)'
+        )
 
     @property
     def min_range(self) -> float:
@@ -106,8 +108,11 @@ class Rectification:
             uv[~seen] = _OUTSIDE_PX
             image[:, part] = np.moveaxis(uv, -1, 0)
             mask[part] = (
-                (uv[..., 0] >= 0) & (uv[..., 0] <= self.lens.width - 1)
-                & (uv[..., 1] >= 0) & (uv[..., 1] <= self.lens.height - 1))
+                (uv[..., 0] >= 0)
+                & (uv[..., 0] <= self.lens.width - 1)
+                & (uv[..., 1] >= 0)
+                & (uv[..., 1] <= self.lens.height - 1)
+            )
         return Maps(image[0], image[1], mask)
 
     def remap(self, pixels: NDArray[Any], interpolation: int = cv2.INTER_LINEAR) -> NDArray[Any]:
@@ -116,18 +121,27 @@ class Rectification:
         Raises ParameterError for a photograph of another size than that of the lens, or for pixels
         of another type than uint8, uint16, int16, float32 or float64.
         """
-        if not isinstance(pixels, np.ndarray) or pixels.ndim not in (2, 3) or (
-                pixels.dtype not in _PIXEL_TYPES):
-            given = (f'{pixels.dtype} {pixels.shape}' if isinstance(pixels, np.ndarray)
-                     else type(pixels).__name__)
-            raise ParameterError(f'the image is {given}; an array (H, W) or (H, W, C) of '
-                                 f'{", ".join(_PIXEL_TYPES)} is needed')
+        if (
+            not isinstance(pixels, np.ndarray)
+            or pixels.ndim not in (2, 3)
+            or (pixels.dtype not in _PIXEL_TYPES)
+        ):
+            given = (
+                f'{pixels.dtype} {pixels.shape}'
+                if isinstance(pixels, np.ndarray)
+                else type(pixels).__name__
+            )
+            raise ParameterError(
+                f'the image is {given}; an array (H, W) or (H, W, C) of '
+                f'{", ".join(_PIXEL_TYPES)} is needed'
+            )
         height, width = pixels.shape[:2]
         if (width, height) != (self.lens.width, self.lens.height):
             raise ParameterError(
                 f'the image is {width}x{height} px, lens {self.lens.name!r} is for '
                 f'{self.lens.width}x{self.lens.height} px; give the lens of this camera at this '
-                'size')
+                'size'
+            )
         found = cv2.remap(pixels, self.maps.u, self.maps.v, interpolation)
         return np.asarray(found)
 
@@ -174,8 +188,9 @@ def _scene_model(lens: Lens) -> ForwardModel:
 
 def _check_range(lens: Lens, range_m: float, nearest: float) -> None:
     if not range_m > nearest:
-        raise ParameterError(f'range is {range_m:g} m; lens {lens.name!r} needs more than '
-                             f'{nearest:.3g} m')
+        raise ParameterError(
+            f'range is {range_m:g} m; lens {lens.name!r} needs more than {nearest:.3g} m'
+        )
 
 
 def meet_sphere(origin: Array, direction: Array, center: Array, radius: float) -> Array:
@@ -230,7 +245,9 @@ def rectify_pair(
     if not length > 0 or abs(along[0]) < 0.5 * length:
         raise GeometryError(
             'the cameras of the rig have no usable baseline: it is '
-            + ', '.join(f'{value:.4g}' for value in -along) + ' m, and rows cannot be aligned')
+            + ', '.join(f'{value:.4g}' for value in -along)
+            + ' m, and rows cannot be aligned'
+        )
     axis = np.cross(along, [np.sign(along[0]), 0.0, 0.0])
     if (size := np.linalg.norm(axis)) > 0:
         axis *= np.arccos(min(abs(along[0]) / length, 1.0)) / size
@@ -239,7 +256,9 @@ def rectify_pair(
     baseline = float(-(rotations[1] @ rig.position)[0])
     return RectifiedPair(
         Rectification(left, camera, range_m, rotations[0], -baseline / 2),
-        Rectification(right, camera, range_m, rotations[1], baseline / 2, baseline), rig)
+        Rectification(right, camera, range_m, rotations[1], baseline / 2, baseline),
+        rig,
+    )
 
 
 def svp_equivalent(lens: Lens) -> Lens:
@@ -257,8 +276,9 @@ def nearest_svp_lens(lens: Lens, range_m: float) -> tuple[Lens, float]:
     """
     _check_range(lens, range_m, unique_range(lens))
     step = max(lens.width, lens.height) / _SAMPLES
-    uv = np.stack(np.meshgrid(np.arange(0.0, lens.width, step), np.arange(0.0, lens.height, step)),
-                  axis=-1).reshape(-1, 2)
+    uv = np.stack(
+        np.meshgrid(np.arange(0.0, lens.width, step), np.arange(0.0, lens.height, step)), axis=-1
+    ).reshape(-1, 2)
     rays = _scene_model(lens).back_project(uv[None]).reshape((len(uv),))
     uv, origin, direction = uv[rays.valid], rays.origin[rays.valid], rays.direction[rays.valid]
     points = meet_sphere(origin, direction, np.zeros(3), range_m)
@@ -268,8 +288,10 @@ def nearest_svp_lens(lens: Lens, range_m: float) -> tuple[Lens, float]:
     reach = float(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]).max())
     off = np.linalg.norm(camera.project(found, points, limited=False).uv - uv, axis=-1)
     if reach > curve_limit(found):
-        raise LensError(f'lens {lens.name!r}: no Kannala-Brandt curve grows to the edge of its '
-                        'image at this range; lower its max_incidence_deg')
+        raise LensError(
+            f'lens {lens.name!r}: no Kannala-Brandt curve grows to the edge of its '
+            'image at this range; lower its max_incidence_deg'
+        )
     return replace(found, max_incidence=reach), float(off.max())
 
 
@@ -277,8 +299,13 @@ def _fit_parameters(start: Lens, names: tuple[str, ...], points: Array, uv: Arra
     """Return the lens with some parameters fitted to image points (N, 2) of points (N, 3)."""
     found = start
     for _ in range(_MOST_STEPS):
-        image = camera.LinearImage(found, points, False, *camera.project(found, points, False),
-                                   np.empty((len(points), 2, 3)))
+        image = camera.LinearImage(
+            found,
+            points,
+            False,
+            *camera.project(found, points, False),
+            np.empty((len(points), 2, 3)),
+        )
         columns = camera.lens_columns(found, image, names).reshape(-1, len(names))
         size = np.linalg.norm(columns, axis=0)
         residual = (uv - image.uv).ravel()

@@ -49,12 +49,14 @@ Block = Heading | Text | TableBlock | Picture
 
 def write_blocks(folder: Path, name: str, blocks: Sequence[Block]) -> list[Path]:
     """Write NAME.md and NAME.html beside the pictures; return both, or raise OutputError."""
-    pictures = {block.file: data_uri(folder / block.file)
-                for block in blocks if isinstance(block, Picture)}
+    pictures = {
+        block.file: data_uri(folder / block.file) for block in blocks if isinstance(block, Picture)
+    }
     pages = [folder / f'{name}.{suffix}' for suffix in ('md', 'html')]
     for path in pages:
-        write_text(path, page(f'blocks{path.suffix}', blocks=blocks, title=blocks[0],
-                              pictures=pictures))
+        write_text(
+            path, page(f'blocks{path.suffix}', blocks=blocks, title=blocks[0], pictures=pictures)
+        )
     return pages
 
 
@@ -63,7 +65,9 @@ def page(template: str, **values: Any) -> str:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader('fisheye_svp_ros.reporting'),
         autoescape=jinja2.select_autoescape(['html']),
-        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     return environment.get_template(template).render(values)
 

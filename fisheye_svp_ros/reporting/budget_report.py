@@ -17,8 +17,11 @@ from fisheye_svp_ros.study.budget import QUANTITIES, UNITS, Budget, Point
 _LINEAR_AXIS_RATIO = 30.0  # times, from the least to the largest error
 DISPLAY_UNITS = {'m': ('mm', 1e3), 'rad': ('deg', 180 / np.pi), 'px': ('px', 1.0)}
 _LABELS = {
-    'position': 'position of the camera', 'axis': 'viewing axis', 'residual': 'mean residual',
-    'epipolar': 'epipolar distance', 'depth': 'stereo points',
+    'position': 'position of the camera',
+    'axis': 'viewing axis',
+    'residual': 'mean residual',
+    'epipolar': 'epipolar distance',
+    'depth': 'stereo points',
 }
 _YES_NO = {True: 'yes', False: 'no', None: '-'}
 
@@ -47,8 +50,17 @@ class BudgetRequest(NamedTuple):
     def header(self) -> tuple[str, ...]:
         """The heads of the table's columns."""
         own = ('its parameters', 'what remains') if self.own else ()
-        return ('error', f'{self.model} causes', 'noise causes', *own, 'limit', 'unit', 'kept',
-                'nearest range', 'largest spread')
+        return (
+            'error',
+            f'{self.model} causes',
+            'noise causes',
+            *own,
+            'limit',
+            'unit',
+            'kept',
+            'nearest range',
+            'largest spread',
+        )
 
     def relevant_points(self, points: Sequence[Point]) -> list[Point]:
         """Return the points that the answer rests on."""
@@ -61,22 +73,30 @@ def rows(points: Sequence[Point], asked: BudgetRequest) -> list[tuple[str, ...]]
     for point in asked.relevant_points(points):
         unit, factor = DISPLAY_UNITS[UNITS[point.quantity]]
         own = (point.parameters, point.misfit) if asked.own else ()
-        found.append((
-            _LABELS[point.quantity],
-            *(f'{factor * value:.3g}' if np.isfinite(value) else '-'
-              for value in (point.error, point.noise, *own, point.limit)),
-            unit, _YES_NO[point.kept],
-            f'{point.nearest_range:.2f} m' if np.isfinite(point.nearest_range) else 'nowhere',
-            f'{np.degrees(point.largest_spread):.0f} deg'
-            if np.isfinite(point.largest_spread) else 'nowhere',
-        ))
+        found.append(
+            (
+                _LABELS[point.quantity],
+                *(
+                    f'{factor * value:.3g}' if np.isfinite(value) else '-'
+                    for value in (point.error, point.noise, *own, point.limit)
+                ),
+                unit,
+                _YES_NO[point.kept],
+                f'{point.nearest_range:.2f} m' if np.isfinite(point.nearest_range) else 'nowhere',
+                f'{np.degrees(point.largest_spread):.0f} deg'
+                if np.isfinite(point.largest_spread)
+                else 'nowhere',
+            )
+        )
     return found
 
 
 def answer(points: Sequence[Point], asked: BudgetRequest) -> str:
     """Return the answer to whether shift and port may be neglected, as a sentence."""
-    where = (f'for landmarks within {np.degrees(asked.spread):.0f} degrees of the axis at '
-             f'{asked.working_range:g} m')
+    where = (
+        f'for landmarks within {np.degrees(asked.spread):.0f} degrees of the axis at '
+        f'{asked.working_range:g} m'
+    )
     judged = asked.relevant_points(points)
     broken = [point for point in judged if point.kept is False]
     unknown = [point for point in judged if point.kept is None]
@@ -84,15 +104,20 @@ def answer(points: Sequence[Point], asked: BudgetRequest) -> str:
         return f'Yes: {where} {asked.model} keeps every limit.'
     untold = ' and '.join(_LABELS[one.quantity] for one in unknown) + ' cannot be computed there'
     if not broken:
-        return (f'Not known: {where} {asked.model} keeps {len(judged) - len(unknown)} of '
-                f'{len(judged)} limits; {untold}.')
+        return (
+            f'Not known: {where} {asked.model} keeps {len(judged) - len(unknown)} of '
+            f'{len(judged)} limits; {untold}.'
+        )
     worst = max(broken, key=lambda point: point.error / point.limit)
     unit, factor = DISPLAY_UNITS[UNITS[worst.quantity]]
     limit = 'your limit' if asked.given else 'the effect of noise'
     needed = max(point.nearest_range for point in (*broken, *unknown))
     neglected = 'suffices' if asked.port else 'may be neglected'
-    remedy = (f'it {neglected} from {needed:.2f} m on' if np.isfinite(needed)
-              else 'it fails at every range up to the largest computed one')
+    remedy = (
+        f'it {neglected} from {needed:.2f} m on'
+        if np.isfinite(needed)
+        else 'it fails at every range up to the largest computed one'
+    )
     return (
         f'No: {where} {asked.model} breaks {len(broken)} of {len(judged)} limits; the worst is '
         f'the {_LABELS[worst.quantity]}: {factor * worst.error:.3g} {unit}, '
@@ -116,16 +141,21 @@ def document(budget: Budget, points: Sequence[Point], asked: BudgetRequest) -> d
         'negligible': negligible(asked.relevant_points(points)),
         'answer': answer(points, asked),
         'at_point': [
-            {**point._asdict(), 'unit': UNITS[point.quantity],
-             'limit_is': 'given' if point.quantity in asked.given else 'noise'}
+            {
+                **point._asdict(),
+                'unit': UNITS[point.quantity],
+                'limit_is': 'given' if point.quantity in asked.given else 'noise',
+            }
             for point in points
         ],
         'spreads_rad': budget.spreads.tolist(),
         'ranges_m': budget.ranges.tolist(),
         'error': {name: budget.error[name].tolist() for name in QUANTITIES},
         'noise': {name: budget.noise[name].tolist() for name in QUANTITIES},
-        **{part: {name: values.tolist() for name, values in by.items()}
-           for part, by in budget.own.items()},
+        **{
+            part: {name: values.tolist() for name, values in by.items()}
+            for part, by in budget.own.items()
+        },
     }
 
 
@@ -137,16 +167,23 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: BudgetReque
             unit, factor = DISPLAY_UNITS[UNITS[point.quantity]]
             error = np.ma.masked_invalid(factor * budget.error[point.quantity])
             mesh = axis.pcolormesh(
-                budget.ranges, np.degrees(budget.spreads), error, shading='nearest',
-                norm=LogNorm(), cmap='Blues',
+                budget.ranges,
+                np.degrees(budget.spreads),
+                error,
+                shading='nearest',
+                norm=LogNorm(),
+                cmap='Blues',
             )
             _label(figure.colorbar(mesh, ax=axis, label=unit), error)
             _draw_limit(axis, budget, point, point.quantity in asked.given)
-            axis.plot(asked.working_range, np.degrees(asked.spread), '*', color=PUBLISHED,
-                      markersize=11)
+            axis.plot(
+                asked.working_range, np.degrees(asked.spread), '*', color=PUBLISHED, markersize=11
+            )
             kept = {True: 'kept', False: 'broken', None: 'not known'}[point.kept]
-            axis.set_title(f'{_LABELS[point.quantity]}: limit {factor * point.limit:.3g} {unit}, '
-                           f'{kept}', fontsize=9.5)
+            axis.set_title(
+                f'{_LABELS[point.quantity]}: limit {factor * point.limit:.3g} {unit}, {kept}',
+                fontsize=9.5,
+            )
             axis.set(xscale='log', xlabel='range / m', ylabel='spread / degree')
             axis.grid(visible=False)
         _explain(axes.flat[len(points)], asked.model)
@@ -174,9 +211,13 @@ def _draw_limit(axis: Any, budget: Budget, point: Point, given: bool) -> None:
 def _explain(axis: Any, model: str) -> None:
     axis.axis('off')
     axis.text(
-        0.02, 0.95,
+        0.02,
+        0.95,
         f'Color: error caused by {model}.\nHatched: above the limit.\nLine: at the limit.\nStar: '
         'your range and spread.\nDefault limits: the errors caused by noise.\n\nSpread: largest '
         'incidence angle of the\nlandmarks, which surround the axis.',
-        va='top', transform=axis.transAxes, linespacing=1.5, in_layout=False,
+        va='top',
+        transform=axis.transAxes,
+        linespacing=1.5,
+        in_layout=False,
     )

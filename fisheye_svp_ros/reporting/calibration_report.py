@@ -30,25 +30,41 @@ def write_calibration_report(
 
     Raises OutputError where it cannot be written.
     """
-    write_text(path, page(
-        'calibration.html', command=command, standard_errors=STANDARD_ERRORS,
-        cameras=[_camera(name, one) for name, one in cameras.items()]))
+    write_text(
+        path,
+        page(
+            'calibration.html',
+            command=command,
+            standard_errors=STANDARD_ERRORS,
+            cameras=[_camera(name, one) for name, one in cameras.items()],
+        ),
+    )
 
 
 def _camera(name: str, one: CalibratedCamera) -> dict[str, Any]:
     rays = _rays(one)
     figures = one.lens.calibration or {}
     return {
-        'name': name, 'lens': one.lens.name, 'source': one.table.source,
-        'points': figures['observations'], 'frames': figures['frames'],
-        'photographs': bool(one.table.photographs), 'rms': figures['rms_px'],
-        'noise': one.result.sigma, 'warnings': one.warnings, 'rows': one.parameter_rows(),
+        'name': name,
+        'lens': one.lens.name,
+        'source': one.table.source,
+        'points': figures['observations'],
+        'frames': figures['frames'],
+        'photographs': bool(one.table.photographs),
+        'rms': figures['rms_px'],
+        'noise': one.result.sigma,
+        'warnings': one.warnings,
+        'rows': one.parameter_rows(),
         'ranged': any(row[3] for row in one.parameter_rows()),
         'reached': float(np.degrees(one.result.reached)),
-        'errors': [(f'{e.range_m:g}', f'{1e3 * e.value:.2g}', f'{1e3 * e.low:.2g}',
-                    f'{1e3 * e.high:.2g}') for e in rays[1].errors()],
-        'coverage': _drawn(_coverage, one), 'residuals': _drawn(_residuals, one),
-        'frames_picture': _drawn(_frames, one), 'uncertainty': _drawn(_uncertainty, one, *rays),
+        'errors': [
+            (f'{e.range_m:g}', f'{1e3 * e.value:.2g}', f'{1e3 * e.low:.2g}', f'{1e3 * e.high:.2g}')
+            for e in rays[1].errors()
+        ],
+        'coverage': _drawn(_coverage, one),
+        'residuals': _drawn(_residuals, one),
+        'frames_picture': _drawn(_frames, one),
+        'uncertainty': _drawn(_uncertainty, one, *rays),
     }
 
 
@@ -74,8 +90,13 @@ def _drawn(draw: Any, *arguments: Any) -> str:
 
 
 def _image(axis: Any, lens: Lens) -> None:
-    axis.set(xlim=(-0.5, lens.width - 0.5), ylim=(lens.height - 0.5, -0.5), aspect='equal',
-             xlabel='u / px', ylabel='v / px')
+    axis.set(
+        xlim=(-0.5, lens.width - 0.5),
+        ylim=(lens.height - 0.5, -0.5),
+        aspect='equal',
+        xlabel='u / px',
+        ylabel='v / px',
+    )
 
 
 def _coverage(figure: Any, one: CalibratedCamera) -> None:
@@ -88,8 +109,13 @@ def _coverage(figure: Any, one: CalibratedCamera) -> None:
     distance = np.linalg.norm(points, axis=-1)
     field.plot(np.degrees(np.arccos(points[:, 2] / distance)), distance, '.', color=OURS, ms=2)
     field.axvline(np.degrees(one.lens.max_incidence), color=PUBLISHED, lw=1)
-    field.set(xlabel='incidence angle / deg', ylabel='distance / m', xlim=(0, None),
-              ylim=(0, None), title='angles and distances (line: max_incidence_deg)')
+    field.set(
+        xlabel='incidence angle / deg',
+        ylabel='distance / m',
+        xlim=(0, None),
+        ylim=(0, None),
+        title='angles and distances (line: max_incidence_deg)',
+    )
 
 
 def _residuals(figure: Any, one: CalibratedCamera) -> None:
@@ -99,8 +125,15 @@ def _residuals(figure: Any, one: CalibratedCamera) -> None:
     step = max(1, len(uv) // _ARROWS)
     size = np.linalg.norm(residual, axis=1)
     typical = max(float(np.quantile(size, 0.9)), 1e-9)
-    key = image.quiver(*uv[::step].T, *residual[::step].T, angles='xy', scale_units='xy',
-                       scale=typical / (_ARROW_LENGTH * lens.width), color=OURS, width=0.002)
+    key = image.quiver(
+        *uv[::step].T,
+        *residual[::step].T,
+        angles='xy',
+        scale_units='xy',
+        scale=typical / (_ARROW_LENGTH * lens.width),
+        color=OURS,
+        width=0.002,
+    )
     length = round_number(typical)
     image.quiverkey(key, 0.8, 1.04, length, f'{length:g} px', labelpos='E')
     _image(image, lens)
@@ -110,8 +143,14 @@ def _residuals(figure: Any, one: CalibratedCamera) -> None:
     theta = np.degrees(np.arccos(points[:, 2] / np.linalg.norm(points, axis=-1)))
     angles.plot(theta, radial, '.', color=OURS, ms=2, alpha=0.4)
     parts = np.array_split(np.argsort(theta), max(1, min(16, len(theta) // 8)))
-    angles.plot([theta[p].mean() for p in parts], [radial[p].mean() for p in parts], 'o-',
-                color=PUBLISHED, ms=4, label='means')
+    angles.plot(
+        [theta[p].mean() for p in parts],
+        [radial[p].mean() for p in parts],
+        'o-',
+        color=PUBLISHED,
+        ms=4,
+        label='means',
+    )
     angles.set(xlabel='incidence angle / deg', ylabel='radial residual / px')
     angles.legend(loc='upper right')
 
@@ -124,8 +163,10 @@ def _frames(figure: Any, one: CalibratedCamera) -> None:
     axis.bar(place, rms, color=OURS)
     axis.axhline(float(np.median(rms)), color=PUBLISHED, lw=1, label='median')
     step = -(-len(rms) // _TICKS)
-    names = [frame_name(one.table, frame).removeprefix('frame ')
-             for frame in views.frame[::step].tolist()]
+    names = [
+        frame_name(one.table, frame).removeprefix('frame ')
+        for frame in views.frame[::step].tolist()
+    ]
     axis.set_xticks(place[::step], names, rotation=90, fontsize=7)
     axis.set(ylabel='rms residual / px', xlabel='' if one.table.photographs else 'frame')
     axis.legend(loc='upper right')
@@ -140,6 +181,7 @@ def _uncertainty(figure: Any, one: CalibratedCamera, uv: Array, rays: RayModel) 
     theta = np.degrees(np.arccos(np.clip(axis[:, 2], -1, 1)))
     for sd, range_m, color in zip(rays.sd, RANGES, (PUBLISHED, FAINT, OURS), strict=True):
         angles.plot(theta, 1e3 * sd, '.', ms=3, color=color, label=f'at {range_m:g} m')
-    angles.set(xlabel='incidence angle / deg', ylabel='standard error of a ray / mrad',
-               ylim=(0, None))
+    angles.set(
+        xlabel='incidence angle / deg', ylabel='standard error of a ray / mrad', ylim=(0, None)
+    )
     angles.legend()

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.solve.lens_calibration import Calibration
     from fisheye_svp_ros.study.trust import LensTrust
 
-STANDARD_ERRORS = ('standard errors include local errors of target, frames and image, and the '
-                   'shape and scale of the target')
+STANDARD_ERRORS = (
+    'standard errors include local errors of target, frames and image, and the '
+    'shape and scale of the target'
+)
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
 _MODEL_ERROR_RATIO = 2.0  # times the noise, from which residuals show a model error
 _MAX_CENTER_OFFSET = 0.1  # of the image, by which a principal point is seldom off its centre
@@ -50,10 +52,16 @@ class CalibratedCamera:
         """Return the camera with a lens fitted to more, and the poses of its views by it."""
         adjusted, views = self.result.adjusted, self.result.views
         solved = localize(ForwardModel(lens), views, adjusted.pose)
-        lens = replace(lens, calibration={
-            **(lens.calibration or {}), 'rms_px': rms_px(solved.residual)})
-        return replace(self, lens=lens, result=self.result._replace(adjusted=adjusted._replace(
-            lens=lens, pose=solved.pose, residual=solved.residual)))
+        lens = replace(
+            lens, calibration={**(lens.calibration or {}), 'rms_px': rms_px(solved.residual)}
+        )
+        return replace(
+            self,
+            lens=lens,
+            result=self.result._replace(
+                adjusted=adjusted._replace(lens=lens, pose=solved.pose, residual=solved.residual)
+            ),
+        )
 
     def parameter_rows(self) -> list[tuple[str, str, str, str, str]]:
         """Return name, value, standard error, range over targets ('': settled) and unit.
@@ -61,13 +69,23 @@ class CalibratedCamera:
         Standard errors are those that the lens file holds.
         """
         errors = dict((self.lens.calibration or {}).get('stderr', {}))
-        ranges = {name: interval(one.low, one.high)
-                  for name, one in self.trust.admissible.items() if not one.settled}
+        ranges = {
+            name: interval(one.low, one.high)
+            for name, one in self.trust.admissible.items()
+            if not one.settled
+        }
         for known in (errors, ranges):
             if 'f' in known:
                 known['fx'] = known['fy'] = known['f']
-        return [(name, *with_error(value, errors.get(name, 0.0)), ranges.get(name, ''),
-                 UNITS.get(name, '1')) for name, value in self.lens.parameters.items()]
+        return [
+            (
+                name,
+                *with_error(value, errors.get(name, 0.0)),
+                ranges.get(name, ''),
+                UNITS.get(name, '1'),
+            )
+            for name, value in self.lens.parameters.items()
+        ]
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
@@ -75,62 +93,85 @@ class CalibratedCamera:
         shifts = [
             f'{name} is undetermined: {1e3 * range_.low:.2f} to {1e3 * range_.high:.2f} mm, since '
             'the shape of the target is confounded with it; run `fisheye-svp diagnose`'
-            for name, range_ in self.trust.doubtful_shift.items()]
-        return (*shifts, *self._fit_warnings(), *self._image_warnings(),
-                *(hand_eye_warnings(self.hand_eye) if self.hand_eye else ()))
+            for name, range_ in self.trust.doubtful_shift.items()
+        ]
+        return (
+            *shifts,
+            *self._fit_warnings(),
+            *self._image_warnings(),
+            *(hand_eye_warnings(self.hand_eye) if self.hand_eye else ()),
+        )
 
     def _fit_warnings(self) -> list[str]:
         found, result = [], self.result
         if result.left_out:
-            found.append('left out, their points do not determine a pose (all near one line, or '
-                         f'of another lens?): {list_frames(self.table, result.left_out)}')
+            found.append(
+                'left out, their points do not determine a pose (all near one line, or '
+                f'of another lens?): {list_frames(self.table, result.left_out)}'
+            )
         if not result.adjusted.converged:
-            found.append('the adjustment has not converged, so the lens is inaccurate; take more '
-                         'photographs, or check these')
+            found.append(
+                'the adjustment has not converged, so the lens is inaccurate; take more '
+                'photographs, or check these'
+            )
         rms, sigma = (self.lens.calibration or {})['rms_px'], float(np.median(self.table.sigma))
         if rms > max(_LOST, _POOR * sigma if np.isfinite(sigma) else 0.0):
-            found.append(f'{self.model} leaves {rms:.1f} px: the model does not fit this lens, or '
-                         'image points and landmarks do not match (check order, units, axes, '
-                         'image size)')
+            found.append(
+                f'{self.model} leaves {rms:.1f} px: the model does not fit this lens, or '
+                'image points and landmarks do not match (check order, units, axes, '
+                'image size)'
+            )
         elif np.isfinite(sigma) and rms > _MODEL_ERROR_RATIO * 2**0.5 * sigma:
-            found.append(f'{rms:.2g} px are {rms / sigma / 2**0.5:.1f} times the noise of image '
-                         'points: lens or target has a model error; run `fisheye-svp diagnose`')
+            found.append(
+                f'{rms:.2g} px are {rms / sigma / 2**0.5:.1f} times the noise of image '
+                'points: lens or target has a model error; run `fisheye-svp diagnose`'
+            )
         if result.beyond:
-            found.append(f'{result.beyond} observations lie beyond max_incidence_deg, where the '
-                         'fitted curve stops growing; try another --model')
+            found.append(
+                f'{result.beyond} observations lie beyond max_incidence_deg, where the '
+                'fitted curve stops growing; try another --model'
+            )
         return found
 
     def _image_warnings(self) -> list[str]:
         """Say where the image of the lens lies askew, or was not covered."""
         lens, views, found = self.lens, self.result.views, []
         off = lens.cx - (lens.width - 1) / 2, lens.cy - (lens.height - 1) / 2
-        if (abs(off[0]) > _MAX_CENTER_OFFSET * lens.width
-                or abs(off[1]) > _MAX_CENTER_OFFSET * lens.height):
+        if (
+            abs(off[0]) > _MAX_CENTER_OFFSET * lens.width
+            or abs(off[1]) > _MAX_CENTER_OFFSET * lens.height
+        ):
             found.append(
                 f'the principal point lies {off[0]:.0f}, {off[1]:.0f} px off the center of the '
-                'image; check the image size, and that images are not cropped')
+                'image; check the image size, and that images are not cropped'
+            )
         out = float(np.linalg.norm(views.uv[views.used] - (lens.cx, lens.cy), axis=-1).max())
         edge = min(lens.cx, lens.width - lens.cx, lens.cy, lens.height - lens.cy)
         if out < _MIN_COVERED_RADIUS * edge:
             found.append(
                 f'the curve is extrapolated beyond {np.degrees(self.result.reached):.0f} deg: '
                 f'image points reach {out:.0f} px from the center, the nearest edge is at '
-                f'{edge:.0f} px; photograph the target near the edges too')
+                f'{edge:.0f} px; photograph the target near the edges too'
+            )
         return found
 
 
 def hand_eye_sentence(found: HandEye) -> str:
     """Return how many poses there are, the noise of the robot, and the scale."""
     scale, error = found.scale, found.stderr[-1]
-    return (f'{len(found.frame)} poses of the flange; noise of the robot '
-            f'{1e3 * found.noise_m:.3f} mm and {np.degrees(found.noise_rad):.4f} deg an axis; '
-            f'lengths of the target are {scale:.5f} ± {error:.5f} times those of the robot')
+    return (
+        f'{len(found.frame)} poses of the flange; noise of the robot '
+        f'{1e3 * found.noise_m:.3f} mm and {np.degrees(found.noise_rad):.4f} deg an axis; '
+        f'lengths of the target are {scale:.5f} ± {error:.5f} times those of the robot'
+    )
 
 
 def hand_eye_rows(found: HandEye) -> list[tuple[str, ...]]:
     """Return both transforms as ROBOT_HEADER has them, each with its standard errors below it."""
-    return [*_rows('camera in flange', found.camera, found.stderr[:6]),
-            *_rows('target in base', found.target, found.stderr[6:12])]
+    return [
+        *_rows('camera in flange', found.camera, found.stderr[:6]),
+        *_rows('target in base', found.target, found.stderr[6:12]),
+    ]
 
 
 def hand_eye_warnings(found: HandEye) -> list[str]:
@@ -139,8 +180,10 @@ def hand_eye_warnings(found: HandEye) -> list[str]:
     if factor > _MAX_SCALE:
         longer = 'the poses' if found.scale < 1 else 'the target'
         likely = f': {longer} may be in mm' if factor > _MIN_MM else ''
-        warnings.append(f'lengths of robot and target differ by a factor of {factor:.4g}{likely}; '
-                        'both are needed in m')
+        warnings.append(
+            f'lengths of robot and target differ by a factor of {factor:.4g}{likely}; '
+            'both are needed in m'
+        )
     noise = np.repeat((found.noise_m, found.noise_rad), 3)
     squares = ((found.residual / noise) ** 2).sum(axis=1)
     worst = int(np.argmax(squares))
@@ -148,14 +191,19 @@ def hand_eye_warnings(found: HandEye) -> list[str]:
         off, turn = np.linalg.norm(found.residual[worst].reshape(2, 3), axis=1)
         warnings.append(
             f'the pose of frame {found.frame[worst]} is {1e3 * off:.1f} mm and '
-            f'{np.degrees(turn):.2f} deg off the others: correct it, or remove it from the poses')
+            f'{np.degrees(turn):.2f} deg off the others: correct it, or remove it from the poses'
+        )
     return warnings
 
 
 def _rows(name: str, pose: Pose, stderr: Array) -> list[tuple[str, ...]]:
     turn = np.degrees(vector_from_rotation(pose.rotation))
-    values = [*(f'{1e3 * value:.3f}' for value in pose.position),
-              *(f'{value:.4f}' for value in turn)]
-    errors = [*(f'± {1e3 * value:.3f}' for value in stderr[:3]),
-              *(f'± {value:.4f}' for value in np.degrees(stderr[3:]))]
+    values = [
+        *(f'{1e3 * value:.3f}' for value in pose.position),
+        *(f'{value:.4f}' for value in turn),
+    ]
+    errors = [
+        *(f'± {1e3 * value:.3f}' for value in stderr[:3]),
+        *(f'± {value:.4f}' for value in np.degrees(stderr[3:])),
+    ]
     return [(name, *values), ('', *errors)]

@@ -13,8 +13,12 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.terminal import UNITS, with_error, without_minus_zero
 
 HUMAN_UNITS = {
-    'm': (1e3, 'mm'), 'm^2': (1e6, 'mm²'), 'rad': (180 / math.pi, 'deg'), 's': (1e3, 'ms'),
-    '1': (1e2, '%'), '1/rad^2': (1.0, '/rad²'),
+    'm': (1e3, 'mm'),
+    'm^2': (1e6, 'mm²'),
+    'rad': (180 / math.pi, 'deg'),
+    's': (1e3, 'ms'),
+    '1': (1e2, '%'),
+    '1/rad^2': (1.0, '/rad²'),
 }
 _UNDETERMINED_RATIO = 1e-6  # of its standard error: a parameter of which the data know nothing
 _ZERO_TOLERANCE = 1e-12  # what rounding leaves of a parameter that does nothing
@@ -26,22 +30,28 @@ _UNCERTAIN = {
     'rotation_rad': ('orientation from one frame', 180 / math.pi, 'deg'),
 }
 COMPONENTS = {
-    'named_lens': 'lens, identified', 'named_target': 'target, identified',
+    'named_lens': 'lens, identified',
+    'named_target': 'target, identified',
     'named_frame': 'frames, identified',
     'image_broad': 'image field, correlated over 1/3 of the width',
     'image_coarse': 'image field, correlated over 1/6 of the width',
     'image_fine': 'image field, correlated over 1/14 of the width',
     'image_finest': 'finer image field',
     'landmark_in_plane': 'landmarks along their board',
-    'landmark_normal': 'landmarks off their board', 'landmark': 'landmarks',
-    'board_stretch': 'stretch of the board', 'board_in_plane': 'board field along it',
+    'landmark_normal': 'landmarks off their board',
+    'landmark': 'landmarks',
+    'board_stretch': 'stretch of the board',
+    'board_in_plane': 'board field along it',
     'board_normal': 'board field off it',
-    'frame_focal': 'focal length of each frame', 'frame_centre': 'principal point of each frame',
+    'frame_focal': 'focal length of each frame',
+    'frame_centre': 'principal point of each frame',
     'frame_linear': 'linear field of each frame',
     'frame_quadratic': 'quadratic field of each frame',
-    'frame_bumps': 'image field of each frame', 'frame_bend': 'bend of the board in each frame',
+    'frame_bumps': 'image field of each frame',
+    'frame_bend': 'bend of the board in each frame',
     'frame_sag': 'bend of the board that follows its tilt',
-    'frame_similar': 'landmarks in similar views', 'noise': 'noise of image points',
+    'frame_similar': 'landmarks in similar views',
+    'noise': 'noise of image points',
 }
 _MAX_LANDMARKS = 6  # landmarks named in a row
 
@@ -67,7 +77,8 @@ def size(diagnosis: Diagnosis, cause: Cause) -> str:
         return '; '.join(
             (f'board {m.board}: ' if len(maps) > 1 else '')
             + f'{1e3 * m.peak_to_valley:.2f} mm peak to valley'
-            for m in maps if m.peak_to_valley > 0
+            for m in maps
+            if m.peak_to_valley > 0
         )
     if target_map == 'single':
         return _landmarks(diagnosis, cause)
@@ -143,8 +154,13 @@ def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
 def budget_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str, str, str]]:
     """Yield the variance budget: part, stage, sd in px, share, p-value."""
     for part in diagnosis.components:
-        yield (COMPONENTS[part.name], part.stage, f'{part.sd_px:.3f}', percent(part.share),
-               '-' if part.name == 'noise' else bare_probability(part.p_value))
+        yield (
+            COMPONENTS[part.name],
+            part.stage,
+            f'{part.sd_px:.3f}',
+            percent(part.share),
+            '-' if part.name == 'noise' else bare_probability(part.p_value),
+        )
 
 
 def uncertainty_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
@@ -184,8 +200,14 @@ def outlier_rows(gross: Sequence[Mapping[str, Any]]) -> list[OutlierRow]:
         where = one.get('photograph') or f'frame {one["frame"]}'
         groups.setdefault((where, one.get('camera', ''), one['why']), []).append(one)
     rows = [
-        OutlierRow(where, camera, _numbers([one['landmark'] for one in points]), len(points),
-                   max(one['px'] for one in points), why)
+        OutlierRow(
+            where,
+            camera,
+            _numbers([one['landmark'] for one in points]),
+            len(points),
+            max(one['px'] for one in points),
+            why,
+        )
         for (where, camera, why), points in groups.items()
     ]
     return sorted(rows, key=lambda row: (-row.points, -row.px))

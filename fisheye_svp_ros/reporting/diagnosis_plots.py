@@ -108,7 +108,7 @@ def draw_field(path: Path, shown: PlotData) -> None:
     with picture(path, _WIDTH, 1.1 * len(lenses) + (_WIDTH - 1) / 2 * sum(sides)) as figure:
         axes = figure.subplots(len(sides), 2, squeeze=False, height_ratios=sides)
         for camera, (name, lens) in enumerate(lenses):
-            _draw_field(axes[2 * camera:][:2], shown.of_camera(camera), name, lens)
+            _draw_field(axes[2 * camera :][:2], shown.of_camera(camera), name, lens)
 
 
 def _draw_field(axes: Any, points: PointResiduals, name: str, lens: Lens) -> None:
@@ -138,19 +138,32 @@ def draw_against(path: Path, shown: PlotData, x: Array, label: str, log: bool = 
     """Radial and tangential residuals against a variable (K,), with binned means."""
     rows = [('radial / px', 0), ('tangential / px', 1)]
     polar = {side: _polar(shown, getattr(shown.points, side)) for side, _ in _SIDES}
-    _grid(path, shown, [
-        (name, x, {side: values[:, i] for side, values in polar.items()}) for name, i in rows
-    ], label, log)
+    _grid(
+        path,
+        shown,
+        [(name, x, {side: values[:, i] for side, values in polar.items()}) for name, i in rows],
+        label,
+        log,
+    )
 
 
 def draw_phase(path: Path, shown: PlotData) -> None:
     """Residuals of u and v against the place of u and v within its pixel."""
     phase = np.mod(shown.points.uv + 0.5, 1.0) - 0.5
-    _grid(path, shown, [
-        (f'{name} residual / px', phase[:, i],
-         {side: getattr(shown.points, side)[:, i] for side, _ in _SIDES})
-        for i, name in enumerate('uv')
-    ], 'fractional part of u (above) and v (below) / px', False)
+    _grid(
+        path,
+        shown,
+        [
+            (
+                f'{name} residual / px',
+                phase[:, i],
+                {side: getattr(shown.points, side)[:, i] for side, _ in _SIDES},
+            )
+            for i, name in enumerate('uv')
+        ],
+        'fractional part of u (above) and v (below) / px',
+        False,
+    )
 
 
 def draw_histogram(path: Path, shown: PlotData) -> None:
@@ -161,7 +174,7 @@ def draw_histogram(path: Path, shown: PlotData) -> None:
         axes = figure.subplots(1, 2, sharex=True, sharey=True)
         for axis, (side, colour) in zip(axes, _SIDES, strict=True):
             z = getattr(shown.points, side).ravel() / shown.noise
-            expected = z.size * np.diff(bins)[0] * np.exp(-middle**2 / 2) / np.sqrt(2 * np.pi)
+            expected = z.size * np.diff(bins)[0] * np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi)
             axis.hist(np.clip(z, -6, 6), bins, color=colour, alpha=0.55, label='u and v')
             axis.plot(middle, expected, color=INK, lw=1.4, label='noise alone')
             axis.set(yscale='log', ylim=(0.5, None), xlabel='residual / noise')
@@ -172,7 +185,10 @@ def draw_histogram(path: Path, shown: PlotData) -> None:
 
 
 def _grid(
-    path: Path, shown: PlotData, rows: list[tuple[str, Array, dict[str, Array]]], label: str,
+    path: Path,
+    shown: PlotData,
+    rows: list[tuple[str, Array, dict[str, Array]]],
+    label: str,
     log: bool,
 ) -> None:
     with picture(path, _WIDTH, 4.4, tight=True) as figure:
@@ -196,18 +212,46 @@ def _plot_bins(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> flo
     axis.plot(x, y, '.', ms=1.5, color=colour, alpha=0.15, zorder=1)
     order = np.argsort(x, kind='stable')
     parts = np.array_split(order, max(min(_BINS, len(x) // 8), 1))
-    centre, mean, rms, error, count = np.array([
-        (x[p].mean(), y[p].mean(), y[p].std(), y[p].std() / np.sqrt(p.size), p.size)
-        for p in parts
-    ]).T
+    centre, mean, rms, error, count = np.array(
+        [
+            (x[p].mean(), y[p].mean(), y[p].std(), y[p].std() / np.sqrt(p.size), p.size)
+            for p in parts
+        ]
+    ).T
     band = 2 * noise / np.sqrt(count)
-    axis.fill_between(centre, -band, band, color=NOISE, alpha=0.6, lw=0, zorder=2,
-                      label='95 % of the means if there is only noise')
-    axis.errorbar(centre, mean, error, fmt='o-', ms=4, lw=1.3, color=colour, zorder=3,
-                  mec='white', mew=0.5, label='mean of a bin and its standard error')
+    axis.fill_between(
+        centre,
+        -band,
+        band,
+        color=NOISE,
+        alpha=0.6,
+        lw=0,
+        zorder=2,
+        label='95 % of the means if there is only noise',
+    )
+    axis.errorbar(
+        centre,
+        mean,
+        error,
+        fmt='o-',
+        ms=4,
+        lw=1.3,
+        color=colour,
+        zorder=3,
+        mec='white',
+        mew=0.5,
+        label='mean of a bin and its standard error',
+    )
     for sign in (-1, 1):
-        axis.plot(centre, mean + sign * rms, ':', lw=1.2, color=colour, zorder=3,
-                  label='scatter within a bin' if sign > 0 else None)
+        axis.plot(
+            centre,
+            mean + sign * rms,
+            ':',
+            lw=1.2,
+            color=colour,
+            zorder=3,
+            label='scatter within a bin' if sign > 0 else None,
+        )
     return float((np.abs(mean) + error).max())
 
 
@@ -219,7 +263,11 @@ def _legend(figure: Figure, axis: Axes) -> None:
 
 
 def draw_groups(
-    path: Path, shown: PlotData, group: Index, x: Array | None, label: str,
+    path: Path,
+    shown: PlotData,
+    group: Index,
+    x: Array | None,
+    label: str,
     ticks: Sequence[str] = (),
 ) -> None:
     """Rms of the residuals of each group (K,), or over a variable (K,); ticks: their names."""
@@ -231,13 +279,28 @@ def draw_groups(
     )
     with picture(path, _WIDTH, 3.6 if ticks else 2.8, tight=True) as figure:
         axis = figure.subplots()
-        axis.fill_between(place[order], low[order], high[order], color=NOISE, alpha=0.4, lw=0,
-                          step='mid', label='95 % if there is only noise')
+        axis.fill_between(
+            place[order],
+            low[order],
+            high[order],
+            color=NOISE,
+            alpha=0.4,
+            lw=0,
+            step='mid',
+            label='95 % if there is only noise',
+        )
         for side, colour in _SIDES:
             squares = (getattr(shown.points, side) ** 2).sum(axis=1)
             rms = np.sqrt(np.bincount(label_of, weights=squares) / count)
-            axis.plot(place[order], rms[order], 'o' if len(names) > 60 else 'o-', ms=3.5, lw=1,
-                      color=colour, label=side)
+            axis.plot(
+                place[order],
+                rms[order],
+                'o' if len(names) > 60 else 'o-',
+                ms=3.5,
+                lw=1,
+                color=colour,
+                label=side,
+            )
         axis.set(xlabel=label, ylabel='rms residual / px', ylim=(0, None))
         if ticks:
             step = -(-len(ticks) // _TICKS)
@@ -267,8 +330,14 @@ def draw_arrows(
 ) -> None:
     """Draw residuals, the typical one (px) as long as a cell, and the key to their scale."""
     key = axis.quiver(
-        *uv.T, *residual.T, angles='xy', scale_units='xy', scale=typical / cell, color=colour,
-        alpha=0.45 if len(uv) > 600 else 0.9, width=0.0018,
+        *uv.T,
+        *residual.T,
+        angles='xy',
+        scale_units='xy',
+        scale=typical / cell,
+        color=colour,
+        alpha=0.45 if len(uv) > 600 else 0.9,
+        width=0.0018,
     )
     length = round_number(typical)
     axis.quiverkey(key, 0.85, 1.03, length, f'{length:g} px', labelpos='E', color=INK)
@@ -280,8 +349,7 @@ def _cell_means(uv: Array, residual: Array, cell: float) -> tuple[Array, Array]:
         np.floor(uv / cell), axis=0, return_inverse=True, return_counts=True
     )
     means = [
-        np.bincount(label.reshape(-1), weights=column) / count
-        for column in (*uv.T, *residual.T)
+        np.bincount(label.reshape(-1), weights=column) / count for column in (*uv.T, *residual.T)
     ]
     table = np.stack(means, axis=-1)[count >= min(3, count.max())]
     return table[:, :2], table[:, 2:]
@@ -299,9 +367,12 @@ def _polar(shown: PlotData, residual: Array) -> Array:
 def _by_photograph(shown: PlotData) -> tuple[Index, None, str, list[str]]:
     """Return the view of each point, no variable, a label, and the photographs' names."""
     views, which = np.unique(
-        np.stack([shown.points.camera, shown.points.frame]), axis=1, return_inverse=True)
-    names = [frame_name(shown.table, frame, shown.table.cameras[camera])
-             for camera, frame in views.T.tolist()]
+        np.stack([shown.points.camera, shown.points.frame]), axis=1, return_inverse=True
+    )
+    names = [
+        frame_name(shown.table, frame, shown.table.cameras[camera])
+        for camera, frame in views.T.tolist()
+    ]
     return which.reshape(-1), None, 'photograph', names
 
 

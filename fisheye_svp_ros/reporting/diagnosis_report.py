@@ -28,23 +28,30 @@ from fisheye_svp_ros.reporting.next_steps import (
 
 _CAPTIONS = {
     'field': 'Residual vectors over the image; the scale is above each panel; dotted: equal '
-             'incidence angle. Above: single points. Below: means over cells of the image, which '
-             'show errors common to all frames.',
+    'incidence angle. Above: single points. Below: means over cells of the image, which '
+    'show errors common to all frames.',
     'theta': 'Residuals against the incidence angle, along the radius from the principal point '
-             '(above) and across it (below).',
+    '(above) and across it (below).',
     'range': 'Residuals against the distance of the landmark. If the viewpoint of the lens moves, '
-             'the radial residuals change with the distance.',
+    'the radial residuals change with the distance.',
     'landmark': 'Residuals of each landmark. One that stands out is displaced.',
     'frame': 'Residuals of each frame. A step or a drift indicates a change of the camera.',
     'phase': 'Residuals against the fractional part of the image point. Waves come from the '
-             'detector.',
+    'detector.',
     'histogram': 'Residuals divided by the noise; the end bins include all beyond 6. Wide tails '
-                 'are outliers, or noise that varies.',
+    'are outliers, or noise that varies.',
 }
 _PICTURE_OF = {
-    'image': 'field', 'theta': 'theta', 'range': 'range', 'landmark': 'landmark',
-    'frame': 'frame', 'time': 'frame', 'pixel_phase': 'phase',
-    'outliers': 'histogram', 'scatter_vs_theta': 'theta', 'scatter_vs_frame': 'frame',
+    'image': 'field',
+    'theta': 'theta',
+    'range': 'range',
+    'landmark': 'landmark',
+    'frame': 'frame',
+    'time': 'frame',
+    'pixel_phase': 'phase',
+    'outliers': 'histogram',
+    'scatter_vs_theta': 'theta',
+    'scatter_vs_frame': 'frame',
     'size': 'histogram',
 }
 _BAR = 220  # px of a share of 1
@@ -52,7 +59,9 @@ _ROWS = 24
 
 
 def write_report(
-    diagnosis: Diagnosis, points: PointResiduals, known: Mapping[str, Comparison],
+    diagnosis: Diagnosis,
+    points: PointResiduals,
+    known: Mapping[str, Comparison],
     inputs: ReportInputs,
     wanted: NextViews | None = None,
 ) -> list[Path]:
@@ -69,26 +78,47 @@ def write_report(
         state = diagnosis.model.state
         shot_list.draw_shots(pictures[-1], ForwardModel(state.lens, state.terms), wanted)
     report = inputs.folder / 'report.html'
-    write_text(report, page(
-        'diagnosis.html', d=diagnosis, inputs=inputs, percent=cause_text.percent,
-        significance=NAMED_P,
-        screen=first_screen(diagnosis, inputs.observations, known),
-        command=command_to_go_on(diagnosis, inputs), verdict=verdict_words(diagnosis),
-        sentences=text.verdict_sentences(diagnosis, known),
-        pictures={'target': None, 'evidence': None, 'next': None,
-                  **{p.stem: data_uri(p) for p in pictures}},
-        shown=_CAPTIONS.items(),
-        **_causes(diagnosis), **_budget(diagnosis), **_evidence(diagnosis),
-        **_remaining_structures(diagnosis),
-        next={} if wanted is None else {
-            'purpose': shot_list.purpose(wanted), 'header': shot_list.HEADER,
-            'rows': shot_list.rows(wanted)},
-        uncertainty=list(cause_text.uncertainty_rows(diagnosis)),
-        known=list(text.known_rows(diagnosis, known)), free=_free(inputs, diagnosis),
-        external=external_text.sections(diagnosis), carried_header=external_text.CARRIED_HEADER,
-        contents=text.lens_contents(diagnosis), count=text.count_frames(diagnosis),
-        extended=follow_up_files(diagnosis, inputs), not_offered=text.refusal_reason(diagnosis),
-    ))
+    write_text(
+        report,
+        page(
+            'diagnosis.html',
+            d=diagnosis,
+            inputs=inputs,
+            percent=cause_text.percent,
+            significance=NAMED_P,
+            screen=first_screen(diagnosis, inputs.observations, known),
+            command=command_to_go_on(diagnosis, inputs),
+            verdict=verdict_words(diagnosis),
+            sentences=text.verdict_sentences(diagnosis, known),
+            pictures={
+                'target': None,
+                'evidence': None,
+                'next': None,
+                **{p.stem: data_uri(p) for p in pictures},
+            },
+            shown=_CAPTIONS.items(),
+            **_causes(diagnosis),
+            **_budget(diagnosis),
+            **_evidence(diagnosis),
+            **_remaining_structures(diagnosis),
+            next={}
+            if wanted is None
+            else {
+                'purpose': shot_list.purpose(wanted),
+                'header': shot_list.HEADER,
+                'rows': shot_list.rows(wanted),
+            },
+            uncertainty=list(cause_text.uncertainty_rows(diagnosis)),
+            known=list(text.known_rows(diagnosis, known)),
+            free=_free(inputs, diagnosis),
+            external=external_text.sections(diagnosis),
+            carried_header=external_text.CARRIED_HEADER,
+            contents=text.lens_contents(diagnosis),
+            count=text.count_frames(diagnosis),
+            extended=follow_up_files(diagnosis, inputs),
+            not_offered=text.refusal_reason(diagnosis),
+        ),
+    )
     return [report, *pictures]
 
 
@@ -112,8 +142,9 @@ def _target_maps(diagnosis: Diagnosis) -> Iterator[tuple[str, BoardMap]]:
     if mapped:
         shown.append(('the target in the extended model', ()))
     if len(mapped) > 1:
-        shown += [(f'{name} alone', (name,)) for name in mapped
-                  if CATALOGUE[name].target_map == 'smooth']
+        shown += [
+            (f'{name} alone', (name,)) for name in mapped if CATALOGUE[name].target_map == 'smooth'
+        ]
     for title, names in shown:
         yield from ((title, m) for m in diagnosis.board_maps(names) if m.spans_plane)
 
@@ -126,21 +157,27 @@ def _free(inputs: ReportInputs, diagnosis: Diagnosis) -> str:
 def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
     causes = []
     for cause, row in zip(diagnosis.causes, cause_text.cause_rows(diagnosis), strict=True):
-        fields = dict(zip(
-            ('effect', 'size', 'p', 'share', 'rms', 'gain', 'same'), row, strict=True
-        ))
+        fields = dict(
+            zip(('effect', 'size', 'p', 'share', 'rms', 'gain', 'same'), row, strict=True)
+        )
         shown = list(cause.parameters.items())[:_ROWS]
-        causes.append({
-            **fields, 'what': cause_text.describe_effect(cause.effect),
-            'to_separate': cause.to_separate if cause.indistinguishable_from else '',
-            'refuted': text.frame_ranges(diagnosis, cause.refuted_by_frames),
-            'parameters': [
-                (name, cause_text.quantity(entry),
-                 f'{entry["value"]:.6g} {entry["unit"]}'.removesuffix(' 1'))
-                for name, entry in shown
-            ],
-            'count': len(cause.parameters),
-        })
+        causes.append(
+            {
+                **fields,
+                'what': cause_text.describe_effect(cause.effect),
+                'to_separate': cause.to_separate if cause.indistinguishable_from else '',
+                'refuted': text.frame_ranges(diagnosis, cause.refuted_by_frames),
+                'parameters': [
+                    (
+                        name,
+                        cause_text.quantity(entry),
+                        f'{entry["value"]:.6g} {entry["unit"]}'.removesuffix(' 1'),
+                    )
+                    for name, entry in shown
+                ],
+                'count': len(cause.parameters),
+            }
+        )
     stages = {cause.effect_class.stage for cause in diagnosis.causes}
     return {'causes': causes, 'on_target': 'target' in stages}
 
@@ -161,7 +198,8 @@ def _step(step: TraceStep, withdrawn: Mapping[str, str]) -> dict[str, Any]:
     if math.isfinite(step.held_out):
         held_out = f'{step.held_out:.1f} ± {step.held_out_stderr:.1f}'
     return {
-        'effect': step.effect, 'accepted': step.accepted and not why,
+        'effect': step.effect,
+        'accepted': step.accepted and not why,
         'why': f'{step.why}; not confirmed: {why}' if why else step.why,
         'rank': step.rank if tried else '',
         'explains': f'{step.statistic:.1f}' if tried else '',
@@ -173,8 +211,10 @@ def _step(step: TraceStep, withdrawn: Mapping[str, str]) -> dict[str, Any]:
 def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the bars of the budget: stage, percent without and with a name, the names."""
     shares = stage_shares(diagnosis.components)
-    names = {stage: ', '.join(cause.effect for cause in diagnosis.causes
-                              if cause.stage == stage) for stage in shares}
+    names = {
+        stage: ', '.join(cause.effect for cause in diagnosis.causes if cause.stage == stage)
+        for stage in shares
+    }
     total = diagnosis.figures.base.rms_px**2
     return {
         'bars': [
@@ -184,8 +224,10 @@ def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
         'total_px2': f'{total:.3g}',
         'budget_rows': list(cause_text.budget_rows(diagnosis)),
         'intrinsics': list(cause_text.intrinsic_rows(diagnosis)),
-        'advice': [(text.advice_text(one), cause_text.percent(one.gain) if one.gain > 0 else '')
-                   for one in diagnosis.advice],
+        'advice': [
+            (text.advice_text(one), cause_text.percent(one.gain) if one.gain > 0 else '')
+            for one in diagnosis.advice
+        ],
     }
 
 

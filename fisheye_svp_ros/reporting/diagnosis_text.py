@@ -60,8 +60,10 @@ _MEASURES = {
     'rig_rotation_rad': ('rotation of the rig', 180 / math.pi, 'deg'),
 }
 STAGE_WORDS = {
-    'lens': 'lens (stays in the image)', 'target': 'target (stays with the board)',
-    'frame': 'frames (motion, detector, light)', 'noise': 'noise',
+    'lens': 'lens (stays in the image)',
+    'target': 'target (stays with the board)',
+    'frame': 'frames (motion, detector, light)',
+    'noise': 'noise',
 }
 _MAX_CAUSES = 3  # causes that one sentence can bear
 _MAX_NAMES = 6  # names in one sentence
@@ -104,8 +106,11 @@ def remaining_text(diagnosis: Diagnosis, variable: str) -> str:
         worst, count = diagnosis.gross[0], len(diagnosis.gross)
         where = worst.get('photograph') or f'frame {worst["frame"]}'
         which = f'{where} landmark {worst["landmark"]} ({worst["px"]:.3g} px)'
-        return (f'{count} points are outliers, the largest {which}' if count > 1 else
-                f'one point is an outlier, {which}')
+        return (
+            f'{count} points are outliers, the largest {which}'
+            if count > 1
+            else f'one point is an outlier, {which}'
+        )
     if variable == 'size':
         ratio = math.sqrt(diagnosis.figures.extended.chi2_per_dof or math.nan)
         return f'the residuals are {ratio:.2g} times as large as sigma states'
@@ -135,8 +140,10 @@ def count_frames(d: Diagnosis) -> str:
     numbers, plural = d.problem.observations.frame, 's' * (d.frames > 1)
     if is_unpaired(d.model.data):
         frames = len({*numbers.tolist()})
-        return (f'{d.frames} view{plural} of {frames} frame{"s" * (frames > 1)} (each view with '
-                'its own pose)')
+        return (
+            f'{d.frames} view{plural} of {frames} frame{"s" * (frames > 1)} (each view with '
+            'its own pose)'
+        )
     pictures = d.problem.observations.photographs and len(d.lenses) == 1
     return f'{d.frames} {"photograph" if pictures else "frame"}{plural}'
 
@@ -157,28 +164,41 @@ def _field_sentence(d: Diagnosis) -> str:
     if field is None or not field.fields:
         return ''
     refuted = frame_ranges(d, field.refuted)
-    return (f' The lens file holds an image field: it predicts frames left out to '
-            f'{field.after:.3g} px rms instead of {field.before:.3g}'
-            + (f', but {refuted} worse' if refuted else '') + '.')
+    return (
+        f' The lens file holds an image field: it predicts frames left out to '
+        f'{field.after:.3g} px rms instead of {field.before:.3g}'
+        + (f', but {refuted} worse' if refuted else '')
+        + '.'
+    )
 
 
 def _wrong(d: Diagnosis) -> str:
     noise = f'noise of {d.noise_px:.3g} px a coordinate'
     if _shows_no_cause(d):
-        but = [what for what, told in (('the intrinsics as given', d.is_lens_off),
-                                       ('the rig', _rig_advice(d)),
-                                       ('the target', _is_target_off(d))) if told]
+        but = [
+            what
+            for what, told in (
+                ('the intrinsics as given', d.is_lens_off),
+                ('the rig', _rig_advice(d)),
+                ('the target', _is_target_off(d)),
+            )
+            if told
+        ]
         nothing = f'Nothing but {join_names(but)}' if but else 'Nothing'
         likely = d.verdict == 'adequate' and d.offers_extended
         wrong = 'confirmed to be wrong' if likely else 'wrong'
         rest = ' and displaced landmarks' if _is_target_off(d) else ', without a pattern'
-        return (f'{nothing} is {wrong} in these data: in {d.observations} points of '
-                f'{count_frames(d)} the residuals are {noise}{rest}.')
+        return (
+            f'{nothing} is {wrong} in these data: in {d.observations} points of '
+            f'{count_frames(d)} the residuals are {noise}{rest}.'
+        )
     if not d.causes:
         off = 'The intrinsics as given are wrong. Fitted to these data, the'
-        return (f'{off if d.is_lens_off else "The"} simulation leaves residuals of '
-                f'{d.figures.base.rms_px:.3g} px rms, and no effect of the catalog explains them: '
-                f'{remains(d, 7)}{_almost(d)}.')
+        return (
+            f'{off if d.is_lens_off else "The"} simulation leaves residuals of '
+            f'{d.figures.base.rms_px:.3g} px rms, and no effect of the catalog explains them: '
+            f'{remains(d, 7)}{_almost(d)}.'
+        )
     causes = '; '.join(
         f'{describe_effect(c.effect)} ({_name(d, c)}: {size(d, c)}; {probability(c.p_value)})'
         for c in d.causes[:_MAX_CAUSES]
@@ -203,9 +223,11 @@ def _almost(d: Diagnosis) -> str:
     for step in d.trace:
         if not step.accepted and step.why.endswith('does not predict better'):
             name = step.effect.partition('(')[0]
-            return (f'; {name} is significant ({probability(step.corrected)}), but does not '
-                    'improve the prediction of left-out frames significantly: take more '
-                    'photographs')
+            return (
+                f'; {name} is significant ({probability(step.corrected)}), but does not '
+                'improve the prediction of left-out frames significantly: take more '
+                'photographs'
+            )
     return ''
 
 
@@ -221,15 +243,18 @@ def is_assumed(d: Diagnosis, cause: Cause) -> bool:
 
 
 def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
-    before, named, best = (quality.heldout_rms_px for quality in (
-        d.figures.base, d.figures.named, d.figures.extended))
+    before, named, best = (
+        quality.heldout_rms_px for quality in (d.figures.base, d.figures.named, d.figures.extended)
+    )
     moving = [c for c in d.causes if c.effect_class.stage != 'noise']
     local = ''
     if best < 0.99 * named:
         local = f'; with the random effects of single landmarks and of the image, to {best:.3g} px'
     elif best > 1.01 * named:
-        local = ('; the random effects of single landmarks and of the image do not transfer to '
-                 f'it: with them {best:.3g} px')
+        local = (
+            '; the random effects of single landmarks and of the image do not transfer to '
+            f'it: with them {best:.3g} px'
+        )
     if not moving:
         why, times = 'no extension improved on it', before / max(2**0.5 * d.noise_px, 1e-3)
         if _shows_no_cause(d):
@@ -240,22 +265,30 @@ def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
         text = f'{which} predicts held-out data to {before:.3g} px rms; {why}{local}'
         return text + (_file_clause(d) if d.offers_extended else '') + '.'
     if named >= before:
-        return (f'Held-out data do not confirm it: {named:.3g} px rms instead of {before:.3g}; do '
-                f'not correct for the causes{local}.')
-    text = (f'Corrected, held-out data are predicted to {named:.3g} px rms instead of '
-            f'{before:.3g}{local}')
+        return (
+            f'Held-out data do not confirm it: {named:.3g} px rms instead of {before:.3g}; do '
+            f'not correct for the causes{local}.'
+        )
+    text = (
+        f'Corrected, held-out data are predicted to {named:.3g} px rms instead of '
+        f'{before:.3g}{local}'
+    )
     if d.figures.gain.value > 0:
         value, low, high = map(percent, d.figures.gain.interval.values())
-        text += (f'; this removes {value} (95 % interval {low} to {high}) of the error above the '
-                 'noise')
+        text += (
+            f'; this removes {value} (95 % interval {low} to {high}) of the error above the noise'
+        )
     if 'target' in {c.stage for c in moving}:
         text += _file_clause(d)
     for (label, base, extended, _), compared in zip(
         known_rows(d, known), known.values(), strict=True
     ):
         changed = compared.low > 0 or compared.high < 0
-        text += f'; the {label} ' + (f'goes from {base} to' if changed else 'stays at') + (
-            f' {extended}')
+        text += (
+            f'; the {label} '
+            + (f'goes from {base} to' if changed else 'stays at')
+            + (f' {extended}')
+        )
     return text + '.'
 
 
@@ -270,15 +303,20 @@ def _poor_prediction(d: Diagnosis, times: float) -> str:
 
 
 def _file_clause(d: Diagnosis) -> str:
-    return (f'; on the same corrected target the extended lens leaves '
-            f'{d.file.extended_px:.3g} px, the lens as given {d.file.given_px:.3g} px')
+    return (
+        f'; on the same corrected target the extended lens leaves '
+        f'{d.file.extended_px:.3g} px, the lens as given {d.file.given_px:.3g} px'
+    )
 
 
 def _rig_advice(d: Diagnosis) -> list[str]:
     """Return what to find out of cameras that no rig holds together."""
-    return [f'find out why {join_names(pair.cameras)} have no constant relative pose (check frame '
-            'numbers, the end from which points are numbered, exchanged cameras, the mount)'
-            for pair in d.cameras if pair.posed_alone and pair.rig]
+    return [
+        f'find out why {join_names(pair.cameras)} have no constant relative pose (check frame '
+        'numbers, the end from which points are numbered, exchanged cameras, the mount)'
+        for pair in d.cameras
+        if pair.posed_alone and pair.rig
+    ]
 
 
 def _next_step(d: Diagnosis) -> str:
@@ -291,21 +329,27 @@ def _next_step(d: Diagnosis) -> str:
     steps += [
         f'find out why {join_names(pair.cameras)} contradict each other about the target: check '
         'that it was not bent or exchanged in between, and that both number its landmarks alike. '
-        'Use no correction of it until then' for pair in d.cameras if pair.verdict == 'contradict'
+        'Use no correction of it until then'
+        for pair in d.cameras
+        if pair.verdict == 'contradict'
     ]
     steps += [advice_text(one) for one in d.advice if one.frames]
-    steps += [advice_text(one) for one in d.advice
-              if one.gain > 0 and one.what != USE_EXTENDED][:_MAX_CAUSES]
+    steps += [advice_text(one) for one in d.advice if one.gain > 0 and one.what != USE_EXTENDED][
+        :_MAX_CAUSES
+    ]
     steps += [advice_text(one) for one in d.advice if one.what == DIAGNOSE_AIR]
-    held = [c.effect for c in d.causes
-            if c.stage == 'frame' and c.effect in d.lens.corrections]
+    held = [c.effect for c in d.causes if c.stage == 'frame' and c.effect in d.lens.corrections]
     if held and d.decision['lens'].say == 'use_extended':
         steps.append(f'it includes {join_names(held)}')
-    steps += [f'to confirm {c.effect}: {_remedy(c)}' for c in d.causes
-              if c.stage == 'frame' and not c.indistinguishable_from]
+    steps += [
+        f'to confirm {c.effect}: {_remedy(c)}'
+        for c in d.causes
+        if c.stage == 'frame' and not c.indistinguishable_from
+    ]
     steps += [
         f'to separate {c.effect} from {join_names(c.indistinguishable_from, "and")}: {_remedy(c)}'
-        for c in d.causes if c.indistinguishable_from
+        for c in d.causes
+        if c.indistinguishable_from
     ]
     steps += [_remedy(c) for c in d.causes if c.effect_class.stage == 'noise']
     if 'frame' in {one.variable for one in d.remaining}:
@@ -320,10 +364,15 @@ def advice_text(advice: Advice) -> str:
     frames = [] if advice.photographs else [*dict.fromkeys(advice.frames)]
     about = [join_names(advice.photographs[:_MAX_NAMES])] if advice.photographs else []
     about += [
-        f'{name}s {join_names([str(n) for n in numbers[:_MAX_NAMES]])}' if len(numbers) > 1
+        f'{name}s {join_names([str(n) for n in numbers[:_MAX_NAMES]])}'
+        if len(numbers) > 1
         else f'{name} {numbers[0]}'
-        for name, numbers in (('frame', frames), ('board', advice.boards),
-                              ('landmark', advice.landmarks)) if numbers
+        for name, numbers in (
+            ('frame', frames),
+            ('board', advice.boards),
+            ('landmark', advice.landmarks),
+        )
+        if numbers
     ]
     what = advice.what.replace('the extended lens file', LENS_FILE)
     return f'{what} ({", ".join(about)})' if about else what
@@ -347,9 +396,12 @@ def known_rows(
 def compared_row(name: str, compared: Comparison) -> tuple[str, str, str, str]:
     """Return a mean error's name, its value before and after, and by how much it is less."""
     label, factor, unit = _MEASURES[name]
-    return (label, f'{factor * compared.before:.3g} {unit}',
-            f'{factor * compared.after:.3g} {unit}',
-            f'{percent(compared.value)} ({percent(compared.low)} to {percent(compared.high)})')
+    return (
+        label,
+        f'{factor * compared.before:.3g} {unit}',
+        f'{factor * compared.after:.3g} {unit}',
+        f'{percent(compared.value)} ({percent(compared.low)} to {percent(compared.high)})',
+    )
 
 
 def join_names(names: Sequence[str], word: str = 'and') -> str:

@@ -19,8 +19,11 @@ from fisheye_svp_ros.reporting.plots import legend_below, picture, round_number
 _REJECTED_COLOR = '#cbd5e1'
 _OVER_LINES = {'facecolor': 'white', 'edgecolor': 'none', 'pad': 1}  # behind a number
 _CELLS = 24  # over the longer side of the image
-_TITLES = {'noise': 'noise of a point', 'parameters': 'parameters of the lens',
-           'misfit': 'unexplained model error'}
+_TITLES = {
+    'noise': 'noise of a point',
+    'parameters': 'parameters of the lens',
+    'misfit': 'unexplained model error',
+}
 
 
 def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
@@ -30,7 +33,8 @@ def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
     with picture(path, 9.2, 1.6 + 0.3 * count, tight=True) as figure:
         left, right = figure.subplots(1, 2)
         left.barh(
-            [step.effect[:40] for step in steps], [step.statistic for step in steps],
+            [step.effect[:40] for step in steps],
+            [step.statistic for step in steps],
             color=[AFTER if step.accepted else _REJECTED_COLOR for step in steps],
         )
         left.set(xlabel='score statistic', title='steps of the selection', xscale='log')
@@ -50,13 +54,22 @@ def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
 def _plot_heldout_rms(axis: Axes, diagnosis: Diagnosis) -> None:
     causes = [c for c in diagnosis.causes if math.isfinite(c.heldout_rms_px)]
     names = ['the lens as given', *(f'+ {cause.effect}' for cause in causes), '+ local offsets']
-    rms = [diagnosis.figures.base.heldout_rms_px, *(cause.heldout_rms_px for cause in causes),
-           diagnosis.figures.extended.heldout_rms_px]
+    rms = [
+        diagnosis.figures.base.heldout_rms_px,
+        *(cause.heldout_rms_px for cause in causes),
+        diagnosis.figures.extended.heldout_rms_px,
+    ]
     axis.barh(names, rms, color=[BEFORE, *[AFTER] * (len(causes) + 1)], height=0.6)
     for place, value in enumerate(rms):
         axis.annotate(
-            f'{value:.3f}', (value, place), xytext=(5, 0), textcoords='offset points',
-            va='center', fontsize=8.5, bbox=_OVER_LINES)
+            f'{value:.3f}',
+            (value, place),
+            xytext=(5, 0),
+            textcoords='offset points',
+            va='center',
+            fontsize=8.5,
+            bbox=_OVER_LINES,
+        )
     axis.axvline(math.sqrt(2) * diagnosis.noise_px, color=INK, ls=':', label='noise')
     axis.set(xlabel='rms residual of held-out data / px', title='prediction of held-out data')
     axis.margins(x=0.12)
@@ -68,12 +81,14 @@ def draw_target(path: Path, maps: list[tuple[str, BoardMap]]) -> None:
     rows = math.ceil(len(maps) / columns)
     with picture(path, 4.8 * columns, 4.3 * rows) as figure:
         axes = np.ravel(figure.subplots(rows, columns, squeeze=False))
-        for axis in axes[len(maps):]:
+        for axis in axes[len(maps) :]:
             axis.remove()
         for axis, (title, board) in zip(axes, maps, strict=False):
             _height_map(figure, axis, board)
-            axis.set_title(f'board {board.board}, {title}:\n'
-                           f'{1e3 * board.peak_to_valley:.2f} mm from lowest to highest')
+            axis.set_title(
+                f'board {board.board}, {title}:\n'
+                f'{1e3 * board.peak_to_valley:.2f} mm from lowest to highest'
+            )
 
 
 def _height_map(figure: Figure, axis: Axes, board: BoardMap) -> None:
@@ -88,8 +103,16 @@ def _height_map(figure: Figure, axis: Axes, board: BoardMap) -> None:
     if longest > 0.02 * limit:
         typical = 1e3 * float(np.quantile(np.linalg.norm(board.slide, axis=1), 0.9))
         larger = round_number(0.06 * float(np.ptp(x)) / typical)
-        axis.quiver(x, y, *(1e3 * board.slide.T), angles='xy', scale_units='xy',
-                    scale=1 / larger, width=0.003, color=INK)
+        axis.quiver(
+            x,
+            y,
+            *(1e3 * board.slide.T),
+            angles='xy',
+            scale_units='xy',
+            scale=1 / larger,
+            width=0.003,
+            color=INK,
+        )
         label += f'\narrows: along the board, {larger:g} times as large'
     axis.use_sticky_edges = False  # landmarks at the edge, and their arrows, whole
     axis.margins(0.08)
@@ -114,8 +137,12 @@ def draw_uncertainty(path: Path, diagnosis: Diagnosis) -> None:
                 square = np.where(camera == i, part.reshape(-1, 2).mean(axis=-1), np.nan)
                 image = np.sqrt(_cells(uv, square, (lens.width, lens.height)))
                 shown = axis.imshow(
-                    image, extent=(-0.5, lens.width - 0.5, lens.height - 0.5, -0.5),
-                    cmap='Blues', vmin=0.0, vmax=np.nanmax(image) or 1.0)
+                    image,
+                    extent=(-0.5, lens.width - 0.5, lens.height - 0.5, -0.5),
+                    cmap='Blues',
+                    vmin=0.0,
+                    vmax=np.nanmax(image) or 1.0,
+                )
                 figure.colorbar(shown, ax=axis, label='px', shrink=0.8)
                 rms = np.sqrt(np.nanmean(square))
                 title = f'{label} {_TITLES[name]}: {rms:.3g} px'.strip()
@@ -129,8 +156,9 @@ def _cells(uv: Array, values: Array, size: tuple[int, int]) -> Array:
     pitch = max(size) / _CELLS
     known = np.isfinite(values)
     shape = tuple(int(np.ceil(side / pitch)) for side in reversed(size))
-    row, column = (np.clip((uv[known, i] / pitch).astype(int), 0, shape[1 - i] - 1)
-                   for i in (1, 0))
+    row, column = (
+        np.clip((uv[known, i] / pitch).astype(int), 0, shape[1 - i] - 1) for i in (1, 0)
+    )
     count, total = np.zeros(shape), np.zeros(shape)
     np.add.at(count, (row, column), 1.0)
     np.add.at(total, (row, column), values[known])

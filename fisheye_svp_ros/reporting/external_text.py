@@ -22,7 +22,8 @@ _SIGNIFICANT_RATIO, _MAX_PARAMETERS = 3.0, 4
 _MIN_HEIGHT = 1e-9  # m, rms: less is rounding
 _NO_RIG_NOTE = (
     '; their relative pose is not constant, the photographs are not simultaneous, or the two see '
-    'different boards, so each view has its own pose and no result depends on the rig')
+    'different boards, so each view has its own pose and no result depends on the rig'
+)
 ROBOT_TITLE = 'Poses of the robot'
 SETS_TITLE = 'Another data set of this camera'
 CAMERAS_TITLE = 'Cross-camera validation'
@@ -49,15 +50,23 @@ def sections(diagnosis: Diagnosis) -> list[Section]:
 def carried_row(one: Transfer, what: str) -> tuple[str, ...]:
     """Return where something was found, tried, what it was, rms without and with it, and less."""
     less = one.less_px
-    return (one.source, one.to, what, f'{one.without_px:.4f}', f'{one.with_px:.4f}',
-            f'{less.value:.4f} ({less.low:.4f} to {less.high:.4f})')
+    return (
+        one.source,
+        one.to,
+        what,
+        f'{one.without_px:.4f}',
+        f'{one.with_px:.4f}',
+        f'{less.value:.4f} ({less.low:.4f} to {less.high:.4f})',
+    )
 
 
 def _of_robot(found: HandEye) -> Section:
     x, y, z = 1e3 * found.camera.position
-    sentence = ('The given poses are those of the flange, not of the camera, which is at '
-                f'{x:.2f}, {y:.2f}, {z:.2f} mm in the flange. They were not used as camera poses: '
-                f'{hand_eye_sentence(found)}.')
+    sentence = (
+        'The given poses are those of the flange, not of the camera, which is at '
+        f'{x:.2f}, {y:.2f}, {z:.2f} mm in the flange. They were not used as camera poses: '
+        f'{hand_eye_sentence(found)}.'
+    )
     sentence += ''.join(f' {one[0].upper()}{one[1:]}.' for one in hand_eye_warnings(found))
     return Section(ROBOT_TITLE, sentence, [], ROBOT_HEADER, hand_eye_rows(found))
 
@@ -66,17 +75,28 @@ def _of_cameras(pair: TwoCameras) -> Section:
     rows = [] if not pair.rig else list(_rig_rows(pair.rig))
     if pair.maps is not None:
         first, second = (f'{1e3 * rms:.3f} mm rms' for rms in pair.maps.rms_m)
-        whose = (f'of {pair.maps.landmarks} landmarks, from {pair.cameras[0]} alone and from '
-                 f'{pair.cameras[1]} alone')
+        whose = (
+            f'of {pair.maps.landmarks} landmarks, from {pair.cameras[0]} alone and from '
+            f'{pair.cameras[1]} alone'
+        )
         if _has_height(pair):
-            rows.append((f'height {whose}', first, second,
-                         f'correlation {pair.maps.correlation:.2f}'))
-        rows.append((f'positions along the board {whose}', '', '',
-                     f'correlation {pair.maps.correlation_along:.2f}'))
+            rows.append(
+                (f'height {whose}', first, second, f'correlation {pair.maps.correlation:.2f}')
+            )
+        rows.append(
+            (
+                f'positions along the board {whose}',
+                '',
+                '',
+                f'correlation {pair.maps.correlation_along:.2f}',
+            )
+        )
     return Section(
-        CAMERAS_TITLE, f'{_agreement(pair)}{_rig(pair)}.',
+        CAMERAS_TITLE,
+        f'{_agreement(pair)}{_rig(pair)}.',
         [carried_row(one, 'shape of the target') for one in pair.target],
-        ('', 'before', 'after', ''), rows,
+        ('', 'before', 'after', ''),
+        rows,
     )
 
 
@@ -84,15 +104,17 @@ def _agreement(pair: TwoCameras) -> str:
     both = join_names(pair.cameras)
     if pair.verdict == 'nothing':
         return f'Neither {join_names(pair.cameras, "nor")} needs another shape of the target'
-    tried = join_names([
-        f'{one.to} from {one.without_px:.3g} to {one.with_px:.3g} px' for one in pair.target
-    ])
+    tried = join_names(
+        [f'{one.to} from {one.without_px:.3g} to {one.with_px:.3g} px' for one in pair.target]
+    )
     carried = f'the shape estimated from one camera changes the held-out error of {tried}'
     alike = ''
     if pair.maps is not None:
         alike = '; their maps correlate by ' + (
-            f'{pair.maps.correlation:.2f}' if _has_height(pair) else
-            f'{pair.maps.correlation_along:.2f} along the board')
+            f'{pair.maps.correlation:.2f}'
+            if _has_height(pair)
+            else f'{pair.maps.correlation_along:.2f} along the board'
+        )
     if pair.verdict == 'agree':
         return f'{both} agree: {carried}{alike}'
     if pair.verdict == 'undecided':
@@ -128,29 +150,40 @@ def _of_sets(against: TwoDatasets) -> Section:
     carried = []
     for tried in filter(None, against.tried):
         carried.append(carried_row(tried.lens, 'causes of the lens'))
-        carried += [carried_row(one, f'{name}, added to the others')
-                    for name, one in tried.causes.items()]
+        carried += [
+            carried_row(one, f'{name}, added to the others') for name, one in tried.causes.items()
+        ]
         carried.append(carried_row(tried.whole, 'the whole lens, intrinsics too'))
         if tried.target is not None:
             carried.append(carried_row(tried.target, 'shape of the target'))
     rows = [
-        (name, quantity({'value': one.value, 'stderr': one.stderr, 'unit': one.unit}),
-         quantity({'value': one.other_value, 'stderr': one.other_stderr, 'unit': one.unit}),
-         f'{one.standardized_difference:.1f} standard errors apart')
+        (
+            name,
+            quantity({'value': one.value, 'stderr': one.stderr, 'unit': one.unit}),
+            quantity({'value': one.other_value, 'stderr': one.other_stderr, 'unit': one.unit}),
+            f'{one.standardized_difference:.1f} standard errors apart',
+        )
         for name, one in against.parameters.items()
     ]
-    return Section(SETS_TITLE, f'{_lens_holds(against)}{_difference_text(against)}'
-                   f'{_follows(against)}.',
-                   carried, ('of the lens', 'here', Path(against.source).name, ''), rows)
+    return Section(
+        SETS_TITLE,
+        f'{_lens_holds(against)}{_difference_text(against)}{_follows(against)}.',
+        carried,
+        ('of the lens', 'here', Path(against.source).name, ''),
+        rows,
+    )
 
 
 def _lens_holds(against: TwoDatasets) -> str:
     if against.verdict == 'nothing':
         return f'Neither these data nor {against.source} need a cause in the lens'
-    tried = join_names([
-        f'{one.lens.to} from {one.lens.without_px:.3g} to {one.lens.with_px:.3g} px'
-        for one in against.tried if one is not None
-    ])
+    tried = join_names(
+        [
+            f'{one.lens.to} from {one.lens.without_px:.3g} to {one.lens.with_px:.3g} px'
+            for one in against.tried
+            if one is not None
+        ]
+    )
     said = {
         'agree': 'The causes in the lens hold in both sets',
         'undecided': 'It is undecided whether the causes in the lens hold in both sets',
@@ -165,13 +198,22 @@ def _difference_text(against: TwoDatasets) -> str:
         return ''
     said = ''
     for of_causes, meaning in (
-        (False, 'the intrinsics of the two sets differ ({}): focus or mount changed in between, '
-                'or they absorb an unexplained error'),
-        (True, 'sizes of causes differ by more than their errors ({}): one set states too small '
-               'errors'),
+        (
+            False,
+            'the intrinsics of the two sets differ ({}): focus or mount changed in between, '
+            'or they absorb an unexplained error',
+        ),
+        (
+            True,
+            'sizes of causes differ by more than their errors ({}): one set states too small '
+            'errors',
+        ),
     ):
-        sizes = [(abs(one.standardized_difference), name)
-                 for name, one in against.parameters.items() if ('.' in name) == of_causes]
+        sizes = [
+            (abs(one.standardized_difference), name)
+            for name, one in against.parameters.items()
+            if ('.' in name) == of_causes
+        ]
         far = sorted((one for one in sizes if one[0] > _SIGNIFICANT_RATIO), reverse=True)
         each = [f'{name} by {apart:.1f} standard errors' for apart, name in far[:_MAX_PARAMETERS]]
         said += f'; {meaning.format(join_names(each))}' if each else ''
@@ -185,6 +227,8 @@ def _follows(against: TwoDatasets) -> str:
     if not there:
         return ''
     if any(one.improves for one in there):
-        return ('; the correction of the target also holds in the other set: the target is the '
-                'same, or the error belongs to the lens')
+        return (
+            '; the correction of the target also holds in the other set: the target is the '
+            'same, or the error belongs to the lens'
+        )
     return '; the correction of the target does not transfer to the other target, as expected'

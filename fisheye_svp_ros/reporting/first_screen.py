@@ -58,7 +58,9 @@ TARGET = {
     'measure_again': 'Measure the target',
 }
 PHOTOGRAPHS = {
-    'enough': 'Enough', 'more': 'Take more', 'retake': 'Take some again',
+    'enough': 'Enough',
+    'more': 'Take more',
+    'retake': 'Take some again',
 }
 NO_CONFIRMED_ERROR = 'no model error is confirmed in these data'
 _HEADLINES = {
@@ -123,18 +125,36 @@ def first_screen(
     answers: tuple[tuple[str, str, Decision, list[str]], ...] = (
         ('Lens', lens_words(d), d.decision['lens'], []),
         ('Target', target_words(d), d.decision['target'], []),
-        ('Photographs', PHOTOGRAPHS[d.decision['photographs'].say], d.decision['photographs'],
-         about),
+        (
+            'Photographs',
+            PHOTOGRAPHS[d.decision['photographs'].say],
+            d.decision['photographs'],
+            about,
+        ),
     )
     return Screen(
-        headline(d), _facts(d, source), _warning(d),
-        tuple(Action(title, do, _reason(decision, d), _confidence(decision),
-                     tuple(Photo(name, _thumbnail(paths.get(name))) for name in some[:_MAX_NAMES]),
-                     max(len(some) - _MAX_NAMES, 0))
-              for title, do, decision, some in answers),
-        _causes(d), _candidates(d), _bound_text(d.decision['lens']),
-        '; '.join(f'{name} {before}' + (f' → {after}' if after != '-' else '')
-                  for name, before, after, _ in known_rows(d, known or {})))
+        headline(d),
+        _facts(d, source),
+        _warning(d),
+        tuple(
+            Action(
+                title,
+                do,
+                _reason(decision, d),
+                _confidence(decision),
+                tuple(Photo(name, _thumbnail(paths.get(name))) for name in some[:_MAX_NAMES]),
+                max(len(some) - _MAX_NAMES, 0),
+            )
+            for title, do, decision, some in answers
+        ),
+        _causes(d),
+        _candidates(d),
+        _bound_text(d.decision['lens']),
+        '; '.join(
+            f'{name} {before}' + (f' → {after}' if after != '-' else '')
+            for name, before, after, _ in known_rows(d, known or {})
+        ),
+    )
 
 
 def _reason(decision: Decision, d: Diagnosis) -> str:
@@ -154,8 +174,10 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
     for one in screen.actions:
         names = ', '.join(photo.name for photo in one.photographs)
         names += f' and {one.more} more' if one.more else ''
-        lines.append(f'{one.about}: {one.do}{names and f": {names}"}. {one.why}'
-                     f'{one.sure and f" ({one.sure})"}.')
+        lines.append(
+            f'{one.about}: {one.do}{names and f": {names}"}. {one.why}'
+            f'{one.sure and f" ({one.sure})"}.'
+        )
     lines += [f'Causes: {screen.causes}'] if screen.causes else []
     lines += [f'Against the truth: {screen.truth}'] if screen.truth else []
     lines += [f'Not confirmed: {screen.candidates}'] if screen.candidates else []
@@ -166,16 +188,21 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
 def _facts(d: Diagnosis, source: str) -> str:
     figures = d.figures
     base, named, extended = (
-        one.heldout_rms_px for one in (figures.base, figures.named, figures.extended))
+        one.heldout_rms_px for one in (figures.base, figures.named, figures.extended)
+    )
     rays, near = d.conclusion.ray_error_mrad(), ''
     if rays and d.offers_extended:
         asked = d.problem.options.range_m or 1.0
-        before, after = (next(one['value'] for one in rays[side] if one['range_m'] == asked)
-                         for side in ('given', 'extended'))
+        before, after = (
+            next(one['value'] for one in rays[side] if one['range_m'] == asked)
+            for side in ('given', 'extended')
+        )
         near = f'; ray error {before:.2g} → {after:.2g} mrad at {asked:g} m'
-    return (f'{source}: {d.observations} points in {count_frames(d)}; held-out error '
-            f'{base:.3g} → {named:.3g} px ({extended:.3g} px with local offsets), '
-            f'noise {d.noise_px:.2g} px{near}')
+    return (
+        f'{source}: {d.observations} points in {count_frames(d)}; held-out error '
+        f'{base:.3g} → {named:.3g} px ({extended:.3g} px with local offsets), '
+        f'noise {d.noise_px:.2g} px{near}'
+    )
 
 
 def _warning(d: Diagnosis) -> str:
@@ -187,16 +214,27 @@ def _warning(d: Diagnosis) -> str:
         ('held-out rms, with the causes', base.heldout_rms_px, named.heldout_rms_px),
     ]
     if d.offers_extended:
-        pairs.append(('held-out rms, with the extended lens on one target', d.file.given_px,
-                      d.file.extended_px))
-    rising = [f'{name}: {before:.3g} → {after:.3g} px' for name, before, after in pairs
-              if after > MAX_RMS_RATIO * before]
+        pairs.append(
+            (
+                'held-out rms, with the extended lens on one target',
+                d.file.given_px,
+                d.file.extended_px,
+            )
+        )
+    rising = [
+        f'{name}: {before:.3g} → {after:.3g} px'
+        for name, before, after in pairs
+        if after > MAX_RMS_RATIO * before
+    ]
     return ('an error rises: ' + '; '.join(rising)) if rising else ''
 
 
 def _confidence(decision: Decision) -> str:
-    if (decision.confidence is None or decision.say == 'undecided'
-            or decision.confidence < _MIN_CONFIDENCE):
+    if (
+        decision.confidence is None
+        or decision.say == 'undecided'
+        or decision.confidence < _MIN_CONFIDENCE
+    ):
         return ''
     sure = f'{_sure_text(decision.confidence)} sure'
     if decision.say == 'use_extended':
@@ -225,9 +263,12 @@ def _causes(d: Diagnosis) -> str:
 def _candidates(d: Diagnosis) -> str:
     shifts = d.averaged_model.shifts
     others = [one for one in d.candidates if not shifts or one.effect != 'viewpoint_shift']
-    words = [f'{f"{one.camera} " if one.camera else ""}viewpoint_shift (posterior probability '
-             f'{_sure_text(one.weight)}: the extended lens includes e0 = {1e3 * one.e0:.2g} ± '
-             f'{1e3 * one.stderr:.2g} mm)' for one in shifts]
+    words = [
+        f'{f"{one.camera} " if one.camera else ""}viewpoint_shift (posterior probability '
+        f'{_sure_text(one.weight)}: the extended lens includes e0 = {1e3 * one.e0:.2g} ± '
+        f'{1e3 * one.stderr:.2g} mm)'
+        for one in shifts
+    ]
     words += [f'{one.effect} ({one.why})' for one in others[:_MAX_NAMES]]
     more = len(others) - _MAX_NAMES
     return '; '.join(words) + (f'; and {more} more' if more > 0 else '')
@@ -237,8 +278,10 @@ def _bound_text(decision: Decision) -> str:
     words = []
     for one in decision.bound:
         factor, unit = HUMAN_UNITS.get(one.unit, (1.0, ''))
-        words.append(f'{one.effect} up to {factor * one.value:.2g} {unit}'.rstrip()
-                     + f' ({one.edge_px:.2g} px, {one.edge_mrad:.2g} mrad at the edge)')
+        words.append(
+            f'{one.effect} up to {factor * one.value:.2g} {unit}'.rstrip()
+            + f' ({one.edge_px:.2g} px, {one.edge_mrad:.2g} mrad at the edge)'
+        )
     return '; '.join(words)
 
 
@@ -295,8 +338,7 @@ def largest_cause(d: Diagnosis) -> str:
     causes = sorted(d.causes, key=lambda cause: (-cause.share, cause.p_value))
     if causes:
         first, stage = causes[0], causes[0].stage
-        other = next((one for one in causes if {stage, one.stage}
-                      == {'lens', 'target'}), None)
+        other = next((one for one in causes if {stage, one.stage} == {'lens', 'target'}), None)
         second = _sentence(d, other) if other else ''
         return _sentence(d, first) + (f', and {second[0].lower()}{second[1:]}' if second else '')
     if d.frames < 2 and (d.candidates or d.decision['target'].figure.value > 0):
@@ -305,23 +347,34 @@ def largest_cause(d: Diagnosis) -> str:
         return _capital(d.decision['lens'].why)
     if only_gross(d):
         count = len(d.gross)
-        return (f'{count} image points are outliers; nothing else is wrong' if count > 1 else
-                'An image point is an outlier; nothing else is wrong')
+        return (
+            f'{count} image points are outliers; nothing else is wrong'
+            if count > 1
+            else 'An image point is an outlier; nothing else is wrong'
+        )
     if d.decision['target'].say == 'measure_again' or (
-            d.verdict == 'adequate' and d.decision['target'].figure.value > 0):
+        d.verdict == 'adequate' and d.decision['target'].figure.value > 0
+    ):
         which = 'Only the target' if d.verdict == 'adequate' else 'The target'
         return f'{which} is imperfect: {d.decision["target"].why}'
     if d.verdict == 'adequate':
-        return (_capital(NO_CONFIRMED_ERROR) if d.offers_extended else
-                'No model error shows in these data')
+        return (
+            _capital(NO_CONFIRMED_ERROR)
+            if d.offers_extended
+            else 'No model error shows in these data'
+        )
     return 'No effect of the catalog explains the residual error'
 
 
 def _displaced_landmarks(d: Diagnosis) -> str:
     """Return that the target is to be measured again, where the causes are all of others."""
     target = d.decision['target']
-    if (target.say != 'measure_again' or target.figure.name != 'local_offsets' or not d.causes
-            or target.confidence is None):
+    if (
+        target.say != 'measure_again'
+        or target.figure.name != 'local_offsets'
+        or not d.causes
+        or target.confidence is None
+    ):
         return ''
     return f', and landmarks of the target are displaced ({target.figure.value:.2g} px)'
 

@@ -32,15 +32,23 @@ class ReportInputs(NamedTuple):
 def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
     """Return the command to go on with, as a shell takes it."""
     d, files = diagnosis, follow_up_files(diagnosis, inputs)
-    observations, lenses = files['observations'], [
-        shlex.join(['--lens', lens]) for lens in inputs.lens]
+    observations, lenses = (
+        files['observations'],
+        [shlex.join(['--lens', lens]) for lens in inputs.lens],
+    )
     if d.decision['lens'].say == 'undecided' and d.problem.plannable and not inputs.planned:
-        words = ['fisheye-svp diagnose', observations, *lenses, shlex.join(inputs.settings),
-                 '--next 6 -o next']
+        words = [
+            'fisheye-svp diagnose',
+            observations,
+            *lenses,
+            shlex.join(inputs.settings),
+            '--next 6 -o next',
+        ]
         return ' '.join(filter(None, words))
     if d.is_lens_off and not d.offers_extended:
         return f'fisheye-svp calibrate {observations} {_image_sizes(d)} -o recalibrated' + (
-            '' if len(d.lenses) > 1 else '.yaml')
+            '' if len(d.lenses) > 1 else '.yaml'
+        )
     used = files['options'] if d.offers_extended else ' '.join(lenses)
     return f'fisheye-svp localize {observations} {used} -o poses'
 
@@ -48,11 +56,15 @@ def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
 def follow_up_files(diagnosis: Diagnosis, inputs: ReportInputs) -> dict[str, str]:
     """Return what commands need to go on: the observations, the extended lenses, the first one."""
     files = {camera: inputs.folder / camera / LENS_FILE for camera in diagnosis.lenses}
-    options = [word for camera, path in files.items()
-               for word in ('--lens', f'{camera}={path}' if camera else str(path))]
+    options = [
+        word
+        for camera, path in files.items()
+        for word in ('--lens', f'{camera}={path}' if camera else str(path))
+    ]
     return {
         'observations': shlex.join([inputs.observations, *inputs.search]),
-        'options': shlex.join(options), 'search': shlex.join(inputs.search),
+        'options': shlex.join(options),
+        'search': shlex.join(inputs.search),
         'first': shlex.quote(str(next(iter(files.values())))),
     }
 

@@ -53,25 +53,40 @@ def write_coverage(detection: Detection, path: Path) -> None:
     with picture(path, 10.0, 4.5) as figure:
         image, field = figure.subplots(1, 2)
         image.plot(table.uv[:, 0], table.uv[:, 1], '.', color=OURS, markersize=2)
-        image.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect='equal',
-                  xlabel='u, px', ylabel='v, px',
-                  title=f'{len(table)} corners in {shown}')
+        image.set(
+            xlim=(-0.5, width - 0.5),
+            ylim=(height - 0.5, -0.5),
+            aspect='equal',
+            xlabel='u, px',
+            ylabel='v, px',
+            title=f'{len(table)} corners in {shown}',
+        )
         for camera, name in enumerate(table.cameras):
             _angles(field, detection, camera, name)
-        field.set(xlabel='incidence angle, deg', ylabel='range, m',
-                  title='angles and ranges from a first calibration')
+        field.set(
+            xlabel='incidence angle, deg',
+            ylabel='range, m',
+            title='angles and ranges from a first calibration',
+        )
 
 
 def _angles(axes: object, detection: Detection, camera: int, name: str) -> None:
     table = detection.observations
     try:
-        fitted = calibrate(table.take(table.camera == camera), 'kannala_brandt',
-                           detection.image_sizes[name])
+        fitted = calibrate(
+            table.take(table.camera == camera), 'kannala_brandt', detection.image_sizes[name]
+        )
     except FisheyeSvpError:
         return
     views, lens = fitted.views, fitted.adjusted.lens
     points = fitted.adjusted.pose.into_body(views.points)[views.used]
     distance = np.linalg.norm(points, axis=-1)
     theta = np.degrees(np.arccos(points[:, 2] / distance))
-    axes.plot(theta, distance, '.', markersize=2,  # type: ignore[attr-defined]
-              color=(OURS, FAINT)[camera % 2], label=name or lens.name)
+    axes.plot(
+        theta,
+        distance,
+        '.',
+        markersize=2,  # type: ignore[attr-defined]
+        color=(OURS, FAINT)[camera % 2],
+        label=name or lens.name,
+    )

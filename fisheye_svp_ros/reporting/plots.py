@@ -93,7 +93,8 @@ def round_number(value: float) -> float:
 def legend_below(figure: Figure, *axes: Any) -> None:
     """Put what axes have to explain below them, each label once."""
     entries = {
-        label: handle for axis in axes
+        label: handle
+        for axis in axes
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
     }
     columns = min(len(entries), _LEGEND_COLUMNS)

@@ -22,8 +22,16 @@ from fisheye_svp_ros.simulate.simulation import blank_views
 
 HEADER = ('', 'board at', 'where in the image', 'tilted', 'turned clockwise', 'then')
 TEXT_COLUMNS = ('where in the image', 'tilted')
-_SIDES = ('right', 'lower right', 'bottom', 'lower left', 'left', 'upper left', 'top',
-          'upper right')
+_SIDES = (
+    'right',
+    'lower right',
+    'bottom',
+    'lower left',
+    'left',
+    'upper left',
+    'top',
+    'upper right',
+)
 _COLUMNS, _PANEL = 3, 3.4  # inches
 _HUMAN = {'m': (1e3, 'mm'), 'rad': (180 / np.pi, 'deg')}
 _WANTED, _SEEN, _READY, _TEXT = (40, 123, 224), (230, 160, 60), (80, 200, 80), (245, 245, 245)
@@ -34,8 +42,10 @@ _FRACTION_BITS = 4  # binary places of a pixel that OpenCV draws to
 
 def rows(wanted: NextViews) -> list[tuple[str, ...]]:
     """Return the shot list's rows, under HEADER."""
-    return [(str(i + 1), *instruction(wanted.shots, i), expected_error(wanted, i + 1))
-            for i in range(len(wanted.shots.distance))]
+    return [
+        (str(i + 1), *instruction(wanted.shots, i), expected_error(wanted, i + 1))
+        for i in range(len(wanted.shots.distance))
+    ]
 
 
 def instruction(shots: Shots, i: int) -> tuple[str, str, str, str]:
@@ -65,11 +75,18 @@ def expected_error(wanted: NextViews, taken: int) -> str:
 def purpose(wanted: NextViews) -> str:
     """Return what the photographs are for, and where matters stand."""
     if wanted.others:
-        known = '' if wanted.answers[-1] > MIN_PROBABILITY else (
-            '; photographs hardly separate them: exclude an absent one with '
-            + ' '.join(f'--without {name}' for name in wanted.others))
-        return (f'to separate {wanted.asked} from {" and ".join(wanted.others)}; now '
-                f'{expected_error(wanted, 0)}{known}')
+        known = (
+            ''
+            if wanted.answers[-1] > MIN_PROBABILITY
+            else (
+                '; photographs hardly separate them: exclude an absent one with '
+                + ' '.join(f'--without {name}' for name in wanted.others)
+            )
+        )
+        return (
+            f'to separate {wanted.asked} from {" and ".join(wanted.others)}; now '
+            f'{expected_error(wanted, 0)}{known}'
+        )
     what = 'the whole lens' if wanted.asked == 'lens' else wanted.asked
     if wanted.unit:
         return f'for {what}; now {expected_error(wanted, 0)}'
@@ -95,8 +112,11 @@ def draw_shots(path: Path, model: ForwardModel, wanted: NextViews) -> None:
             axis.plot(*uv[i].T, '.', color=OURS, markersize=2.5)
             axis.plot(*uv[i][first], 'o', color=PUBLISHED, markersize=6, fillstyle='none')
             away, where, tilt, roll = instruction(shots, i)
-            axis.set_title(f'{i + 1}: {away}, {where}\ntilt {tilt}, turn {roll}; '
-                           f'{expected_error(wanted, i + 1)}', fontsize=7.5)
+            axis.set_title(
+                f'{i + 1}: {away}, {where}\ntilt {tilt}, turn {roll}; '
+                f'{expected_error(wanted, i + 1)}',
+                fontsize=7.5,
+            )
         figure.suptitle(purpose(wanted), fontsize=9)
 
 
@@ -104,10 +124,19 @@ def _frame(axis: Any, lens: Lens) -> None:
     """Draw the border of the image and the edge of the field."""
     turn = np.linspace(0, 2 * np.pi, 181)
     edge = float(lens.image_height.value_and_slope(np.array(lens.max_incidence))[0])
-    axis.plot(lens.cx + lens.fx * edge * np.cos(turn), lens.cy + lens.fy * edge * np.sin(turn),
-              ':', color=FAINT)
-    axis.set(xlim=(-0.5, lens.width - 0.5), ylim=(lens.height - 0.5, -0.5), aspect='equal',
-             xticks=[], yticks=[])
+    axis.plot(
+        lens.cx + lens.fx * edge * np.cos(turn),
+        lens.cy + lens.fy * edge * np.sin(turn),
+        ':',
+        color=FAINT,
+    )
+    axis.set(
+        xlim=(-0.5, lens.width - 0.5),
+        ylim=(lens.height - 0.5, -0.5),
+        aspect='equal',
+        xticks=[],
+        yticks=[],
+    )
     axis.grid(visible=False)
     for side in axis.spines.values():
         side.set_visible(True)
@@ -166,8 +195,15 @@ def draw_guide(pixels: Pixels, guide: Guide, seen: DetectedBoard | None) -> NDAr
         picture = np.asarray(cv2.addWeighted(filled, 0.25, picture, 0.75, 0))
         cv2.polylines(picture, [hull], True, colour, 2, cv2.LINE_AA, _FRACTION_BITS)
         _dots(picture, wanted, colour, 2)
-        cv2.circle(picture, wanted[0].tolist(), 9 << _FRACTION_BITS, colour, 2, cv2.LINE_AA,
-                   _FRACTION_BITS)
+        cv2.circle(
+            picture,
+            wanted[0].tolist(),
+            9 << _FRACTION_BITS,
+            colour,
+            2,
+            cv2.LINE_AA,
+            _FRACTION_BITS,
+        )
     if seen is not None:
         found = _to_fixed_point(seen.uv, zoom)
         _dots(picture, found, _SEEN, 3)
@@ -202,13 +238,26 @@ def _draw_texts(picture: NDArray[np.uint8], guide: Guide) -> None:
     _write(picture, known, height - round(0.4 * line), size)
     left, right, top = round(0.6 * width), round(0.98 * width), round(0.3 * line)
     ready = guide.score >= MIN_SCORE
-    cv2.rectangle(picture, (left, top), (left + round(guide.score * (right - left)), line),
-                  _READY if ready else _WANTED, -1)
+    cv2.rectangle(
+        picture,
+        (left, top),
+        (left + round(guide.score * (right - left)), line),
+        _READY if ready else _WANTED,
+        -1,
+    )
     cv2.rectangle(picture, (left, top), (right, line), _TEXT, 1)
     mark = left + round(MIN_SCORE * (right - left))
     cv2.line(picture, (mark, top), (mark, line), _TEXT, 2)
 
 
 def _write(picture: NDArray[np.uint8], text: str, base: int, size: float) -> None:
-    cv2.putText(picture, text, (round(0.012 * picture.shape[1]), base), cv2.FONT_HERSHEY_SIMPLEX,
-                size, _TEXT, max(1, round(1.6 * size)), cv2.LINE_AA)
+    cv2.putText(
+        picture,
+        text,
+        (round(0.012 * picture.shape[1]), base),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        size,
+        _TEXT,
+        max(1, round(1.6 * size)),
+        cv2.LINE_AA,
+    )

@@ -31,8 +31,12 @@ _COLUMNS = 4  # axes beside each other
 _TICKS, _LABELS = 12, 6
 _CLOUD = 20_000  # points in a scatter plot
 _UNITS = {'radius': 'm', 'baseline': 'm', 'vergence': 'rad', 'noise_px': 'px'}
-_NAMES = {'radius': 'range of the landmarks', 'shift_scale': 'viewpoint shift, relative',
-          'noise_px': 'noise', 'vergence': 'inward turn of the left camera'}
+_NAMES = {
+    'radius': 'range of the landmarks',
+    'shift_scale': 'viewpoint shift, relative',
+    'noise_px': 'noise',
+    'vergence': 'inward turn of the left camera',
+}
 _OF_RUNS = {
     'position_error_m': (1e3, 'position error / mm'),
     'axis_error_rad': (180 / np.pi, 'axis error / deg'),
@@ -53,8 +57,9 @@ _METRICS = (
     PlottedMetric('localizer.axis_error_rad', 'Localization: axis error, deg', np.degrees(1.0)),
     PlottedMetric('localizer.rms_px', 'Localization: rms residual, px', 1.0),
     PlottedMetric('stereo_calibrator.position_error_m', 'Calibration: position error, mm', 1e3),
-    PlottedMetric('stereo_calibrator.axis_error_rad', 'Calibration: axis error, deg',
-                  np.degrees(1.0)),
+    PlottedMetric(
+        'stereo_calibrator.axis_error_rad', 'Calibration: axis error, deg', np.degrees(1.0)
+    ),
     PlottedMetric('stereo_depth.error3_m', 'Depth: mean error in space (Error3), mm', 1e3),
     PlottedMetric('stereo_depth.error2_px', 'Depth: distance to epipolar curve (Error2), px', 1.0),
 )
@@ -78,8 +83,9 @@ def draw_table(table: SweptTable, folder: Path) -> list[Path]:
         files.append(folder / 'residuals_and_noise.png')
         others = [name for name in swept if name != 'noise_px']
         few = [name for name in others if len(set(table[name])) <= 2 * _HUES]
-        _draw_spreads(table, min(few, key=lambda name: len(set(table[name])), default=None),
-                      files[-1])
+        _draw_spreads(
+            table, min(few, key=lambda name: len(set(table[name])), default=None), files[-1]
+        )
     return files + draw_runs(table, folder / 'runs.png')
 
 
@@ -99,13 +105,18 @@ def _draw_curves(
 ) -> None:
     """Draw an error over x: the colour tells one other parameter, the line style a second."""
     by = sorted(others, key=lambda name: -len(set(table[name])))[-2:]
-    looks = [_pick_evenly(list(dict.fromkeys(table[name])), most)
-             for name, most in zip(by, (_HUES, len(_LINES)), strict=False)]
+    looks = [
+        _pick_evenly(list(dict.fromkeys(table[name])), most)
+        for name, most in zip(by, (_HUES, len(_LINES)), strict=False)
+    ]
     merged = [name for name in others if name not in by]
     with _axes(path, len(metrics), 4.2, 3.6) as (figure, axes):
         for axis, metric in zip(axes, metrics, strict=True):
-            found = [curve for curve in curves(table, metric.column, x, by)
-                     if all(v in values for v, values in zip(curve.key, looks, strict=True))]
+            found = [
+                curve
+                for curve in curves(table, metric.column, x, by)
+                if all(v in values for v, values in zip(curve.key, looks, strict=True))
+            ]
             for curve in found:
                 place = [values.index(v) for values, v in zip(looks, curve.key, strict=True)]
                 colour = _hues(len(looks[0]))[place[0]] if place else OURS
@@ -113,18 +124,26 @@ def _draw_curves(
                 if not merged:
                     axis.fill_between(curve.x, low, high, color=colour, alpha=0.15, linewidth=0)
                 axis.plot(
-                    curve.x, middle, _LINES[place[1]] if len(place) > 1 else '-', marker='.',
-                    color=colour, label=', '.join(
-                        f'{name} {value_text(v)}' for name, v in zip(by, curve.key, strict=True)))
+                    curve.x,
+                    middle,
+                    _LINES[place[1]] if len(place) > 1 else '-',
+                    marker='.',
+                    color=colour,
+                    label=', '.join(
+                        f'{name} {value_text(v)}' for name, v in zip(by, curve.key, strict=True)
+                    ),
+                )
             _scale(axis, found[0].x, metric.factor * np.concatenate([c.median for c in found]))
             axis.set_xlabel(_label(x))
             axis.set_title(metric.title, loc='left')
         if by:
             legend_below(figure, axes[0])
         what = f'median over all {", ".join(merged)}' if merged else 'median; band: 5 to 95 %'
-        thinned = [f'{len(values)} of {count} values of {name}'
-                   for name, values in zip(by, looks, strict=True)
-                   if len(values) < (count := len(set(table[name])))]
+        thinned = [
+            f'{len(values)} of {count} values of {name}'
+            for name, values in zip(by, looks, strict=True)
+            if len(values) < (count := len(set(table[name])))
+        ]
         figure.suptitle('; '.join([what, *thinned]), x=0.01, ha='left', fontsize=8)
 
 
@@ -135,7 +154,11 @@ def _pick_evenly(values: list[Any], most: int) -> list[Any]:
 
 
 def _draw_grids(
-    table: SweptTable, metrics: Sequence[PlottedMetric], x: str, y: str, others: Sequence[str],
+    table: SweptTable,
+    metrics: Sequence[PlottedMetric],
+    x: str,
+    y: str,
+    others: Sequence[str],
     path: Path,
 ) -> None:
     with _axes(path, len(metrics), 4.4, 3.6) as (figure, axes):
@@ -163,13 +186,22 @@ def _draw_spreads(table: SweptTable, by: str | None, path: Path) -> None:
     with _axes(path, len(spreads), 4.0, 2.8) as (figure, axes):
         for axis, spread in zip(axes, spreads, strict=True):
             edges = np.linspace(0.0, spread.at[-1], 61)
-            axis.hist(spread.ratio, edges, weights=np.full(len(spread.ratio), 1 / len(spread.ratio)
-                      / (edges[1] - edges[0])), color=OURS, label='localizations')
+            axis.hist(
+                spread.ratio,
+                edges,
+                weights=np.full(len(spread.ratio), 1 / len(spread.ratio) / (edges[1] - edges[0])),
+                color=OURS,
+                label='localizations',
+            )
             axis.plot(spread.at, spread.density, color=PUBLISHED, label='noise alone')
             beyond = np.mean(spread.ratio > edges[-1])
             if beyond:
-                axis.annotate(f'{100 * beyond:.0f} % are above {edges[-1]:g}', (0.98, 0.92),
-                              xycoords='axes fraction', ha='right')
+                axis.annotate(
+                    f'{100 * beyond:.0f} % are above {edges[-1]:g}',
+                    (0.98, 0.92),
+                    xycoords='axes fraction',
+                    ha='right',
+                )
             axis.set_title(spread.label, loc='left')
             axis.set(xlabel='rms residual / noise', yticks=[], xlim=(0.0, edges[-1]))
         legend_below(figure, axes[0])
@@ -187,12 +219,21 @@ def draw_residuals(clouds: Sequence[Points], lenses: Sequence[str], path: Path) 
         nearest, farthest = np.inf, 0.0
         for name, colour in zip(names, _hues(len(names)), strict=True):
             points = np.concatenate(
-                [cloud for cloud, lens in zip(clouds, lenses, strict=True) if lens == name])
-            points = points[::-(-len(points) // each)]
+                [cloud for cloud, lens in zip(clouds, lenses, strict=True) if lens == name]
+            )
+            points = points[:: -(-len(points) // each)]
             size = np.hypot(points['du'], points['dv'])
             for axis, x in zip(axes, (np.degrees(points['theta']), points['range']), strict=True):
-                axis.plot(x, size, '.', color=colour, alpha=0.6, markersize=4, markeredgewidth=0,
-                          label=name)
+                axis.plot(
+                    x,
+                    size,
+                    '.',
+                    color=colour,
+                    alpha=0.6,
+                    markersize=4,
+                    markeredgewidth=0,
+                    label=name,
+                )
             nearest = min(nearest, points['range'].min())
             farthest = max(farthest, points['range'].max())
         if 0 < 10 * nearest <= farthest:
@@ -241,7 +282,8 @@ def draw_runs(columns: Mapping[str, Sequence[Any]], path: Path) -> list[Path]:
     posed = [c.rpartition('.')[0] for c in columns if c.endswith('.axis_error_rad')]
     localizers = [name for name in posed if f'{name}.views' not in columns]  # no calibrator
     runs = {
-        name: found for name in _OF_RUNS
+        name: found
+        for name in _OF_RUNS
         if len(found := [c for n in localizers if (c := f'{n}.{name}') in columns]) > 1
     }
     if not runs or STAMP not in columns:
@@ -254,8 +296,14 @@ def draw_runs(columns: Mapping[str, Sequence[Any]], path: Path) -> list[Path]:
             for node in nodes:
                 values = factor * np.array(columns[node], dtype=float)
                 mean = float(np.nanmean(values))
-                axis.plot(stamp - stamp.min(), values, 'o-', ms=3, lw=1,
-                          label=f'{node.rpartition(".")[0]}, mean {mean:.3g}')
+                axis.plot(
+                    stamp - stamp.min(),
+                    values,
+                    'o-',
+                    ms=3,
+                    lw=1,
+                    label=f'{node.rpartition(".")[0]}, mean {mean:.3g}',
+                )
             axis.set(ylabel=label, ylim=(0, None))
             axis.legend(loc='lower right', bbox_to_anchor=(1, 1), ncols=len(nodes), fontsize=8)
         axes[-1].set_xlabel('time / s')

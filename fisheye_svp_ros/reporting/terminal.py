@@ -21,8 +21,9 @@ from rich.table import Table
 UNITS = {  # of the parameters of a lens; 1 where there is none
     **dict.fromkeys(('f', 'fx', 'fy', 'cx', 'cy'), 'px'),
     **dict.fromkeys(('s0', 'e0', 'e1', 'e2', 'thickness'), 'm'),
-    **dict.fromkeys(('port_distance', 'port_thickness', 'port_radius', 'port_x', 'port_y',
-                     'port_z'), 'm'),
+    **dict.fromkeys(
+        ('port_distance', 'port_thickness', 'port_radius', 'port_x', 'port_y', 'port_z'), 'm'
+    ),
     **dict.fromkeys(('port_tilt_x', 'port_tilt_y'), 'rad'),
 }
 _DEFAULT_WIDTH = 200  # columns where no terminal says how many it has
@@ -44,8 +45,9 @@ def print_table(
         text = name in words
         justify: JustifyMethod = 'right' if i and not text else 'left'
         widest = max(len(row[i]) for row in cells)
-        table.add_column(name, justify=justify, no_wrap=not text,
-                         min_width=None if text else widest)
+        table.add_column(
+            name, justify=justify, no_wrap=not text, min_width=None if text else widest
+        )
         least += 3 + (_MIN_WIDTH if text else widest)
     for row in cells[1:]:
         table.add_row(*row)
@@ -68,7 +70,9 @@ def console() -> Console:
     """Return the console of standard output, wide enough for a table when it is a file."""
     return Console(
         width=None if sys.stdout.isatty() else _DEFAULT_WIDTH,
-        highlight=False, markup=False, emoji=False
+        highlight=False,
+        markup=False,
+        emoji=False,
     )
 
 

@@ -65,22 +65,33 @@ def rows_left(pair: RectifiedPair) -> Remaining:
 
 
 def _remaining(
-    side: Rectification, error: ImageError | PairError, px: Array, curve_ranges: Array,
+    side: Rectification,
+    error: ImageError | PairError,
+    px: Array,
+    curve_ranges: Array,
     curve_px: Array,
 ) -> Remaining:
     table = quantiles(px)
     worst = int(np.nanargmax(table[:, 2]))
     return Remaining(
-        error.ranges, table, curve_ranges, quantiles(curve_px),
-        tolerated_ranges(curve_ranges, curve_px, side.range), float(error.ranges[worst]),
-        error.pixels, np.abs(px[worst]))
+        error.ranges,
+        table,
+        curve_ranges,
+        quantiles(curve_px),
+        tolerated_ranges(curve_ranges, curve_px, side.range),
+        float(error.ranges[worst]),
+        error.pixels,
+        np.abs(px[worst]),
+    )
 
 
 def print_remaining(title: str, left: Remaining) -> None:
     """Print the errors by range."""
     header = ['range', 'median, px', '95 %, px', 'largest, px']
-    rows = [[range_text(r), *(_number(value, 3) for value in row)]
-            for r, row in zip(left.ranges, left.table, strict=True)]
+    rows = [
+        [range_text(r), *(_number(value, 3) for value in row)]
+        for r, row in zip(left.ranges, left.table, strict=True)
+    ]
     if left.depth is not None:
         header += ['depth error, median, %', '95 %, %']
         for row, depth in zip(rows, left.depth, strict=True):
@@ -97,12 +108,17 @@ def tolerated_text(left: Remaining) -> str:
 def remaining_document(left: Remaining) -> dict[str, Any]:
     """Return the mapping of one part of undistort.json; null is infinity among ranges."""
     names = ('median_px', 'p95_px', 'worst_px')
-    document = {'ranges_m': left.ranges.tolist(),
-                **{name: left.table[:, i].tolist() for i, name in enumerate(names)},
-                'below_px': LIMIT, 'below_m': left.tolerated.tolist()}
+    document = {
+        'ranges_m': left.ranges.tolist(),
+        **{name: left.table[:, i].tolist() for i, name in enumerate(names)},
+        'below_px': LIMIT,
+        'below_m': left.tolerated.tolist(),
+    }
     if left.depth is not None:
-        document |= {'depth_median': left.depth[:, 0].tolist(),
-                     'depth_p95': left.depth[:, 1].tolist()}
+        document |= {
+            'depth_median': left.depth[:, 0].tolist(),
+            'depth_p95': left.depth[:, 1].tolist(),
+        }
     return document
 
 
@@ -113,23 +129,35 @@ def draw_remaining(path: Path, side: Rectification, left: Remaining, what: str) 
     with picture(path, 10.0, 4.0) as figure:
         curve, image = figure.subplots(1, 2)
         near = np.isfinite(left.curve_ranges)
-        for i, (name, color) in enumerate((('median', FAINT), ('95 %', OURS),
-                                           ('worst', PUBLISHED))):
+        for i, (name, color) in enumerate(
+            (('median', FAINT), ('95 %', OURS), ('worst', PUBLISHED))
+        ):
             curve.plot(left.curve_ranges[near], left.curve[near, i], color=color, label=name)
         curve.axhline(LIMIT, color='#404850', linestyle='--', linewidth=0.9)
         if np.isfinite(side.range):
             curve.axvline(side.range, color='#404850', linestyle=':', linewidth=0.9)
         top = np.fmax.reduce(left.table[:, 2])
-        curve.set(xscale='log', xlabel='range, m', ylabel=f'{what}, px', ylim=(0, 1.1 * top),
-                  title=tolerated_text(left))
+        curve.set(
+            xscale='log',
+            xlabel='range, m',
+            ylabel=f'{what}, px',
+            ylim=(0, 1.1 * top),
+            title=tolerated_text(left),
+        )
         curve.legend()
         seen = np.isfinite(left.map_px)
-        shown = image.scatter(*left.map_uv[seen].T, c=left.map_px[seen], s=14, marker='s',
-                              cmap='Blues', vmin=0.0)
+        shown = image.scatter(
+            *left.map_uv[seen].T, c=left.map_px[seen], s=14, marker='s', cmap='Blues', vmin=0.0
+        )
         figure.colorbar(shown, ax=image, label=f'{what}, px')
-        image.set(xlim=(-0.5, side.camera.width - 0.5), ylim=(side.camera.height - 0.5, -0.5),
-                  aspect='equal', xlabel='u, px', ylabel='v, px',
-                  title=f'over the image, at {range_text(left.map_range)}')
+        image.set(
+            xlim=(-0.5, side.camera.width - 0.5),
+            ylim=(side.camera.height - 0.5, -0.5),
+            aspect='equal',
+            xlabel='u, px',
+            ylabel='v, px',
+            title=f'over the image, at {range_text(left.map_range)}',
+        )
         image.grid(visible=False)
 
 

@@ -50,6 +50,7 @@ class Board(NamedTuple):
 def spacing(points: Array) -> float:
     """Return the median distance of points (M, 3) to their nearest neighbours."""
     from scipy.spatial import KDTree  # not loaded for the help of a command
+
     return float(np.median(np.asarray(KDTree(points).query(points, 2)[0])[:, 1]))
 
 
@@ -135,5 +136,7 @@ def _turns(board: Board, ids: Index, points: Array) -> list[BoardTurn]:
     for _ in found:
         for partner, _ in found.values():
             paired &= paired[partner]
-    return [BoardTurn(board, degrees, ids[paired], ids[partner[paired]], ids[~paired], matrix)
-            for degrees, (partner, matrix) in found.items()]
+    return [
+        BoardTurn(board, degrees, ids[paired], ids[partner[paired]], ids[~paired], matrix)
+        for degrees, (partner, matrix) in found.items()
+    ]

@@ -52,8 +52,10 @@ def check_landmarks(landmarks: Landmarks, where: str) -> Landmarks:
         raise ObservationError(f'{where}: landmark {values[counts > 1][0]} is listed twice')
     bad = ~np.isfinite(landmarks.points).all(axis=-1)
     if np.any(bad):
-        raise ObservationError(f'{where}: landmark {landmarks.ids[bad][0]} has a coordinate '
-                               'that is not a finite number')
+        raise ObservationError(
+            f'{where}: landmark {landmarks.ids[bad][0]} has a coordinate '
+            'that is not a finite number'
+        )
     return landmarks
 
 
@@ -84,8 +86,10 @@ class Observations:
 
     def __repr__(self) -> str:
         cameras = f', cameras {", ".join(self.cameras)}' if self.cameras != ('',) else ''
-        return (f'Observations({len(self)} points in {len(self.frames)} frames{cameras}, '
-                f'of {self.source})')
+        return (
+            f'Observations({len(self)} points in {len(self.frames)} frames{cameras}, '
+            f'of {self.source})'
+        )
 
     def take(self, index: Index | Mask) -> Observations:
         """Return some of the rows."""

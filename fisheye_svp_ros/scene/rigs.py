@@ -36,8 +36,10 @@ def surround_rig(count: int, radius: float) -> Pose:
     Raises ParameterError for fewer than two, or an impossible radius.
     """
     if count < 2 or not (np.isfinite(radius) and radius > 0):
-        raise ParameterError(f'{count} cameras on a circle of {radius} m; at least 2, and a '
-                             'radius above 0, are needed')
+        raise ParameterError(
+            f'{count} cameras on a circle of {radius} m; at least 2, and a '
+            'radius above 0, are needed'
+        )
     azimuth = 2 * np.pi * np.arange(count) / count
     turns = azimuth[:, None] * np.array([0.0, 1.0, 0.0])
     places = np.stack([np.sin(azimuth), np.zeros(count), np.cos(azimuth) - 1], axis=-1)

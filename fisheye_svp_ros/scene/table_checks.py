@@ -23,8 +23,9 @@ def order_cameras(table: Observations, cameras: tuple[str, ...]) -> Observations
         return table
     if set(table.cameras) != set(cameras):
         held = ', '.join(filter(None, table.cameras)) or 'one without a name'
-        raise ObservationError(f'{table.source}: its cameras ({held}) are not those of the rig, '
-                               + ', '.join(cameras))
+        raise ObservationError(
+            f'{table.source}: its cameras ({held}) are not those of the rig, ' + ', '.join(cameras)
+        )
     return select_cameras(table, cameras)
 
 
@@ -38,11 +39,15 @@ def put_right_camera_first(table: Observations) -> Observations:
 
 def check_distinct(observations: Observations, other: Observations) -> None:
     """Raise ObservationError where most of other observations are these once more."""
-    seen, again = (set(zip(table.landmark.tolist(), *table.uv.T.tolist(), strict=True))
-                   for table in (observations, other))
+    seen, again = (
+        set(zip(table.landmark.tolist(), *table.uv.T.tolist(), strict=True))
+        for table in (observations, other)
+    )
     if len(seen & again) > _COPIED_SHARE * len(again):
-        raise ObservationError(f'{other.source}: these image points are those of '
-                               f'{observations.source}; other photographs are needed')
+        raise ObservationError(
+            f'{other.source}: these image points are those of '
+            f'{observations.source}; other photographs are needed'
+        )
 
 
 def is_another_target(observations: Observations, other: Observations) -> bool:
@@ -83,9 +88,13 @@ def remove_copies(observations: Observations) -> tuple[Observations, tuple[int, 
 
 def check_cameras(observations: Observations) -> None:
     """Raise ObservationError where two cameras of a rig hold the same image points."""
-    tables = [replace(observations.take(observations.camera == camera),
-                      source=f'{observations.source}, camera {name}')
-              for camera, name in enumerate(observations.cameras)]
+    tables = [
+        replace(
+            observations.take(observations.camera == camera),
+            source=f'{observations.source}, camera {name}',
+        )
+        for camera, name in enumerate(observations.cameras)
+    ]
     for one, other in combinations(tables, 2):
         check_distinct(one, other)
 

@@ -65,7 +65,7 @@ class Print:
         """Nominal inner corners (N, 3), m, row by row, or the points of the drawing."""
         if self.drawing is not None:
             return np.pad(self.drawing.points, ((0, 0), (0, 1))) * self.size
-        y, x = np.mgrid[:self.rows, :self.columns]
+        y, x = np.mgrid[: self.rows, : self.columns]
         return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1) * self.size
 
     @property
@@ -140,12 +140,15 @@ def render(
     window = _window(lens, boards, camera)
     part = uv[window]
     if part.size:
-        parts = Rays(rays.origin[window], rays.direction[window], theta[window],
-                     rays.valid[window])
-        seen = sum(_of_board(lens, board, camera, exposure, part, parts, moved)
-                   for board in boards)
+        parts = Rays(
+            rays.origin[window], rays.direction[window], theta[window], rays.valid[window]
+        )
+        seen = sum(
+            _of_board(lens, board, camera, exposure, part, parts, moved) for board in boards
+        )
         light[window] = _lens_blur(
-            np.asarray(_ROOM + seen, np.float32), theta[window], exposure, lens.max_incidence)
+            np.asarray(_ROOM + seen, np.float32), theta[window], exposure, lens.max_incidence
+        )
     outwards = np.nan_to_num(theta / lens.max_incidence)
     light *= exposure.gain * (1 - exposure.vignetting * outwards**2)
     light *= 1 + (uv / lens.width - 0.5) @ np.array(exposure.slope)
@@ -163,7 +166,7 @@ def pixel_rays(lens: Lens) -> Rays:
 
 def _pixels(lens: Lens) -> Array:
     """Return the image points of all pixels (H, W, 2)."""
-    v, u = np.mgrid[:lens.height, :lens.width].astype(float)
+    v, u = np.mgrid[: lens.height, : lens.width].astype(float)
     return np.stack([u, v], axis=-1)
 
 
@@ -188,7 +191,12 @@ def _window(lens: Lens, boards: Sequence[BoardPose], camera: Pose) -> tuple[slic
 
 
 def _of_board(
-    lens: Lens, board: BoardPose, camera: Pose, exposure: Exposure, uv: Array, rays: Rays,
+    lens: Lens,
+    board: BoardPose,
+    camera: Pose,
+    exposure: Exposure,
+    uv: Array,
+    rays: Rays,
     moved: Field | None,
 ) -> NDArray[np.float32]:
     """Return what a board adds to the light of the parts of pixels uv (H, W, 2), rays (H, W)."""
@@ -197,8 +205,7 @@ def _of_board(
         for _ in range(3):
             # The image of a place is moved: look where the unmoved image of what is seen lies.
             unmoved = uv - moved(_is_near_sheet(places, board.printed))
-            places = _board_xy(lens, board, camera, exposure, unmoved,
-                               back_project(lens, unmoved))
+            places = _board_xy(lens, board, camera, exposure, unmoved, back_project(lens, unmoved))
     return _light(board.printed, places) - np.float32(_ROOM)
 
 
@@ -209,14 +216,20 @@ def _board_xy(
     line = uv[..., 1].ravel() - (lens.height - 1) / 2
     origin, direction = rays.origin.reshape(-1, 3), rays.direction.reshape(-1, 3)
     parts = [slice(i, i + _CHUNK) for i in range(0, len(line), _CHUNK)]
-    return np.concatenate([
-        _board_share(board, camera, exposure, line[part], origin[part], direction[part])
-        for part in parts
-    ]).reshape(uv.shape)
+    return np.concatenate(
+        [
+            _board_share(board, camera, exposure, line[part], origin[part], direction[part])
+            for part in parts
+        ]
+    ).reshape(uv.shape)
 
 
 def _board_share(
-    board: BoardPose, camera: Pose, exposure: Exposure, line: Array, origin: Array,
+    board: BoardPose,
+    camera: Pose,
+    exposure: Exposure,
+    line: Array,
+    origin: Array,
     direction: Array,
 ) -> Array:
     """Return places (N, 2) of rays (N, 3); line (N,): rows of the image after the middle one."""
@@ -266,12 +279,12 @@ def _light(printed: Print, places: Array) -> NDArray[np.float32]:
     light = np.empty((*edge.shape, _SAMPLES, _SAMPLES), np.float32)
     light[:] = np.expand_dims(_reflectance(printed, part, np.full(2, 1e-12)), (2, 3))
     part, by_u, by_v, uu, uv_, vv = (
-        np.asarray(array)[edge] for array in (part, by_u, by_v, uu, uv_, vv))
+        np.asarray(array)[edge] for array in (part, by_u, by_v, uu, uv_, vv)
+    )
     steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
     for row, b in enumerate(steps):
         for column, a in enumerate(steps):
-            sample = (part + a * by_u + b * by_v
-                      + 0.5 * a * a * uu + a * b * uv_ + 0.5 * b * b * vv)
+            sample = part + a * by_u + b * by_v + 0.5 * a * a * uu + a * b * uv_ + 0.5 * b * b * vv
             # How far, in squares, a sample reaches across lines of x and of y.
             reach = np.abs(by_u + a * uu + b * uv_) + np.abs(by_v + a * uv_ + b * vv)
             light[edge, row, column] = _reflectance(printed, sample, reach / _SAMPLES + 1e-12)
@@ -286,8 +299,9 @@ def _line_distance(printed: Print, places: Array) -> Array:
     squares = np.abs(places - np.clip(np.round(places), low, high))
     if printed.drawing is not None:
         squares = np.maximum(np.maximum(low - places, places - high), 0.0)
-    sheet = np.minimum(np.abs(places - low + printed.margin),
-                       np.abs(places - high - printed.margin))
+    sheet = np.minimum(
+        np.abs(places - low + printed.margin), np.abs(places - high - printed.margin)
+    )
     return np.asarray(np.minimum(squares, sheet))
 
 
@@ -327,8 +341,9 @@ def _lens_blur(light: NDArray[np.float32], theta: Array, exposure: Exposure, edg
     lower = np.floor(place).astype(int)
     row, column = np.indices(theta.shape)
     weight = place - lower
-    return np.asarray((1 - weight) * stack[lower, row, column]
-                      + weight * stack[lower + 1, row, column])
+    return np.asarray(
+        (1 - weight) * stack[lower, row, column] + weight * stack[lower + 1, row, column]
+    )
 
 
 def _sample_pixels(light: NDArray[np.float32], blur: float) -> Array:

@@ -61,42 +61,50 @@ class Scenario:
         2.0, 'Distance of the landmarks of whole, inner and outer', 'm', (1e-3, 1e6)
     )
     style: str = parameter(
-        MONO, 'One camera, or a stereo rig with the cameras left and right',
-        choices=(MONO, *STYLES)
+        MONO,
+        'One camera, or a stereo rig with the cameras left and right',
+        choices=(MONO, *STYLES),
     )
     baseline: float = parameter(BASELINE, 'Distance between the two cameras', 'm', (1e-6, 1e3))
     vergence: float = parameter(
-        0.0, 'Further inward turn of the left camera, beyond that of the style', 'rad',
-        (-1.6, 1.6)
+        0.0, 'Further inward turn of the left camera, beyond that of the style', 'rad', (-1.6, 1.6)
     )
     poses: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
         'x, y, z, qx, qy, qz, qw of the camera (right camera of a rig) in the world, one pose '
-        'after the other', 'm'
+        'after the other',
+        'm',
     )
     poses_file: str = parameter(
-        '', 'Poses CSV in place of `poses`, or `calibration`: ten poses to calibrate a rig from',
-        file=True
+        '',
+        'Poses CSV in place of `poses`, or `calibration`: ten poses to calibrate a rig from',
+        file=True,
     )
     trajectory_steps: int = parameter(
-        0, '0: jump from pose to pose; n: move smoothly from each pose to the next in n steps',
-        span=(0, 1_000_000)
+        0,
+        '0: jump from pose to pose; n: move smoothly from each pose to the next in n steps',
+        span=(0, 1_000_000),
     )
     noise_px: float = parameter(
         0.0, 'Standard deviation of the noise of image points', 'px', (0.0, 1e3)
     )
     seed: int = parameter(0, 'Seed of the noise', span=(0, 2**31 - 1))
     rig_file: str = parameter(
-        '', 'Cameras in place of `lens` and `style`: a folder or file with their lenses and '
+        '',
+        'Cameras in place of `lens` and `style`: a folder or file with their lenses and '
         'relative poses, as `calibrate` writes it; `poses` are those of the first '
-        'camera', file=True
+        'camera',
+        file=True,
     )
 
 
 _SETS_PER_BLOCK = 1000  # sets that are simulated at once
 
-SCALARS = tuple(row.name for row in rows(Scenario)
-                if not isinstance(row.default, tuple) and row.name != 'rig_file')
+SCALARS = tuple(
+    row.name
+    for row in rows(Scenario)
+    if not isinstance(row.default, tuple) and row.name != 'rig_file'
+)
 
 
 class Simulation(NamedTuple):
@@ -125,8 +133,12 @@ def simulate_scenario(
     Raises FisheyeSvpError for a lens, landmarks or poses that
     cannot be used.
     """
-    return _simulate_poses(scenario, scenario_poses(scenario),
-                           noise_generator(scenario.seed, number, repetition), lens)
+    return _simulate_poses(
+        scenario,
+        scenario_poses(scenario),
+        noise_generator(scenario.seed, number, repetition),
+        lens,
+    )
 
 
 def simulate_in_pieces(
@@ -150,8 +162,11 @@ def _simulate_poses(
 ) -> Simulation:
     if scenario.rig_file:
         return _simulate_rig(scenario, poses, rng)
-    lens = true_lens(scenario.lens, scenario.shift_scale) if lens is None else (
-        _scale_shift(lens, scenario.shift_scale))
+    lens = (
+        true_lens(scenario.lens, scenario.shift_scale)
+        if lens is None
+        else (_scale_shift(lens, scenario.shift_scale))
+    )
     landmarks, rig = scenario_landmarks(scenario), scenario_rig(scenario)
     model, sigma = ForwardModel(lens), scenario.noise_px
     if rig is None:
@@ -167,8 +182,9 @@ def _simulate_rig(scenario: Scenario, poses: Pose, rng: np.random.Generator) -> 
     lenses = tuple(_scale_shift(lens, scenario.shift_scale) for lens in lenses)
     landmarks, count = scenario_landmarks(scenario), len(poses.position)
     each = tuple(poses.compose(places.take(i).broadcast_to(count)) for i in range(len(names)))
-    seen = simulate_rig([ForwardModel(lens) for lens in lenses], landmarks, each,
-                        scenario.noise_px, rng, names)
+    seen = simulate_rig(
+        [ForwardModel(lens) for lens in lenses], landmarks, each, scenario.noise_px, rng, names
+    )
     return Simulation(lenses[0], landmarks, seen, each, None, lenses)
 
 
@@ -311,8 +327,10 @@ def _interpolate_poses(poses: Pose, steps: int, numbers: Index) -> Pose:
     before, after = poses.take(start), poses.take(np.minimum(start + 1, last))
     part = ((numbers - start * steps) / steps)[:, None]
     turn = vector_from_rotation(after.rotation @ np.swapaxes(before.rotation, -1, -2))
-    way = Pose(rotation_from_vector(part * turn) @ before.rotation,
-               before.position + part * (after.position - before.position))
+    way = Pose(
+        rotation_from_vector(part * turn) @ before.rotation,
+        before.position + part * (after.position - before.position),
+    )
     there = numbers >= last * steps
     way.rotation[there], way.position[there] = poses.rotation[last], poses.position[last]
     return way
@@ -378,11 +396,16 @@ def _simulate_batch(scenes: Sequence[_Scene], first: int) -> Batch:
     for number, camera in enumerate(cameras):
         views = blank_views(landmark[sets], points[sets], flat)
         views = views._replace(camera=views.camera + number)
-        seen = (part.reshape(*shape, -1)
-                for part in predict_points(model, camera.reshape(flat), views))
-        uv.append(np.stack([
-            add_noise(model, (ideal, scale), scene.scenario.noise_px, rng)
-            for scene, rng, ideal, scale in zip(scenes, noise, *seen, strict=True)
-        ]))
+        seen = (
+            part.reshape(*shape, -1) for part in predict_points(model, camera.reshape(flat), views)
+        )
+        uv.append(
+            np.stack(
+                [
+                    add_noise(model, (ideal, scale), scene.scenario.noise_px, rng)
+                    for scene, rng, ideal, scale in zip(scenes, noise, *seen, strict=True)
+                ]
+            )
+        )
     row = np.array([scene.row for scene in scenes])
     return Batch(row, one.lens, one.shift_scale, landmark, points, rig, cameras, tuple(uv))

@@ -59,8 +59,9 @@ def simulate_stereo(
 
     rig: left camera in the right one; poses (S,) of the right camera in the world.
     """
-    return simulate_rig((left, right), landmarks, (poses.compose(rig), poses), sigma, rng, STEREO,
-                        t=t)
+    return simulate_rig(
+        (left, right), landmarks, (poses.compose(rig), poses), sigma, rng, STEREO, t=t
+    )
 
 
 def simulate_rig(
@@ -80,8 +81,11 @@ def simulate_rig(
     views = blank_views(landmarks.ids, landmarks.points, len(poses[0].position), t)
     seen = [
         add_noise(
-            model, predict_points(model, place, views._replace(camera=views.camera + camera)),
-            sigma, rng)
+            model,
+            predict_points(model, place, views._replace(camera=views.camera + camera)),
+            sigma,
+            rng,
+        )
         for camera, (model, place) in enumerate(zip(models, poses, strict=True))
     ]
     return _table(np.stack(seen, axis=1), landmarks, sigma, t, None, cameras)
@@ -128,7 +132,11 @@ def add_noise(
 
 
 def _table(
-    seen: Array, landmarks: Landmarks, sigma: float, t: Array | None, board: Index | None,
+    seen: Array,
+    landmarks: Landmarks,
+    sigma: float,
+    t: Array | None,
+    board: Index | None,
     cameras: tuple[str, ...],
 ) -> Observations:
     """Make the table of image points (S, C, N, 2) in the order of frame, camera, landmark."""

@@ -43,7 +43,8 @@ def _box(printed: Print, outside: bool) -> tuple[BoardPose, ...]:
 
 
 TARGETS: dict[str, Callable[[Print], tuple[BoardPose, ...]]] = {
-    'cube': partial(_box, outside=True), 'room': partial(_box, outside=False),
+    'cube': partial(_box, outside=True),
+    'room': partial(_box, outside=False),
 }
 
 
@@ -55,7 +56,8 @@ def visible(lens: Lens, boards: tuple[BoardPose, ...], camera: Pose) -> tuple[Ar
         image = project(lens, camera.into_body(points))
         front = board.pose.into_body(camera.position[None])[0, 2] < 0
         inside = (image.uv > -0.5).all(axis=-1) & (
-            image.uv < np.array([lens.width, lens.height]) - 0.5).all(axis=-1)
+            image.uv < np.array([lens.width, lens.height]) - 0.5
+        ).all(axis=-1)
         uv.append(image.uv)
         seen.append(image.valid & inside & front)
     return np.stack(uv), np.stack(seen)
@@ -78,13 +80,24 @@ def board_views(
     def sees(camera: Pose) -> bool:
         return _contains(lens, camera.into_body(corners), printed)
 
-    return _draw_poses(count, draw, sees, (
-        f'lens {lens.name!r} does not see the whole board at {ranges[0]:g} to {ranges[1]:g} m; '
-        'choose a smaller board or other ranges'))
+    return _draw_poses(
+        count,
+        draw,
+        sees,
+        (
+            f'lens {lens.name!r} does not see the whole board at {ranges[0]:g} to '
+            f'{ranges[1]:g} m; '
+            'choose a smaller board or other ranges'
+        ),
+    )
 
 
 def target_views(
-    lens: Lens, kind: str, boards: tuple[BoardPose, ...], count: int, ranges: tuple[float, float],
+    lens: Lens,
+    kind: str,
+    boards: tuple[BoardPose, ...],
+    count: int,
+    ranges: tuple[float, float],
     rng: np.random.Generator,
 ) -> Pose:
     """Return `count` poses of the camera in a target's frame from which two boards are seen.
@@ -96,18 +109,27 @@ def target_views(
 
     def draw() -> Pose:
         if kind == 'room':
-            return Pose(rotation_from_vector(rng.normal(size=3)),
-                        _CAMERA_RANGE * half * rng.uniform(-1, 1, 3))
+            return Pose(
+                rotation_from_vector(rng.normal(size=3)),
+                _CAMERA_RANGE * half * rng.uniform(-1, 1, 3),
+            )
         turn, place = _placed_in_sight(lens, ranges, rng)
         return Pose(turn @ rotation_from_vector(rng.normal(size=3)), place).inverse()
 
     def boards_visible(camera: Pose) -> bool:
         return bool((visible(lens, boards, camera)[1].sum(axis=1) > 3).sum() >= _MIN_BOARDS)
 
-    where = ('from inside it; take a lens with a larger field of view' if kind == 'room' else
-             f'at {ranges[0]:g} to {ranges[1]:g} m; choose other ranges')
-    return _draw_poses(count, draw, boards_visible, (
-        f'lens {lens.name!r} does not see two boards of the {kind} {where}'))
+    where = (
+        'from inside it; take a lens with a larger field of view'
+        if kind == 'room'
+        else f'at {ranges[0]:g} to {ranges[1]:g} m; choose other ranges'
+    )
+    return _draw_poses(
+        count,
+        draw,
+        boards_visible,
+        (f'lens {lens.name!r} does not see two boards of the {kind} {where}'),
+    )
 
 
 def _draw_poses(
@@ -140,8 +162,9 @@ def _facing(sight: Array, rng: np.random.Generator) -> Array:
     towards = rotation_from_vector(angle * across / max(float(np.linalg.norm(across)), 1e-12))
     axis, roll = rng.uniform(0, 2 * np.pi, 2)
     tilt = _TILT * np.sqrt(rng.uniform()) * np.array([np.cos(axis), np.sin(axis), 0.0])
-    return np.asarray(towards @ rotation_from_vector(tilt)
-                      @ rotation_from_vector(np.array([0.0, 0.0, roll])))
+    return np.asarray(
+        towards @ rotation_from_vector(tilt) @ rotation_from_vector(np.array([0.0, 0.0, roll]))
+    )
 
 
 def _contains(lens: Lens, points: Array, printed: Print) -> bool:

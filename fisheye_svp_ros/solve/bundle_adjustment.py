@@ -63,7 +63,10 @@ class Prior(NamedTuple):
 
 
 def adjust(
-    data: RigViews, state: RigState, free: Sequence[str], prior: Prior | None = None,
+    data: RigViews,
+    state: RigState,
+    free: Sequence[str],
+    prior: Prior | None = None,
     held: Collection[str] | None = (),
 ) -> RigState:
     """Fit poses, rig, free intrinsics and effect values together, from a state on.
@@ -80,7 +83,8 @@ def adjust_poses(data: RigViews, state: RigState) -> RigState:
 
 
 def gauss_newton(
-    linear: Linearization, solve: Callable[[Array, RigState], tuple[Array, Array]],
+    linear: Linearization,
+    solve: Callable[[Array, RigState], tuple[Array, Array]],
     tolerance: float,
 ) -> RigState:
     """Fit as `adjust` does, under a covariance of the residuals that the caller knows.
@@ -101,15 +105,19 @@ def gauss_newton(
         change = (linear.frame_columns @ frame[..., None])[..., 0] + linear.shared_columns @ shared
         after = partial(state.retract, free, frame, shared)
         state, residual = shorten_step(
-            data, free, after, limit, partial(is_linear, residual, change))
+            data, free, after, limit, partial(is_linear, residual, change)
+        )
         if np.sqrt((change**2).mean()) < tolerance:
             break
     return state
 
 
 def shorten_step(
-    data: RigViews, free: Sequence[str], after: Callable[[float], RigState],
-    limit: float = np.inf, is_linear: Callable[[float, Array], bool] = lambda *_: False,
+    data: RigViews,
+    free: Sequence[str],
+    after: Callable[[float], RigState],
+    limit: float = np.inf,
+    is_linear: Callable[[float, Array], bool] = lambda *_: False,
 ) -> tuple[RigState, Array]:
     """Return the state after so much of a step that all points are seen, and its residual (F, M).
 
@@ -166,21 +174,39 @@ def adjust_lens(lens: Lens, views: Views, pose: Pose, names: Sequence[str]) -> A
     _check_determined(arrow, names)
     covariance = arrow_covariance(arrow)
     return AdjustedLens(
-        fitted.lens, tuple(names), covariance.shared[0], fitted.pose, covariance.blocks[0],
-        linear.residual_px, (linear.residual**2).sum(axis=1), bool(solved.converged[0]),
+        fitted.lens,
+        tuple(names),
+        covariance.shared[0],
+        fitted.pose,
+        covariance.blocks[0],
+        linear.residual_px,
+        (linear.residual**2).sum(axis=1),
+        bool(solved.converged[0]),
     )
 
 
 def adjust_lens_from(
-    lens: Lens, views: Views, pose: Pose, values: Array, names: Sequence[str],
+    lens: Lens,
+    views: Views,
+    pose: Pose,
+    values: Array,
+    names: Sequence[str],
     max_iterations: int,
 ) -> Lens:
     """Return the lens that fits best of those adjusted from S starts: pose (S, V), values (S, K).
 
     names: of the K parameters; a start outside the lens's domain is left as it is.
     """
-    states = [RigState(pose.take(i), identity(1), lens.with_parameters(names, one.tolist()), (),
-                       corrected=True) for i, one in enumerate(values)]
+    states = [
+        RigState(
+            pose.take(i),
+            identity(1),
+            lens.with_parameters(names, one.tolist()),
+            (),
+            corrected=True,
+        )
+        for i, one in enumerate(values)
+    ]
     problem = Adjustment(RigViews.of_one_camera(views), states[0], names)
     solved: Minimum = levenberg_marquardt(problem, problem.pack(states), max_iterations)
     return problem.unpack(solved.state, int(np.argmin(solved.cost))).lens
@@ -196,8 +222,11 @@ def rig_covariance(linear: Linearization, sigma: float, lenses: Array) -> Array:
     cameras = linear.data.cameras - 1
     bodies = len(linear.state.rig.position) - 1  # and boards
     count = 6 * bodies
-    names = [f'the place of {f"camera {i + 2}" if i < cameras else f"board {i - cameras + 2}"}'
-             for i in range(bodies) for _ in range(6)]
+    names = [
+        f'the place of {f"camera {i + 2}" if i < cameras else f"board {i - cameras + 2}"}'
+        for i in range(bodies)
+        for _ in range(6)
+    ]
     _check_determined(_equations(linear, linear.shared_columns[..., :count])[1], names)
     information = arrow_information(_equations(linear, linear.shared_columns)[1])[0]
     information[count:, count:] += sigma**2 * lenses
@@ -213,8 +242,12 @@ class Adjustment:
     step = staticmethod(arrow_step)
 
     def __init__(
-        self, data: RigViews, template: RigState, free: Sequence[str],
-        held: Collection[str] | None = (), prior: Prior | None = None,
+        self,
+        data: RigViews,
+        template: RigState,
+        free: Sequence[str],
+        held: Collection[str] | None = (),
+        prior: Prior | None = None,
     ) -> None:
         """Take what to fit; held: effects that stay as they are, None for all but the poses."""
         self._data, self._template, self._free = data, template, tuple(free)
@@ -223,8 +256,11 @@ class Adjustment:
         moving = [np.zeros(0, dtype=bool)]
         if held is not None:
             moving += [np.ones(6 * (len(template.rig.position) - 1) + len(self._free), dtype=bool)]
-            moving += [np.full(len(values), effect.name not in held)
-                       for effect, values in template.terms if is_shared(effect)]
+            moving += [
+                np.full(len(values), effect.name not in held)
+                for effect, values in template.terms
+                if is_shared(effect)
+            ]
         self._moving = np.concatenate(moving)
 
     def pack(self, states: Sequence[RigState]) -> Arrays:
@@ -235,16 +271,19 @@ class Adjustment:
     def unpack(self, packed: Arrays, system: int = 0) -> RigState:
         """Return one of the states."""
         rotation, position, rig_rotation, rig_position, values = (a[system] for a in packed)
-        state = replace(self._template, pose=Pose(rotation, position),
-                        rig=Pose(rig_rotation, rig_position))
+        state = replace(
+            self._template, pose=Pose(rotation, position), rig=Pose(rig_rotation, rig_position)
+        )
         return state.with_shared_values(self._free, values)
 
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         if not len(index):
             return np.zeros(0), ()
         costs, systems = zip(*(self._equations(state, i) for i in range(len(index))), strict=True)
-        return (np.concatenate(costs),
-                tuple(np.concatenate(parts) for parts in zip(*systems, strict=True)))
+        return (
+            np.concatenate(costs),
+            tuple(np.concatenate(parts) for parts in zip(*systems, strict=True)),
+        )
 
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         frame, shared = step
@@ -257,7 +296,7 @@ class Adjustment:
         return (
             *Pose(rotation, position).retract(frame),
             *Pose(rig_rotation, rig_position).retract(move),
-            values + shared[:, 6 * (bodies - 1):],
+            values + shared[:, 6 * (bodies - 1) :],
         )
 
     def _equations(self, packed: Arrays, system: int) -> tuple[Array, Arrays]:
@@ -277,12 +316,18 @@ class Adjustment:
 
     def _empty_equations(self) -> Arrays:
         frames, count = self._data.frames, len(self._moving)
-        return tuple(np.zeros((1, *shape)) for shape in (
-            (frames, 6, 6), (frames, 6, count), (count, count), (frames, 6), (count,)))
+        return tuple(
+            np.zeros((1, *shape))
+            for shape in (
+                (frames, 6, 6),
+                (frames, 6, count),
+                (count, count),
+                (frames, 6),
+                (count,),
+            )
+        )
 
-    def _with_prior(
-        self, state: RigState, cost: Array, normal: Arrays
-    ) -> tuple[Array, Arrays]:
+    def _with_prior(self, state: RigState, cost: Array, normal: Arrays) -> tuple[Array, Arrays]:
         blocks, _, shared, block_gradient, shared_gradient = (array[0] for array in normal)
         prior = self._prior
         if prior.mean is not None and prior.root is not None:

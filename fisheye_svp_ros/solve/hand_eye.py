@@ -55,8 +55,12 @@ class Transforms(NamedTuple):
     def flange(self, camera: Pose) -> Pose:
         """Return the flange in the base, in lengths of the target, of cameras (F,) in it."""
         rows = [0] * len(camera.position)
-        return self.target.reshape(1).take(rows).compose(camera).compose(
-            self.camera.reshape(1).take(rows).inverse())
+        return (
+            self.target.reshape(1)
+            .take(rows)
+            .compose(camera)
+            .compose(self.camera.reshape(1).take(rows).inverse())
+        )
 
 
 @dataclass(frozen=True)
@@ -89,14 +93,21 @@ class HandEye:
         covariance: of both transforms, each (dx, dy, dz, rotation about x, y, z) in its reference
         frame, and of the scale.
         """
+
         def entry(pose: Pose) -> dict[str, list[float]]:
-            return {'position': pose.position.tolist(),
-                    'quaternion': quaternion_from_rotation(pose.rotation).tolist()}
+            return {
+                'position': pose.position.tolist(),
+                'quaternion': quaternion_from_rotation(pose.rotation).tolist(),
+            }
 
         return {
-            'camera_in_flange': entry(self.camera), 'target_in_base': entry(self.target),
-            'scale': self.scale, 'covariance': self.covariance.tolist(),
-            'noise_m': self.noise_m, 'noise_rad': self.noise_rad, 'frames': len(self.frame),
+            'camera_in_flange': entry(self.camera),
+            'target_in_base': entry(self.target),
+            'scale': self.scale,
+            'covariance': self.covariance.tolist(),
+            'noise_m': self.noise_m,
+            'noise_rad': self.noise_rad,
+            'frames': len(self.frame),
         }
 
 
@@ -125,26 +136,37 @@ def _solve_lengths(
 ) -> Transforms:
     """Return the transforms of known rotations: scale p_f = R_b p_c + t_b - R_f t_m is linear."""
     frames = len(flange.position)
-    columns = np.concatenate([
-        np.broadcast_to(np.eye(3), (frames, 3, 3)), -flange.rotation,
-        -flange.position[..., None]], axis=-1).reshape(-1, 7)
+    columns = np.concatenate(
+        [
+            np.broadcast_to(np.eye(3), (frames, 3, 3)),
+            -flange.rotation,
+            -flange.position[..., None],
+        ],
+        axis=-1,
+    ).reshape(-1, 7)
     right = -(camera.position @ base.T).ravel()
     if scale is not None:
         columns, right = columns[:, :6], right - scale * columns[:, 6]
     solved = np.linalg.lstsq(columns, right, rcond=None)[0]
-    return Transforms(Pose(mount, solved[3:6]), Pose(base, solved[:3]),
-                      float(solved[6]) if scale is None else scale)
+    return Transforms(
+        Pose(mount, solved[3:6]),
+        Pose(base, solved[:3]),
+        float(solved[6]) if scale is None else scale,
+    )
 
 
 def _check_turns(flange: Pose) -> None:
     if len(flange.position) < MIN_FRAMES:
         raise GeometryError(
             f'{len(flange.position)} of the frames have a pose of the robot; {MIN_FRAMES} or more '
-            'are needed; check the frame numbers of the poses')
+            'are needed; check the frame numbers of the poses'
+        )
     sizes = turn_sizes(flange)
     if not sizes[1] > max(_MIN_TURN, _MIN_TURN * sizes[0]):
-        raise GeometryError('the flange turns about one axis at most; turn it about two axes or '
-                            'more, by 20 degrees or more')
+        raise GeometryError(
+            'the flange turns about one axis at most; turn it about two axes or '
+            'more, by 20 degrees or more'
+        )
 
 
 def turn_sizes(poses: Pose) -> Array:
@@ -166,8 +188,9 @@ def fit_hand_eye(
     linear = Linearization(data, state, free)
     unknowns = 6 * data.frames + linear.shared_columns.shape[-1]
     given = bool(np.isfinite(data.observations.sigma).all())
-    sigma = 1.0 if given else noise_sigma(
-        linear.sum_of_squares, int(linear.row_mask.sum()), unknowns)
+    sigma = (
+        1.0 if given else noise_sigma(linear.sum_of_squares, int(linear.row_mask.sum()), unknowns)
+    )
     robot = _Robot(flange, known, sigma)
     residual = robot.residual(start, state.pose)[known]
     noise = np.maximum(np.sqrt((residual.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2))), _MIN_NOISE)
@@ -181,8 +204,15 @@ def fit_hand_eye(
             break
     covariance = problem.covariance(state, start)
     return state, HandEye(
-        start.camera, start.target, start.scale, covariance, float(noise[0]), float(noise[1]),
-        _frame_numbers(data)[known], robot.residual(start, state.pose)[known])
+        start.camera,
+        start.target,
+        start.scale,
+        covariance,
+        float(noise[0]),
+        float(noise[1]),
+        _frame_numbers(data)[known],
+        robot.residual(start, state.pose)[known],
+    )
 
 
 def _check_noise(noise: Array, camera: Pose) -> None:
@@ -191,7 +221,8 @@ def _check_noise(noise: Array, camera: Pose) -> None:
         raise GeometryError(
             f'no hand-eye transform explains the poses of the robot: {1000 * noise[0]:.0f} mm and '
             f'{np.degrees(noise[1]):.1f} degrees are left; check that frames, units and the order '
-            'of the quaternion (x, y, z, w) belong together')
+            'of the quaternion (x, y, z, w) belong together'
+        )
 
 
 class _Robot(NamedTuple):
@@ -253,9 +284,12 @@ class _HandEyeAdjustment(Adjustment):
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         frame, shared = step
         mount, target, scale = np.split(shared[:, -PARAMETERS:], (6, 12), axis=1)
-        return (*super().retract(state[:5], (frame, shared[:, :-PARAMETERS])),
-                *Pose(*state[5:7]).retract(mount), *Pose(*state[7:9]).retract(target),
-                state[9] + scale)
+        return (
+            *super().retract(state[:5], (frame, shared[:, :-PARAMETERS])),
+            *Pose(*state[5:7]).retract(mount),
+            *Pose(*state[7:9]).retract(target),
+            state[9] + scale,
+        )
 
     def estimate_noise(self, state: RigState, transforms: Transforms) -> Array:
         """Return the noise (2,) of the robot, m and rad: of its residuals' own freedom."""
@@ -281,10 +315,13 @@ class _HandEyeAdjustment(Adjustment):
         information = arrow_information(normal)[0]
         scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
         own = information[-PARAMETERS:, -PARAMETERS:] / np.outer(
-            scale[-PARAMETERS:], scale[-PARAMETERS:])
+            scale[-PARAMETERS:], scale[-PARAMETERS:]
+        )
         if np.linalg.eigvalsh(own)[0] < _MIN_EIGENVALUE:
-            raise GeometryError('the poses of the robot do not determine the hand-eye transform; '
-                                'turn the flange about two axes or more, and move it')
+            raise GeometryError(
+                'the poses of the robot do not determine the hand-eye transform; '
+                'turn the flange about two axes or more, and move it'
+            )
         whole = arrow_covariance(normal).shared[0]
         return np.asarray(self._robot.sigma**2 * whole[-PARAMETERS:, -PARAMETERS:])
 
@@ -296,8 +333,9 @@ class _HandEyeAdjustment(Adjustment):
         cost, normal = self._system(state)
         blocks, cross, shared, block_gradient, shared_gradient = (part[0] for part in normal)
         off = self._robot.residual(transforms, state.pose) * self._weight
-        frame, own = (part * self._weight[:, None]
-                      for part in self._robot.columns(transforms, state.pose))
+        frame, own = (
+            part * self._weight[:, None] for part in self._robot.columns(transforms, state.pose)
+        )
         transposed = np.swapaxes(frame, -1, -2)
         added = ArrowEquations(
             blocks + transposed @ frame,

@@ -108,9 +108,7 @@ def _sum_points(local: Array, d: Array) -> tuple[Array, Array]:
     return form + mixed @ pull, pull
 
 
-def _best_turn(
-    candidates: Array, problem: _Problem, steps: int
-) -> tuple[Array, Array, Array]:
+def _best_turn(candidates: Array, problem: _Problem, steps: int) -> tuple[Array, Array, Array]:
     """Polish candidates (S, C, 3, 3) and return the best turn, its translation and its error.
 
     error (S,): mean squared sine between rays and landmarks; 1 for a landmark behind its ray.
@@ -167,7 +165,8 @@ def _algebraic_rotations(problem: _Problem) -> Array:
     m = np.stack([columns, -columns], axis=1)
     third = np.cross(m[..., 0], m[..., 1])
     return nearest_rotation(
-        np.where(flat[:, None], np.stack([m[..., 0], m[..., 1], third], axis=-1), m))
+        np.where(flat[:, None], np.stack([m[..., 0], m[..., 1], third], axis=-1), m)
+    )
 
 
 @cache

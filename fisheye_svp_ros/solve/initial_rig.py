@@ -33,10 +33,13 @@ def initial_state(data: RigViews, lens: Lens, others: Sequence[Lens] = ()) -> Ri
     of_target = terms[len(models[0].terms) :]
     if others:
         terms = (*_camera_terms(labels, models), *of_target)
-    bare = [replace(one, corrections={}, target={} if of_target else one.target)
-            for one in (lens, *others)]
-    state = RigState(identity(data.frames), identity(data.cameras), bare[0], terms,
-                     tuple(bare[1:]), labels)
+    bare = [
+        replace(one, corrections={}, target={} if of_target else one.target)
+        for one in (lens, *others)
+    ]
+    state = RigState(
+        identity(data.frames), identity(data.cameras), bare[0], terms, tuple(bare[1:]), labels
+    )
     solved = localize_cameras(state.model, data.views)
     rig = _rig(data, state.model, solved)
     return replace(state, rig=rig, pose=data.poses or _frame_poses(data, solved, rig))
@@ -71,8 +74,11 @@ def _camera_terms(labels: Sequence[str], models: Sequence[ForwardModel]) -> list
         effects = by_camera(i, label, (effect for effect, _ in model.terms))
         for effect, (_, values) in zip(effects, model.terms, strict=True):
             known = held.get(effect.name)
-            held[effect.name] = (effect, values) if known is None else (
-                known[0].merge_with(effect), np.concatenate([known[1], values]))
+            held[effect.name] = (
+                (effect, values)
+                if known is None
+                else (known[0].merge_with(effect), np.concatenate([known[1], values]))
+            )
     return list(held.values())
 
 

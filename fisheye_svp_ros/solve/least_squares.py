@@ -75,8 +75,11 @@ def levenberg_marquardt(
     active: Index = np.arange(systems)
     total, normal = problem.linearise(start, active)
     found = Minimum(
-        tuple(array.copy() for array in start), total, np.zeros(systems, dtype=np.bool_),
-        np.zeros(systems, dtype=np.int64), normal,
+        tuple(array.copy() for array in start),
+        total,
+        np.zeros(systems, dtype=np.bool_),
+        np.zeros(systems, dtype=np.int64),
+        normal,
     )
     damping, growth = np.full(systems, FIRST_DAMPING), np.full(systems, FIRST_GROWTH)
     moved_before = np.zeros(systems)
@@ -229,9 +232,9 @@ def arrow_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
         'svbk,svb->sk', eliminated[..., :-1], scaled.block_gradient
     )
     shared_step = -(_inverse(reduced) @ right[..., None])[..., 0]
-    block_step = -eliminated[..., -1] - (
-        eliminated[..., :-1] @ shared_step[:, None, :, None]
-    )[..., 0]
+    block_step = (
+        -eliminated[..., -1] - (eliminated[..., :-1] @ shared_step[:, None, :, None])[..., 0]
+    )
     block_step, shared_step = block_step / block_scale, shared_step / shared_scale
     return (block_step, shared_step), _squared_change(equations, block_step, shared_step)
 

@@ -136,14 +136,20 @@ def calibrate_hand_eye(
     try:
         state, hand_eye = fit_hand_eye(data, state, names, *flange_poses(data, poses))
     except GeometryError as cause:
-        raise ObservationError(f'{observations.source}: the given poses are not those of a flange '
-                               f'that carries the camera: {cause}') from cause
+        raise ObservationError(
+            f'{observations.source}: the given poses are not those of a flange '
+            f'that carries the camera: {cause}'
+        ) from cause
     linear = Linearization(data, state, names)
     # The covariances stay those of the images alone, which are no smaller.
     adjusted = adjusted._replace(lens=state.lens, pose=state.pose, residual=linear.residual_px)
     theta = _angles(adjusted, views)
-    block = {**(adjusted.lens.calibration or {}), 'rms_px': rms_px(adjusted.residual),
-             'hand_eye': hand_eye.to_dict(), 'reached_deg': float(np.degrees(theta.max()))}
+    block = {
+        **(adjusted.lens.calibration or {}),
+        'rms_px': rms_px(adjusted.residual),
+        'hand_eye': hand_eye.to_dict(),
+        'reached_deg': float(np.degrees(theta.max())),
+    }
     lens = replace(_with_field(adjusted, theta), calibration=block)
     found = found._replace(adjusted=adjusted._replace(lens=lens), reached=float(theta.max()))
     return found, hand_eye
@@ -207,12 +213,21 @@ def _start_lens(model: str, image_size: tuple[int, int], free: Sequence[str], na
     width, height = image_size
     if min(width, height) < 1:
         raise LensError(f'image size is {width}x{height}; both must be above 0')
-    shifts = (kind.neutral() for kind in VIEWPOINT_SHIFTS.values()
-              if set(kind.coefficient_names) & set(free))
+    shifts = (
+        kind.neutral()
+        for kind in VIEWPOINT_SHIFTS.values()
+        if set(kind.coefficient_names) & set(free)
+    )
     lens = Lens(
-        name=name, width=width, height=height,
-        fx=float(width), fy=float(width), cx=(width - 1) / 2, cy=(height - 1) / 2,
-        image_height=IMAGE_HEIGHTS[model](), max_incidence=1.0,
+        name=name,
+        width=width,
+        height=height,
+        fx=float(width),
+        fy=float(width),
+        cx=(width - 1) / 2,
+        cy=(height - 1) / 2,
+        image_height=IMAGE_HEIGHTS[model](),
+        max_incidence=1.0,
         viewpoint_shift=next(shifts, None),
     )
     return _with_corner(lens)
@@ -255,10 +270,10 @@ def _fit_lens(start: Lens, views: Views, names: tuple[str, ...]) -> AdjustedLens
         air, larger = adjusted.lens, start.port.magnification
         if larger > 1:
             # What a port does to the focal length is known, the rest of the curve is begun anew.
-            air = replace(air, fx=air.fx / larger, fy=air.fy / larger,
-                          image_height=start.image_height)
-        adjusted = _fit_port(
-            replace(air, port=start.port), few, views, (*svp_names, *port_names))
+            air = replace(
+                air, fx=air.fx / larger, fy=air.fy / larger, image_height=start.image_height
+            )
+        adjusted = _fit_port(replace(air, port=start.port), few, views, (*svp_names, *port_names))
     if shift is None:
         return adjusted
     lens = _with_corner(replace(adjusted.lens, viewpoint_shift=shift))

@@ -67,8 +67,9 @@ def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localiza
         if few.size:
             some = views.take(few)
             direction = model.back_project(some.uv).direction
-            _improve(model, views, found, few,
-                     candidate_poses(some.points, direction, some.weight))
+            _improve(
+                model, views, found, few, candidate_poses(some.points, direction, some.weight)
+            )
     return found
 
 

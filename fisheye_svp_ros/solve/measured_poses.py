@@ -143,7 +143,8 @@ def _check_inside(observations: Observations, lens: Lens) -> None:
     if outside.any(axis=1).mean() > _OUTSIDE_SHARE:
         raise ObservationError(
             f'{observations.source}: image points lie outside the {lens.width}x{lens.height} px '
-            f'of lens {lens.name!r}; check that it is the lens of this camera')
+            f'of lens {lens.name!r}; check that it is the lens of this camera'
+        )
 
 
 def poses_by_frame(

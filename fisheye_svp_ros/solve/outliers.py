@@ -21,8 +21,9 @@ _SUSPICIOUS_SIGMAS = 6.0  # below this no point is worth a robust fit
 SWAPPED_POINT = 'at the predicted place of another landmark'
 FAR_POINT = 'far from its prediction'
 VIEW = 'all points of the view are off: check their order'
-FRAME = ('its cameras contradict each other: check the order of points, the moment, and left and '
-         'right')
+FRAME = (
+    'its cameras contradict each other: check the order of points, the moment, and left and right'
+)
 _VIEW_RATIO, _MIN_VIEW_PX = 15.0, 3.0  # times the median view, px: it belongs elsewhere
 _FRAME_RATIO = 6.0  # times the median frame: cameras that contradict each other
 _MAX_INCONSISTENT_SHARE = 0.5  # of the views that another camera can contradict: a minority
@@ -43,8 +44,11 @@ class Outliers(NamedTuple):
 
     def join(self, other: Outliers) -> Outliers:
         """Return these and other rows."""
-        return Outliers(np.concatenate([self.rows, other.rows]),
-                     np.concatenate([self.px, other.px]), (*self.why, *other.why))
+        return Outliers(
+            np.concatenate([self.rows, other.rows]),
+            np.concatenate([self.px, other.px]),
+            (*self.why, *other.why),
+        )
 
     def append(self, rows: Index, px: Array, why: str) -> Outliers:
         """Return these and other rows, of one reason."""
@@ -79,9 +83,12 @@ def find_outliers(data: RigViews, state: RigState) -> tuple[RigViews, Outliers]:
     whole = whole & ~torn
     far, swapped = far & ~torn[:, None], swapped & ~torn[:, None]
     offset, outliers = offset * relative_sigma(views), NO_OUTLIERS
-    for mask, px, why in ((swapped, offset, SWAPPED_POINT), (far & ~swapped, offset, FAR_POINT),
-                          (views.used & whole[:, None], offset, VIEW),
-                          (views.used & torn[:, None], apart, FRAME)):
+    for mask, px, why in (
+        (swapped, offset, SWAPPED_POINT),
+        (far & ~swapped, offset, FAR_POINT),
+        (views.used & whole[:, None], offset, VIEW),
+        (views.used & torn[:, None], apart, FRAME),
+    ):
         outliers = outliers.append(views.row[mask], px[mask], why)
     return without_points(data, far | (views.used & (whole | torn)[:, None])), outliers
 
@@ -168,9 +175,7 @@ def without_points(data: RigViews, mask: Mask) -> RigViews:
     return replace(data, views=views).select(np.asarray(views.used.any(axis=1)))
 
 
-def _find_swaps(
-    model: ForwardModel, pose: Pose, views: Views, far: Mask, gate: float
-) -> Mask:
+def _find_swaps(model: ForwardModel, pose: Pose, views: Views, far: Mask, gate: float) -> Mask:
     """Which far points (S, N) lie where another landmark of the table is predicted.
 
     None where so many would by chance, as dense as landmarks are predicted around their own place.
@@ -182,9 +187,12 @@ def _find_swaps(
     swapped, by_chance = np.zeros_like(far), 0.0
     for view in np.flatnonzero(far.any(axis=1)):
         single = views.take(slice(view, view + 1))._replace(
-            points=points[None], board=np.zeros((1, len(ids)), dtype=np.int64),
-            landmark=ids[None], t=np.full((1, len(ids)), np.nan),
-            uv=np.zeros((1, len(ids), 2)), row=np.arange(len(ids))[None],
+            points=points[None],
+            board=np.zeros((1, len(ids)), dtype=np.int64),
+            landmark=ids[None],
+            t=np.full((1, len(ids)), np.nan),
+            uv=np.zeros((1, len(ids), 2)),
+            row=np.arange(len(ids))[None],
         )
         here = pose.take(slice(view, view + 1))
         seen = model.linearise(here, single).uv[0]
@@ -206,8 +214,10 @@ def relative_sigma(views: Views) -> Array:
 
 def robust_scale(offset: Array) -> Array:
     """Robust standard deviation of a coordinate, one a view (S, 1), from offsets (S, N)."""
-    median, typical = (np.nanmedian(np.minimum(offset, _UNSEEN_PX), axis=axis, keepdims=True)
-                       for axis in (1, None))
+    median, typical = (
+        np.nanmedian(np.minimum(offset, _UNSEEN_PX), axis=axis, keepdims=True)
+        for axis in (1, None)
+    )
     least = np.maximum(typical, _MIN_RESIDUAL_PX)
     return np.asarray(np.maximum(median, least) / _MEDIAN_NORM)
 

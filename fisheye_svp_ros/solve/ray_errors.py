@@ -31,8 +31,12 @@ class RayError(NamedTuple):
 
     def in_mrad(self) -> dict[str, float]:
         """Return the numbers by name, angles in mrad."""
-        return {'range_m': self.range_m, 'value': 1e3 * self.value, 'low': 1e3 * self.low,
-                'high': 1e3 * self.high}
+        return {
+            'range_m': self.range_m,
+            'value': 1e3 * self.value,
+            'low': 1e3 * self.low,
+            'high': 1e3 * self.high,
+        }
 
 
 class RayModel(NamedTuple):
@@ -67,9 +71,14 @@ class RayModel(NamedTuple):
         # The mean square over the points is a quadratic form of the parameters.
         form = np.swapaxes(columns, -1, -2) @ columns / points
         rms = np.sqrt(np.maximum((draws * (form @ draws)).sum(axis=1), 0.0))
-        return [RayError(range_m, float(np.sqrt((one**2).mean())),
-                         *np.quantile(one, (0.025, 0.975)).tolist())
-                for range_m, one in zip(self.ranges, rms, strict=True)]
+        return [
+            RayError(
+                range_m,
+                float(np.sqrt((one**2).mean())),
+                *np.quantile(one, (0.025, 0.975)).tolist(),
+            )
+            for range_m, one in zip(self.ranges, rms, strict=True)
+        ]
 
     def with_field(
         self, lens: Lens, uv: Array, bumps: Array, covariance: Array, cross: Array
@@ -82,13 +91,22 @@ class RayModel(NamedTuple):
         """
         steps = _STEP_PX * np.eye(2)
         # A field that moves an image point takes the ray from where it was.
-        slope = np.stack([(points_on_rays(lens, uv - step, self.ranges)
-                           - points_on_rays(lens, uv + step, self.ranges)) / (2 * _STEP_PX)
-                          for step in steps], axis=-1)
+        slope = np.stack(
+            [
+                (
+                    points_on_rays(lens, uv - step, self.ranges)
+                    - points_on_rays(lens, uv + step, self.ranges)
+                )
+                / (2 * _STEP_PX)
+                for step in steps
+            ],
+            axis=-1,
+        )
         moves = (slope[..., None, :] * bumps[:, None, :, None]).reshape(*self.points.shape, -1)
         columns = np.concatenate([self.columns, without_motion(self.points, moves)], axis=-1)
-        return self._replace(columns=columns, covariance=np.block(
-            [[self.covariance, cross], [cross.T, covariance]]))
+        return self._replace(
+            columns=columns, covariance=np.block([[self.covariance, cross], [cross.T, covariance]])
+        )
 
     def sample(self, at: int, seed: int = 0) -> Array:
         """Return errors (G, 3, samples), rad, at one of the ranges, drawn by the covariance."""
@@ -97,8 +115,9 @@ class RayModel(NamedTuple):
     def _draw_parameters(self, seed: int) -> Array:
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        return np.asarray(root @ np.random.default_rng(seed).standard_normal(
-            (len(root), _SAMPLES)))
+        return np.asarray(
+            root @ np.random.default_rng(seed).standard_normal((len(root), _SAMPLES))
+        )
 
 
 def typical_points(uv: Array) -> Array:
@@ -108,7 +127,9 @@ def typical_points(uv: Array) -> Array:
 
 
 def ray_model(
-    lens_of: Callable[[Array], Lens], covariance: Array, uv: Array,
+    lens_of: Callable[[Array], Lens],
+    covariance: Array,
+    uv: Array,
     ranges: tuple[float, ...] = RANGES,
 ) -> tuple[RayModel, Mask]:
     """Return how parameters move the rays of image points, and which points (G,) have rays.
@@ -130,8 +151,11 @@ def ray_model(
         there &= np.isfinite(one).all(axis=(0, 2)) & np.isfinite(other).all(axis=(0, 2))
         sides.append((one - other) / (2 * step[k]))
     points = base[:, there]
-    moves = np.stack([side[:, there] for side in sides], axis=-1) if sides else (
-        np.zeros((*points.shape, 0)))
+    moves = (
+        np.stack([side[:, there] for side in sides], axis=-1)
+        if sides
+        else (np.zeros((*points.shape, 0)))
+    )
     return RayModel(points, without_motion(points, moves), covariance, ranges), np.asarray(there)
 
 

@@ -53,7 +53,10 @@ class Examination(NamedTuple):
 
 
 def examine(
-    model: ForwardModel, views: Views, found: Localization, sigma_known: bool = True,
+    model: ForwardModel,
+    views: Views,
+    found: Localization,
+    sigma_known: bool = True,
     searched: bool = True,
 ) -> Examination:
     """Test the poses that `localize` found, and look for outliers where they fail.
@@ -77,15 +80,22 @@ def examine(
     sigma = noise_sigma(result.cost[some].sum(), int(rows), 6 * int(some.sum()))
     reasons = checked.reasons
     if sigma > _NOISIEST:
-        noisy = (f'the noise would be {sigma:.3g} px, more than any detector has: check lens, '
-                 'image size, landmarks and their unit')
+        noisy = (
+            f'the noise would be {sigma:.3g} px, more than any detector has: check lens, '
+            'image size, landmarks and their unit'
+        )
         reasons = tuple(_join_reasons(noisy, reason) for reason in reasons)
-    return Examination(result._replace(covariance=result.covariance * sigma**2), checked.gross,
-                    reasons, sigma)
+    return Examination(
+        result._replace(covariance=result.covariance * sigma**2), checked.gross, reasons, sigma
+    )
 
 
 def _examine(
-    model: ForwardModel, views: Views, found: Localization, sigma: float, tolerance: float,
+    model: ForwardModel,
+    views: Views,
+    found: Localization,
+    sigma: float,
+    tolerance: float,
     searched: bool = True,
 ) -> Examination:
     """Examine with a sigma in units of 1 / weight; tolerance: of the misfit, as a factor."""
@@ -99,8 +109,9 @@ def _examine(
     result = Localization.concatenate([found])  # a copy
     for i in np.flatnonzero(suspect):
         view = views.take([i])
-        other = (_consensus_pose(model, view, found.take([i]), sigma, tolerance) if searched
-                 else None)
+        other = (
+            _consensus_pose(model, view, found.take([i]), sigma, tolerance) if searched else None
+        )
         if other is not None:
             result.put([i], other)
             gross[i] = (view.weight[0] > 0) & np.isnan(other.residual[0, :, 0])
@@ -112,12 +123,16 @@ def _examine(
             result.covariance[i] *= excess
             reasons[i] = _join_reasons(
                 f'{misfit_reason(excess, int(freedom[i]))}; the covariance is scaled by it',
-                reasons[i])
+                reasons[i],
+            )
     return Examination(result, gross, tuple(reasons), None)
 
 
 def doubt_of_pairs(
-    models: tuple[ForwardModel, ForwardModel], rig: Pose, uv: tuple[Array, Array], landmark: Index,
+    models: tuple[ForwardModel, ForwardModel],
+    rig: Pose,
+    uv: tuple[Array, Array],
+    landmark: Index,
     sigma: float,
 ) -> str:
     """Say why stereo depth should not be relied on; '' for a reliable one.
@@ -128,8 +143,10 @@ def doubt_of_pairs(
     best = triangulate_optimally(*models, rig, *uv, sigma)
     behind = int((~best.valid).sum())
     if behind > (1 - _MIN_AGREEMENT) * len(landmark):
-        return (f'the rays of {behind} of {len(landmark)} landmarks do not meet in front of both '
-                'cameras: check left and right, rig and ids')
+        return (
+            f'the rays of {behind} of {len(landmark)} landmarks do not meet in front of both '
+            'cameras: check left and right, rig and ids'
+        )
     cost = np.square(np.stack([best.left_residual, best.right_residual])).sum(axis=(0, -1))
     cost, ids = cost[best.valid] / sigma**2, landmark[best.valid]
     gross = cost > _GROSS**2
@@ -196,8 +213,10 @@ def _suspect(views: Views, found: Localization, freedom: Array, allowed: float) 
     allowed: variance of a row.
     """
     with np.errstate(divide='ignore', invalid='ignore'):  # where no view has a pose
-        largest = np.fmax.reduce(np.where(
-            views.weight > 0, (found.residual**2).sum(axis=-1) * views.weight**2, 0.0), axis=1)
+        largest = np.fmax.reduce(
+            np.where(views.weight > 0, (found.residual**2).sum(axis=-1) * views.weight**2, 0.0),
+            axis=1,
+        )
         mean = found.cost / np.maximum(freedom, 1)
         stands_out = largest > 2 * _MAX_RESIDUAL_RATIO**2 * mean
         return np.asarray(misfit_fails(found.cost / allowed, freedom) | stands_out)
@@ -215,7 +234,8 @@ def _consensus(model: ForwardModel, view: Views, found: Localization, sigma: flo
     draws = np.random.default_rng(len(usable)).uniform(size=(many, len(usable)))
     subset = usable[np.argsort(draws, axis=1)[:, :size]]
     pose = initial_poses(
-        view.points[0, subset], rays.direction[0, subset], np.ones(subset.shape), not enough)
+        view.points[0, subset], rays.direction[0, subset], np.ones(subset.shape), not enough
+    )
     pose = Pose.concatenate([pose, found.pose])
     views = view.take(np.zeros(len(pose.position), dtype=int))
     off = _median(_lengths(model, pose, views), views)
@@ -257,7 +277,7 @@ def _noise_from_median(views: Views, found: Localization) -> Array:
 
 def _gross_reason(view: Views, gross: Mask, residual: Array) -> str:
     size = np.where(gross, np.nan_to_num(np.linalg.norm(residual, axis=-1), nan=np.inf), 0.0)
-    worst = np.argsort(-size, kind='stable')[:gross.sum()]
+    worst = np.argsort(-size, kind='stable')[: gross.sum()]
     if not len(worst):
         return ''
     return f'outliers rejected: {_landmark_names(view.landmark[0, worst], size[worst])}'
@@ -265,8 +285,10 @@ def _gross_reason(view: Views, gross: Mask, residual: Array) -> str:
 
 def _landmark_names(landmark: Index, size: Array) -> str:
     """Return landmarks by name, each with its residual, px; the first of many."""
-    names = ', '.join(f'{one} ({px:.3g} px)'
-                      for one, px in zip(landmark[:_MAX_NAMES], size[:_MAX_NAMES], strict=True))
+    names = ', '.join(
+        f'{one} ({px:.3g} px)'
+        for one, px in zip(landmark[:_MAX_NAMES], size[:_MAX_NAMES], strict=True)
+    )
     more = f' and {len(landmark) - _MAX_NAMES} more' if len(landmark) > _MAX_NAMES else ''
     return f'landmark{"s" if len(landmark) > 1 else ""} {names}{more}'
 

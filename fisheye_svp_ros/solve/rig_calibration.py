@@ -72,7 +72,8 @@ def place_boards(rows: Observations, lenses: Sequence[Lens]) -> PlacedBoards:
             f'{rows.source}: no relative pose of {" and ".join(rows.cameras)} explains most '
             'frames; give simultaneous photographs the same frame number, others different ones, '
             'and number points from the same end; if the cameras see boards of their own, '
-            f'{cause}') from cause
+            f'{cause}'
+        ) from cause
     return PlacedBoards(placed, data, state, boards)
 
 
@@ -93,25 +94,26 @@ def _boards_of_cameras(rows: Observations, lenses: Sequence[Lens]) -> tuple[int,
     board = np.arange(len(lenses))
     for one in range(len(lenses)):
         for other in range(one):
-            pair = select_shared(
-                select_cameras(rows, (rows.cameras[other], rows.cameras[one])))
+            pair = select_shared(select_cameras(rows, (rows.cameras[other], rows.cameras[one])))
             if len(pair.frames) >= _MIN_TIED_FRAMES and not is_unrelated(
-                    *_start_rig(pair, (lenses[other], lenses[one]))):
+                *_start_rig(pair, (lenses[other], lenses[one]))
+            ):
                 board[board == board[one]] = board[other]
     return tuple(np.unique(board, return_inverse=True)[1].tolist())
 
 
-def _board_poses(
-    rows: Observations, lenses: Sequence[Lens], boards: tuple[int, ...]
-) -> Pose:
+def _board_poses(rows: Observations, lenses: Sequence[Lens], boards: tuple[int, ...]) -> Pose:
     """Return the poses (B,) of the boards in the frame of the first; raise GeometryError."""
     views = []
     for board in range(max(boards) + 1):
         mine = [camera for camera, its in enumerate(boards) if its == board]
         own = select_cameras(rows, [rows.cameras[camera] for camera in mine])
         _, state = _start_rig(own, [lenses[camera] for camera in mine])
-        views.append(dict(zip(own.frames.tolist(), map(state.pose.take, range(len(own.frames))),
-                              strict=True)))
+        views.append(
+            dict(
+                zip(own.frames.tolist(), map(state.pose.take, range(len(own.frames))), strict=True)
+            )
+        )
     placed, left = identity(len(views)), set(range(1, len(views)))
     body = dict(views[0])
     while left:
@@ -119,8 +121,10 @@ def _board_poses(
         left.remove(board)
         shared = sorted(body.keys() & views[board].keys())
         _check_motion([body[frame] for frame in shared])
-        found = _solve_robustly(Pose.stack([views[board][frame] for frame in shared]),
-                                Pose.stack([body[frame] for frame in shared]))
+        found = _solve_robustly(
+            Pose.stack([views[board][frame] for frame in shared]),
+            Pose.stack([body[frame] for frame in shared]),
+        )
         placed.put(board, found.target)
         moved = found.flange(Pose.stack(list(views[board].values())))
         for number, frame in enumerate(views[board]):
@@ -135,8 +139,9 @@ def _check_motion(poses: Sequence[Pose]) -> None:
     sizes = turn_sizes(Pose.stack(poses)) / np.sqrt(len(poses))
     if sizes[1] < _MIN_TURN:
         motion = 'does not turn' if sizes[0] < _MIN_TURN else 'turns about one axis only'
-        raise GeometryError(f'the rig {motion}; turn it about two axes or more, by 20 degrees or '
-                            'more')
+        raise GeometryError(
+            f'the rig {motion}; turn it about two axes or more, by 20 degrees or more'
+        )
 
 
 def _solve_robustly(camera: Pose, flange: Pose) -> Transforms:
@@ -151,13 +156,15 @@ def _solve_robustly(camera: Pose, flange: Pose) -> Transforms:
     return found
 
 
-def _in_first_board(
-    rows: Observations, boards: tuple[int, ...], placed: Pose
-) -> Observations:
+def _in_first_board(rows: Observations, boards: tuple[int, ...], placed: Pose) -> Observations:
     """Return rows with their landmarks in the frame of the first board, numbered by board."""
     board = np.array(boards)[rows.camera]
-    return replace(rows, board=board, xyz=placed.take(board).transform(rows.xyz),
-                   landmark=rows.landmark + board * (int(rows.landmark.max()) + 1))
+    return replace(
+        rows,
+        board=board,
+        xyz=placed.take(board).transform(rows.xyz),
+        landmark=rows.landmark + board * (int(rows.landmark.max()) + 1),
+    )
 
 
 class RigCalibration(NamedTuple):
@@ -188,8 +195,10 @@ class RigCalibration(NamedTuple):
 
     def steps(self) -> tuple[Pose, ...]:
         """Return each camera in the next one (C - 1 poses), as rig files have them."""
-        return tuple(self.rig.take(i + 1).inverse().compose(self.rig.take(i))
-                     for i in range(len(self.cameras) - 1))
+        return tuple(
+            self.rig.take(i + 1).inverse().compose(self.rig.take(i))
+            for i in range(len(self.cameras) - 1)
+        )
 
 
 def connected_cameras(table: Observations) -> list[tuple[str, ...]]:
@@ -247,14 +256,21 @@ def calibrate_rig(
     covariance = rig_covariance(linear, sigma or 1.0, information)
     squares = (linear.residual_px**2).sum(axis=-1)
     return RigCalibration(
-        tuple(order[i] for i in place), state.rig.take(place),
-        covariance[[i - 1 for i in place[1:]]], rows.frames, state.pose,
+        tuple(order[i] for i in place),
+        state.rig.take(place),
+        covariance[[i - 1 for i in place[1:]]],
+        rows.frames,
+        state.pose,
         np.array([np.sqrt(np.nanmean(squares[data.camera_of == i])) for i in place]),
-        float(np.sqrt(np.nanmean(squares))), sigma,
-        np.bincount(data.camera_of, minlength=len(order))[place], torn,
+        float(np.sqrt(np.nanmean(squares))),
+        sigma,
+        np.bincount(data.camera_of, minlength=len(order))[place],
+        torn,
         misfit_reason(squared / freedom, freedom) if fails else '',
-        tuple(replace(lens, max_incidence=min(lens.max_incidence, monotone_limit(lens)))
-              for lens in (state.lenses[i] for i in place)),  # as far as their curves still allow
+        tuple(
+            replace(lens, max_incidence=min(lens.max_incidence, monotone_limit(lens)))
+            for lens in (state.lenses[i] for i in place)
+        ),  # as far as their curves still allow
         tuple(placed.boards[i] for i in place if placed.boards),
     )
 
@@ -263,8 +279,11 @@ def _without_outliers(placed: PlacedBoards) -> tuple[Observations, tuple[int, ..
     """Return the rows without outliers, and the frames that no rig explains."""
     rows = placed.rows
     _, found = find_outliers(placed.data, placed.state)
-    torn = {int(rows.frame[row]) for row, why in zip(found.rows, found.why, strict=True)
-            if why == FRAME}
+    torn = {
+        int(rows.frame[row])
+        for row, why in zip(found.rows, found.why, strict=True)
+        if why == FRAME
+    }
     kept = ~np.isin(np.arange(len(rows)), found.rows) & ~np.isin(rows.frame, sorted(torn))
     return select_shared(rows.take(kept)), tuple(sorted(torn))
 
@@ -275,8 +294,15 @@ def _fit_rig(
     """Return rig, boards of the cameras' own and poses of the frames, fitted, the lenses known."""
     data, start = _start_rig(rows, lenses)
     rig = Pose.concatenate([start.rig, identity(max(boards, default=0))])
-    state = replace(start, rig=rig, lens=lenses[0], others=tuple(lenses[1:]), terms=(),
-                    corrected=True, boards=boards)
+    state = replace(
+        start,
+        rig=rig,
+        lens=lenses[0],
+        others=tuple(lenses[1:]),
+        terms=(),
+        corrected=True,
+        boards=boards,
+    )
     return data, adjust(data, state, ())
 
 
@@ -294,6 +320,7 @@ def _stated_errors(
         if 'covariance' in stated and 'stderr' in stated:
             free += [f'{name}.{parameter}' for parameter in stated['stderr']]
             mean += parameter_values(lens, list(stated['stderr']))
-            parts.append(np.linalg.pinv(np.array(stated['covariance'], dtype=float),
-                                        hermitian=True))
+            parts.append(
+                np.linalg.pinv(np.array(stated['covariance'], dtype=float), hermitian=True)
+            )
     return free, np.array(mean), block_diag(*parts)

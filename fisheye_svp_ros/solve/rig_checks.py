@@ -56,8 +56,9 @@ def rig_differs(test: RigViews, state: RigState) -> bool:
     if has_no_rig(test):
         return False
     alone = unpair_cameras(test)
-    together, own = (rms_px(Linearization(data, localize_frames(data, state), ()))
-                     for data in (test, alone))
+    together, own = (
+        rms_px(Linearization(data, localize_frames(data, state), ())) for data in (test, alone)
+    )
     return together > MAX_RIG_RATIO * own
 
 

@@ -53,32 +53,52 @@ def localize_rig(
     """
     missing = [name for name in table.cameras if name not in cameras]
     if missing:
-        raise ObservationError(f'{table.source}: camera {missing[0] or "without a name"} is not '
-                               f'in the rig, which has {", ".join(cameras)}')
+        raise ObservationError(
+            f'{table.source}: camera {missing[0] or "without a name"} is not '
+            f'in the rig, which has {", ".join(cameras)}'
+        )
     rows, left_out = posable_observations(table, lenses)
     present = [name for name in cameras if name in np.array(rows.cameras)[rows.camera]]
     rows = select_cameras(rows, present)
     own = [lenses[name] for name in present]
     data, place = group_by_frame(rows), rig.take([list(cameras).index(name) for name in present])
-    state = RigState(identity(data.frames), place, own[0], (), tuple(own[1:]), tuple(present),
-                     corrected=True)
+    state = RigState(
+        identity(data.frames), place, own[0], (), tuple(own[1:]), tuple(present), corrected=True
+    )
     if is_unrelated(data, state):
         raise GeometryError(
             f'{table.source}: no pose of the rig explains what its cameras see at the same time: '
             'they see boards of their own, or the rig is of other cameras; localize each camera '
-            'by itself, or calibrate the rig again')
+            'by itself, or calibrate the rig again'
+        )
     data, outliers = find_outliers(data, state)
     state = localize_frames(data, state)
     linear = Linearization(data, state, ())
     information = np.swapaxes(linear.frame_columns, -1, -2) @ linear.frame_columns
-    if not np.isfinite(linear.residual).all() or (
-            np.linalg.eigvalsh(information)[:, 0] <= 0).any():
-        raise GeometryError(f'{table.source}: the rig does not determine the pose of a frame; '
-                            'check that lenses, rig and observations belong together, and that '
-                            'all cameras see one target')
-    sigma = None if sigma_known(rows) else noise_sigma(
-        linear.sum_of_squares, int(linear.row_mask.sum()), 6 * data.frames)
+    if (
+        not np.isfinite(linear.residual).all()
+        or (np.linalg.eigvalsh(information)[:, 0] <= 0).any()
+    ):
+        raise GeometryError(
+            f'{table.source}: the rig does not determine the pose of a frame; '
+            'check that lenses, rig and observations belong together, and that '
+            'all cameras see one target'
+        )
+    sigma = (
+        None
+        if sigma_known(rows)
+        else noise_sigma(linear.sum_of_squares, int(linear.row_mask.sum()), 6 * data.frames)
+    )
     covariance = np.asarray((sigma or 1.0) ** 2 * np.linalg.inv(information))
     return RigLocalization(
-        rows, outliers, np.unique(data.views.frame), state.pose, covariance, data,
-        linear.residual_px, sigma, left_out, rig_differs(data, state))
+        rows,
+        outliers,
+        np.unique(data.views.frame),
+        state.pose,
+        covariance,
+        data,
+        linear.residual_px,
+        sigma,
+        left_out,
+        rig_differs(data, state),
+    )

@@ -68,14 +68,15 @@ class RigViews:
         frames, frame_of = np.unique(self.frame_of[kept], return_inverse=True)
         poses = None if self.poses is None else self.poses.take(frames)
         return replace(
-            self, views=self.views.take(kept), frame_of=frame_of.reshape(-1),
-            camera_of=self.camera_of[kept], poses=poses,
+            self,
+            views=self.views.take(kept),
+            frame_of=frame_of.reshape(-1),
+            camera_of=self.camera_of[kept],
+            poses=poses,
         )
 
 
-def group_by_frame(
-    observations: Observations, poses: dict[int, Pose] | None = None
-) -> RigViews:
+def group_by_frame(observations: Observations, poses: dict[int, Pose] | None = None) -> RigViews:
     """Group a table by frame and camera; sigma is 1 px where the table does not say.
 
     poses: true poses by frame number; they are kept fixed in adjustments.
@@ -131,15 +132,19 @@ class RigState:
     def lens_names(self, free: Sequence[str]) -> list[list[str]]:
         """Return which of some parameters each lens has, by their names there."""
         heads = [f'{label}.' if label else '' for label in self.labels]
-        return [[name.removeprefix(head) for name in free if name.startswith(head)]
-                for head in heads]
+        return [
+            [name.removeprefix(head) for name in free if name.startswith(head)] for head in heads
+        ]
 
     def shared_values(self, free: Sequence[str]) -> Array:
         """Return free intrinsics and the values of the effects that move image points, (K,)."""
-        lens = [parameter_values(one, names)
-                for one, names in zip(self.lenses, self.lens_names(free), strict=True)]
-        return np.concatenate([*map(np.array, lens), *(values for effect, values in self.terms
-                                                       if is_shared(effect))])
+        lens = [
+            parameter_values(one, names)
+            for one, names in zip(self.lenses, self.lens_names(free), strict=True)
+        ]
+        return np.concatenate(
+            [*map(np.array, lens), *(values for effect, values in self.terms if is_shared(effect))]
+        )
 
     def with_shared_values(self, free: Sequence[str], values: Array) -> RigState:
         """Return the state with other free intrinsics and values of effects, (K,)."""
@@ -151,8 +156,7 @@ class RigState:
             if is_shared(effect):
                 known, values = values[: len(known)], values[len(known) :]
             terms.append((effect, known))
-        return replace(self, lens=lenses[0], others=tuple(lenses[1:]),
-                       terms=tuple(terms))
+        return replace(self, lens=lenses[0], others=tuple(lenses[1:]), terms=tuple(terms))
 
     def retract(
         self, free: Sequence[str], frame: Array, shared: Array, part: float = 1.0
@@ -225,7 +229,8 @@ class Linearization:
         shared.append(self._lens_columns())
         shared += [
             self.model.effect_columns(effect, self.scene, self.linear)
-            for effect, _ in self.state.terms if is_shared(effect)
+            for effect, _ in self.state.terms
+            if is_shared(effect)
         ]
         return self.whiten(np.concatenate(shared, axis=-1))
 
@@ -285,7 +290,8 @@ class Linearization:
         board = np.array(self.state.boards)[self.data.camera_of]
         arm = self._camera.position - self.state.board_poses(self.data).position
         columns = np.concatenate(
-            [-d_place, d_place @ cross_matrix(arm)[:, None] - d_turn], axis=-1)
+            [-d_place, d_place @ cross_matrix(arm)[:, None] - d_turn], axis=-1
+        )
         return _place_columns(columns, board, max(self.state.boards) + 1)
 
     def _lens_columns(self) -> Array:
@@ -315,7 +321,8 @@ def free_parameters(lenses: Mapping[str, Lens], free: bool | None = None) -> tup
     free: of all lenses or of none; None asks each lens whether a calibration made it.
     """
     return tuple(
-        f'{camera}.{name}' if camera else name for camera, lens in lenses.items()
+        f'{camera}.{name}' if camera else name
+        for camera, lens in lenses.items()
         if (lens.calibration is not None if free is None else free)
         for name in intrinsic_names(lens)
     )

@@ -72,10 +72,15 @@ def calibrate_stereo(
     shape = (*pose.shape, -1, 2)
     covariance.shared[lost] = covariance.blocks[lost] = np.nan
     return StereoCalibration(
-        rig, covariance.shared, pose, covariance.blocks,
+        rig,
+        covariance.shared,
+        pose,
+        covariance.blocks,
         residuals(left, _left_pose(pose, rig).reshape(-1), left_views).reshape(shape),
         residuals(right, pose.reshape(-1), right_views).reshape(shape),
-        solved.cost, solved.converged, solved.iterations,
+        solved.cost,
+        solved.converged,
+        solved.iterations,
     )
 
 
@@ -86,7 +91,8 @@ def _solve_rigs(
     quick = None
     if left.is_lens_only and right.is_lens_only:
         quick = engines.adjust_rigs(
-            (left.lens, right.lens), (views[0].solver_inputs, views[1].solver_inputs), start)
+            (left.lens, right.lens), (views[0].solver_inputs, views[1].solver_inputs), start
+        )
     if quick is None:
         return levenberg_marquardt(_Rigs(models, views, len(start[-1])), start)
     everyone = np.ones(len(start[-1]), dtype=bool)

@@ -62,8 +62,12 @@ class OptimalPoints(NamedTuple):
 
 
 def epipolar_curves(
-    left: ForwardModel, right: ForwardModel, rig: Pose, uv_right: Array,
-    count: int = 200, nearest: float = 0.05,
+    left: ForwardModel,
+    right: ForwardModel,
+    rig: Pose,
+    uv_right: Array,
+    count: int = 200,
+    nearest: float = 0.05,
 ) -> Array:
     """Return the epipolar curves (..., count, 2), px, in the left image of right image points.
 
@@ -133,7 +137,11 @@ def triangulate(
 
 
 def triangulate_optimally(
-    left: ForwardModel, right: ForwardModel, rig: Pose, uv_left: Array, uv_right: Array,
+    left: ForwardModel,
+    right: ForwardModel,
+    rig: Pose,
+    uv_left: Array,
+    uv_right: Array,
     sigma: float = 1.0,
 ) -> OptimalPoints:
     """Return the points of least reprojection error in both images, from those of `triangulate`.
@@ -159,8 +167,10 @@ def triangulate_optimally(
         return scatter(valid.reshape(pairs.shape), field[fixed])
 
     return OptimalPoints(
-        place_valid(solved.state[0]), place_valid(np.asarray(np.linalg.inv(hessian), dtype=float)),
-        place_valid(solved_pairs.left - uv[:, 0]), place_valid(solved_pairs.right - uv[:, 1]),
+        place_valid(solved.state[0]),
+        place_valid(np.asarray(np.linalg.inv(hessian), dtype=float)),
+        place_valid(solved_pairs.left - uv[:, 0]),
+        place_valid(solved_pairs.right - uv[:, 1]),
         valid.reshape(pairs.shape),
     )
 

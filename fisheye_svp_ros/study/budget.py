@@ -91,8 +91,10 @@ def widest_spread(lens: Lens) -> float:
         return float(lens.max_incidence - _EDGE)
     turn = np.linspace(0, 2 * np.pi, 17)[:-1, None]
     height, _ = lens.image_height.value_and_slope(np.linspace(0, lens.max_incidence, 181))
-    uv = np.stack([lens.cx + lens.fx * height * np.cos(turn),
-                   lens.cy + lens.fy * height * np.sin(turn)], axis=-1)
+    uv = np.stack(
+        [lens.cx + lens.fx * height * np.cos(turn), lens.cy + lens.fy * height * np.sin(turn)],
+        axis=-1,
+    )
     seen = np.arccos(back_project(lens, uv).direction[..., 2])
     return float(np.nanmax(seen, axis=1).min() - _EDGE)
 
@@ -121,14 +123,18 @@ def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
     """
     lens = setup.lens
     if lens.is_svp:
-        raise LensError(f'lens {lens.name!r} has no viewpoint_shift: SVP is exact for it; '
-                        'whether the camera has one is found by `fisheye-svp diagnose`')
+        raise LensError(
+            f'lens {lens.name!r} has no viewpoint_shift: SVP is exact for it; '
+            'whether the camera has one is found by `fisheye-svp diagnose`'
+        )
     if not (np.isfinite(setup.noise) and setup.noise > 0):
         raise ParameterError(f'noise is {setup.noise} px; it must be above 0')
     baseline = float(np.linalg.norm(setup.rig.position))
     if not _BASELINES[0] <= baseline <= _BASELINES[1]:
-        raise ParameterError(f'baseline is {baseline:.4g} m; a budget covers {_BASELINES[0]:g} to '
-                             f'{_BASELINES[1]:g} m')
+        raise ParameterError(
+            f'baseline is {baseline:.4g} m; a budget covers {_BASELINES[0]:g} to '
+            f'{_BASELINES[1]:g} m'
+        )
     angle = np.linspace(_MIN_SPREAD, widest_spread(lens), spreads)
     distance = np.geomspace(nearest_range(lens), _FARTHEST, ranges)
     points = distance[:, None, None] * _caps(angle)[:, None]
@@ -139,8 +145,10 @@ def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
         {name: row[i].reshape(shape) for name, row in zip(QUANTITIES, rows, strict=True)}
         for i in range(2)
     )
-    own = {part: {name: values.reshape(shape) for name, values in by.items()}
-           for part, by in _own_errors(setup, flat).items()}
+    own = {
+        part: {name: values.reshape(shape) for name, values in by.items()}
+        for part, by in _own_errors(setup, flat).items()
+    }
     return Budget(angle, distance, error, noise, own)
 
 
@@ -169,18 +177,30 @@ def at_point(
         by_range = _interpolate_rows(budget.spreads, excess, spread)
         by_spread = _interpolate_rows(np.log(budget.ranges), excess.T, np.log(working_range))
         here = np.interp(np.log(working_range), np.log(budget.ranges), by_range)
-        own = [budget.own.get(part, {}).get(quantity, np.full_like(noise, np.nan))
-               for part in _LENS_PARTS]
+        own = [
+            budget.own.get(part, {}).get(quantity, np.full_like(noise, np.nan))
+            for part in _LENS_PARTS
+        ]
         caused, noisy, most, parameters, misfit = (
-            _value(budget, table, spread, working_range)
-            for table in (error, noise, allowed, *own))
+            _value(budget, table, spread, working_range) for table in (error, noise, allowed, *own)
+        )
         logs = np.log(budget.ranges)
-        found.append(Point(
-            quantity, caused, noisy, most, None if np.isnan(here) else bool(here <= 0),
-            # From which range on the limit is kept, and up to which spread
-            float(np.exp(_last_crossing(logs, by_range, ~(by_range <= 0), logs[0], np.nan))),
-            _last_crossing(budget.spreads, by_spread, by_spread <= 0, np.nan, budget.spreads[-1]),
-            parameters, misfit))
+        found.append(
+            Point(
+                quantity,
+                caused,
+                noisy,
+                most,
+                None if np.isnan(here) else bool(here <= 0),
+                # From which range on the limit is kept, and up to which spread
+                float(np.exp(_last_crossing(logs, by_range, ~(by_range <= 0), logs[0], np.nan))),
+                _last_crossing(
+                    budget.spreads, by_spread, by_spread <= 0, np.nan, budget.spreads[-1]
+                ),
+                parameters,
+                misfit,
+            )
+        )
     return found
 
 
@@ -233,12 +253,15 @@ def _own_errors(setup: Setup, points: Array) -> dict[str, dict[str, Array]]:
     left = lens.predict(setup.rig.broadcast_to(len(some)), views_of(some)).uv
     both: Mask = np.asarray(np.isfinite(left).all(axis=-1))
     depth = depth_errors(errors, errors, setup.rig, some[both])
-    poses = [errors.of_poses(views_of(caps), identity(len(caps)))
-             for caps in np.array_split(points, -(-len(points) // _CAPS_PER_BLOCK))]
+    poses = [
+        errors.of_poses(views_of(caps), identity(len(caps)))
+        for caps in np.array_split(points, -(-len(points) // _CAPS_PER_BLOCK))
+    ]
     found = {}
     for part in _LENS_PARTS:
-        variance = np.concatenate([
-            np.diagonal(getattr(one, part), axis1=-2, axis2=-1) for one in poses])
+        variance = np.concatenate(
+            [np.diagonal(getattr(one, part), axis1=-2, axis2=-1) for one in poses]
+        )
         far = np.sqrt(np.trace(getattr(depth, part), axis1=-2, axis2=-1))
         found[part] = {
             'position': np.sqrt(variance[:, :3].sum(axis=-1)),
@@ -281,7 +304,7 @@ def _last_crossing(places: Array, excess: Array, side: Mask, none: float, all_: 
     i = int(rows[-1]) if rows.size else -1
     if i in (-1, len(places) - 1):
         return float(none if i < 0 else all_)
-    one, two = excess[i:i + 2]
+    one, two = excess[i : i + 2]
     if not np.isfinite(one - two):
         return float(places[i + 1] if two <= 0 else places[i])
     return float(places[i] + one / (one - two) * (places[i + 1] - places[i]))

@@ -52,8 +52,11 @@ class ResidualRatio(NamedTuple):
 
 def swept_parameters(table: SweptTable) -> list[str]:
     """Return the parameters that differ between rows, but for those that only redraw noise."""
-    return [name for name in SCALARS
-            if name in table and name not in _REPEATS and len(set(table[name])) > 1]
+    return [
+        name
+        for name in SCALARS
+        if name in table and name not in _REPEATS and len(set(table[name])) > 1
+    ]
 
 
 def is_number(table: SweptTable, name: str) -> bool:
@@ -68,15 +71,18 @@ def curves(table: SweptTable, metric: str, x: str, by: Sequence[str]) -> list[Cu
     for name in by:
         groups = {
             (*key, value): np.intersect1d(rows, mine)
-            for key, rows in groups.items() for value, mine in _slots(table, name).items()
+            for key, rows in groups.items()
+            for value, mine in _slots(table, name).items()
         }
     found = []
     for key, rows in groups.items():
         cells = [values[np.intersect1d(rows, place)] for place in places.values()]
-        low, middle, high = np.array([
-            np.percentile(cell, (_BAND[0], 50.0, _BAND[1])) if len(cell) else [np.nan] * 3
-            for cell in (cell[np.isfinite(cell)] for cell in cells)
-        ]).T
+        low, middle, high = np.array(
+            [
+                np.percentile(cell, (_BAND[0], 50.0, _BAND[1])) if len(cell) else [np.nan] * 3
+                for cell in (cell[np.isfinite(cell)] for cell in cells)
+            ]
+        ).T
         found.append(Curve(key, list(places), middle, low, high))
     return found
 

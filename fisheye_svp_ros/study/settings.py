@@ -13,12 +13,16 @@ class Settings:
     """Parameters that every node has."""
 
     wait_for_subscribers: int = parameter(
-        0, 'Publish nothing before this number of subscribers listens to the image points (true '
-        'poses, if a camera publishes images) or, of a solver, the results', span=(0, 1000)
+        0,
+        'Publish nothing before this number of subscribers listens to the image points (true '
+        'poses, if a camera publishes images) or, of a solver, the results',
+        span=(0, 1000),
     )
     folder: str = parameter(
-        '', 'Folder of the files that `scenario` or a new parameter value may name while the node '
-        'runs; empty: no files, only names in config/', fixed=True
+        '',
+        'Folder of the files that `scenario` or a new parameter value may name while the node '
+        'runs; empty: no files, only names in config/',
+        fixed=True,
     )
 
 
@@ -29,18 +33,23 @@ class CameraSettings(Settings):
     rate: float = parameter(10.0, 'Sets per second', 'Hz', (1e-3, 1e4))
     repeat: bool = parameter(True, 'Start again after the last set; otherwise the node ends')
     lock_step: str = parameter(
-        '', 'Result topics, separated by blanks: each set waits, in place of `rate`, until all '
-        'have answered the previous one. Empty: do not wait'
+        '',
+        'Result topics, separated by blanks: each set waits, in place of `rate`, until all '
+        'have answered the previous one. Empty: do not wait',
     )
     world_frame: str = parameter('world', 'Frame id of the world', fixed=True, frame=True)
     camera_frame: str = parameter(
-        '', 'Frame id of the camera; in a rig with the prefix left_ or right_. Empty: '
+        '',
+        'Frame id of the camera; in a rig with the prefix left_ or right_. Empty: '
         'camera_optical_frame; in the namespace front, front_camera_optical_frame',
-        fixed=True, frame=True
+        fixed=True,
+        frame=True,
     )
     publish_tf: bool = parameter(
-        False, 'Publish the true pose on tf2, from `world_frame` to the frame of the camera with '
-        'the suffix _true', fixed=True
+        False,
+        'Publish the true pose on tf2, from `world_frame` to the frame of the camera with '
+        'the suffix _true',
+        fixed=True,
     )
 
 
@@ -54,36 +63,45 @@ class SolverSettings(Settings):
     """Parameters of every node that solves."""
 
     lens: str = parameter(
-        '', 'Lens to solve with: a file, or a name in config/lenses (a rig takes the first two '
+        '',
+        'Lens to solve with: a file, or a name in config/lenses (a rig takes the first two '
         'cameras of a file or folder); `camera_info`: from that topic; empty: from '
-        '`scenario`', file=True
+        '`scenario`',
+        file=True,
     )
     svp: str = parameter(
-        'auto', 'Solve with the single-viewpoint approximation of the lens; auto: true for a lens '
+        'auto',
+        'Solve with the single-viewpoint approximation of the lens; auto: true for a lens '
         'from `scenario`, false for a lens named by the parameter `lens`',
-        choices=('auto', 'true', 'false')
+        choices=('auto', 'true', 'false'),
     )
     sigma_px: float = parameter(
         1.0, 'Standard deviation of an image point, for the covariance', 'px', (1e-6, 1e3)
     )
     # Fast DDS tells every 3 s what it has sent, and what was lost last comes after that.
     patience: float = parameter(
-        4.0, 'Longest time that image points wait for messages of their stamp on other '
-        'topics', 's',
-        (0.0, 3600.0)
+        4.0,
+        'Longest time that image points wait for messages of their stamp on other topics',
+        's',
+        (0.0, 3600.0),
     )
     true_pose_gap: float = parameter(
-        0.1, 'Largest time between two true poses that are interpolated for a set between them; '
-        '0: use only a true pose with the stamp of the set', 's', (0.0, 60.0)
+        0.1,
+        'Largest time between two true poses that are interpolated for a set between them; '
+        '0: use only a true pose with the stamp of the set',
+        's',
+        (0.0, 60.0),
     )
     backlog: int = parameter(
-        100, 'Largest number of sets that wait to be solved; beyond it the oldest are dropped and '
+        100,
+        'Largest number of sets that wait to be solved; beyond it the oldest are dropped and '
         'counted',
-        span=(1, 10_000)
+        span=(1, 10_000),
     )
     lifecycle: bool = parameter(
-        False, 'Run as a managed node: `configure` loads the lens, `activate` '
-        'subscribes', fixed=True
+        False,
+        'Run as a managed node: `configure` loads the lens, `activate` subscribes',
+        fixed=True,
     )
 
     @property
@@ -105,8 +123,11 @@ class RigSettings(SolverSettings):
         False, 'Also pair image points of the two cameras whose stamps differ'
     )
     approximate_sync_tolerance_seconds: float = parameter(
-        0.005, 'With approximate_sync, the largest difference; choose less than half the time '
-        'between two images', 's', (0.0, 10.0)
+        0.005,
+        'With approximate_sync, the largest difference; choose less than half the time '
+        'between two images',
+        's',
+        (0.0, 10.0),
     )
 
     @property
@@ -120,16 +141,21 @@ class LocalizerSettings(SolverSettings):
     """Parameters of the localizer."""
 
     publish_tf: bool = parameter(
-        False, 'Publish the estimated pose on tf2, from the frame of the landmarks to that of the '
-        'camera; only if no other node publishes the latter', fixed=True
+        False,
+        'Publish the estimated pose on tf2, from the frame of the landmarks to that of the '
+        'camera; only if no other node publishes the latter',
+        fixed=True,
     )
     camera_frame: str = parameter(
-        '', 'Frame id of the estimated camera; empty: that of the image points', fixed=True,
-        frame=True
+        '',
+        'Frame id of the estimated camera; empty: that of the image points',
+        fixed=True,
+        frame=True,
     )
     model_error: bool = parameter(
-        False, 'Include the errors of the lens in the covariance of the pose, besides `sigma_px`; '
-        'the lens file must hold `uncertainty`, as `diagnose` writes it'
+        False,
+        'Include the errors of the lens in the covariance of the pose, besides `sigma_px`; '
+        'the lens file must hold `uncertainty`, as `diagnose` writes it',
     )
 
 
@@ -138,14 +164,17 @@ class StereoCalibratorSettings(RigSettings):
     """Parameters of the stereo calibrator."""
 
     publish_tf: bool = parameter(
-        False, 'Publish the rig on tf2 (static), from the frame of the right camera to that of '
-        'the left one', fixed=True
+        False,
+        'Publish the rig on tf2 (static), from the frame of the right camera to that of '
+        'the left one',
+        fixed=True,
     )
 
     views: int = parameter(
-        10, 'Calibrate from this number of the latest sets of a scenario, or from fewer if there '
+        10,
+        'Calibrate from this number of the latest sets of a scenario, or from fewer if there '
         'are no more',
-        span=(1, 1000)
+        span=(1, 1000),
     )
 
 
@@ -154,11 +183,14 @@ class StereoDepthSettings(RigSettings):
     """Parameters of stereo depth."""
 
     rig: str = parameter(
-        'true', 'Rig to measure with: `true`: the true one; `topic`: the latest on the topic '
+        'true',
+        'Rig to measure with: `true`: the true one; `topic`: the latest on the topic '
         '`rig` (stereo calibrator); or a file of `calibrate`, Kalibr, Basalt, OpenCV, or '
-        'a URDF', file=True
+        'a URDF',
+        file=True,
     )
     optimal: bool = parameter(
-        False, 'Find the point of least reprojection error instead of the one halfway between the '
-        'two rays'
+        False,
+        'Find the point of least reprojection error instead of the one halfway between the '
+        'two rays',
     )

@@ -31,12 +31,24 @@ _NO_PAIR = 'image_points: no landmark is in both images'
 Metrics = dict[str, Array]
 
 _FIT_METRICS = ('points', 'rms_px', 'mean_residual_px')
-_POSE = ('position_error_m', 'position_error_x_m', 'position_error_y_m', 'position_error_z_m',
-         'rotation_error_rad', 'axis_error_rad')
+_POSE = (
+    'position_error_m',
+    'position_error_x_m',
+    'position_error_y_m',
+    'position_error_z_m',
+    'rotation_error_rad',
+    'axis_error_rad',
+)
 LOCALIZATION_METRICS = (*_FIT_METRICS, *_POSE)
 STEREO_CALIBRATION_METRICS = ('views', *_FIT_METRICS, *_POSE)
-STEREO_DEPTH_METRICS = ('points', 'error2_px', 'error2_vertical_px', 'error2_max_px', 'error3_m',
-                        'error3_max_m')
+STEREO_DEPTH_METRICS = (
+    'points',
+    'error2_px',
+    'error2_vertical_px',
+    'error2_max_px',
+    'error3_m',
+    'error3_max_m',
+)
 
 
 class Measurement(NamedTuple):
@@ -73,8 +85,12 @@ class SetSolutions(NamedTuple, Generic[T]):
 
 
 def localize_sets(
-    model: ForwardModel, views: Views, true: Pose | None = None, start: Pose | None = None,
-    examined: bool = False, searched: bool = True,
+    model: ForwardModel,
+    views: Views,
+    true: Pose | None = None,
+    start: Pose | None = None,
+    examined: bool = False,
+    searched: bool = True,
 ) -> SetSolutions[Localization]:
     """Localize the camera of every view (S,); true, start: poses (S,) where they are known.
 
@@ -111,14 +127,19 @@ def solve_rigs(
     freedom = 2 * sum(points) - 6 * (found.pose.shape[1] + 1)
     reasons = tuple(
         misfit_reason(float(cost) / max(int(free), 1), int(free)) if fails else ''
-        for cost, free, fails in
-        zip(found.cost, freedom, misfit_fails(found.cost, freedom), strict=True)
+        for cost, free, fails in zip(
+            found.cost, freedom, misfit_fails(found.cost, freedom), strict=True
+        )
     )
     return SetSolutions(found, metrics, found.converged, _NO_RIG, reasons)
 
 
 def measure_points(
-    models: Pair, rig: Pose, uv_left: Array, uv_right: Array, true: Array | None = None,
+    models: Pair,
+    rig: Pose,
+    uv_left: Array,
+    uv_right: Array,
+    true: Array | None = None,
     optimal: bool = False,
 ) -> SetSolutions[Measurement]:
     """Measure landmarks with rigs (S,) that are known; models: left, right.
@@ -130,8 +151,9 @@ def measure_points(
     pairs = *models, rig.take(np.nonzero(both)[0]), uv_left[both], uv_right[both]
     offset = epipolar_offset(*pairs)
     points = (triangulate_optimally if optimal else triangulate)(*pairs).points
-    found = Measurement(*(
-        scatter(both, part) for part in (points, offset.distance, offset.vertical, offset.foot)))
+    found = Measurement(
+        *(scatter(both, part) for part in (points, offset.distance, offset.vertical, offset.foot))
+    )
     metrics = stereo_depth_metrics(found.distance, found.vertical, found.points, true)
     return SetSolutions(found, metrics, np.asarray(both.any(axis=1)), _NO_PAIR)
 

@@ -115,7 +115,7 @@ def _model(batch: Batch, settings: SolverSettings) -> ForwardModel:
 
 
 def _chunks(index: Index) -> list[Index]:
-    return [index[i:i + _SETS_PER_SOLVE] for i in range(0, len(index), _SETS_PER_SOLVE)]
+    return [index[i : i + _SETS_PER_SOLVE] for i in range(0, len(index), _SETS_PER_SOLVE)]
 
 
 def localizer(batch: Batch, settings: LocalizerSettings) -> Outcome:
@@ -153,7 +153,7 @@ def stereo_calibrator(batch: Batch, settings: StereoCalibratorSettings) -> Outco
         index = np.arange(scenarios) * per_scenario + number
         before = [list(window) for window in windows]
         for window, one in zip(windows, index, strict=True):
-            window[:] = [*window, int(one)][-settings.views:]
+            window[:] = [*window, int(one)][-settings.views :]
         lengths = np.array([len(window) for window in windows])
         for length in np.unique(lengths):
             for chunk in _chunks(index[lengths == length]):
@@ -197,7 +197,8 @@ SOLVERS: Mapping[str, Solver] = {
     'stereo_depth': Solver(StereoDepthSettings, STEREO_DEPTH_METRICS, stereo_depth),
 }
 TABLES: Mapping[str, type[Any]] = {
-    CAMERA: SyntheticCameraSettings, **{name: s.settings for name, s in SOLVERS.items()}
+    CAMERA: SyntheticCameraSettings,
+    **{name: s.settings for name, s in SOLVERS.items()},
 }
 
 
@@ -223,11 +224,14 @@ def plan_sweep(parameters: Mapping[str, Mapping[str, Any]]) -> Plan:
     with_values(TABLES[CAMERA](), camera)  # what the node would refuse
     names = solvers_of(base, sweep)
     tables = {
-        name: with_values(SOLVERS[name].settings(), parameters.get(name, {})) for name in names}
+        name: with_values(SOLVERS[name].settings(), parameters.get(name, {})) for name in names
+    }
     for name, table in tables.items():
         if isinstance(table, StereoDepthSettings) and table.rig != StereoDepthSettings.rig:
-            raise ParameterError(f'{name}: rig is {table.rig!r}; a sweep measures with the true '
-                                 'rig, not with one from a topic')
+            raise ParameterError(
+                f'{name}: rig is {table.rig!r}; a sweep measures with the true '
+                'rig, not with one from a topic'
+            )
         if table.lens:
             model_of(table.lens, 1.0, table.solves_svp)
     check_sweep(base, sweep)
@@ -237,8 +241,10 @@ def plan_sweep(parameters: Mapping[str, Mapping[str, Any]]) -> Plan:
 def solvers_of(base: Scenario, sweep: Sweep) -> tuple[str, ...]:
     """Return the solver nodes of a sweep; raise ParameterError where scenarios differ in them."""
     if base.rig_file:
-        raise ParameterError(f'{CAMERA}: rig_file names a rig; an offline sweep simulates one '
-                             'camera or a pair: leave rig_file out, and choose a style')
+        raise ParameterError(
+            f'{CAMERA}: rig_file names a rig; an offline sweep simulates one '
+            'camera or a pair: leave rig_file out, and choose a style'
+        )
     mono = {style == MONO for style in sweep.lists.get('style', (base.style,))}
     if len(mono) > 1:
         raise ParameterError(f'{SWEEP}style has {MONO} together with rigs; make two sweeps of it')
@@ -248,10 +254,15 @@ def solvers_of(base: Scenario, sweep: Sweep) -> tuple[str, ...]:
 def idle_solvers(plan: Plan, nodes: Iterable[str]) -> list[str]:
     """Return a sentence for each node that has nothing to solve in a sweep."""
     *others, last = STYLES
-    needed = {node: MONO if node in _MONO_SOLVERS else f'{", ".join(others)} or {last}'
-              for node in nodes if node not in (CAMERA, *plan.solvers)}
-    return [f'{node} solves nothing in this sweep: it needs style {style}'
-            for node, style in needed.items()]
+    needed = {
+        node: MONO if node in _MONO_SOLVERS else f'{", ".join(others)} or {last}'
+        for node in nodes
+        if node not in (CAMERA, *plan.solvers)
+    }
+    return [
+        f'{node} solves nothing in this sweep: it needs style {style}'
+        for node, style in needed.items()
+    ]
 
 
 def column_types(plan: Plan) -> dict[str, type]:
@@ -340,8 +351,13 @@ def fingerprint(plan: Plan) -> str:
         for value in plan.sweep.lists.get(name, (getattr(plan.base, name),)):
             scenario = replace(plan.base, **{name: value})
             landmarks, poses = scenario_landmarks(scenario), scenario_poses(scenario)
-            parts += [true_lens(scenario.lens), landmarks.ids.tolist(), landmarks.points.tolist(),
-                      poses.position.tolist(), poses.rotation.tolist()]
+            parts += [
+                true_lens(scenario.lens),
+                landmarks.ids.tolist(),
+                landmarks.points.tolist(),
+                poses.position.tolist(),
+                poses.rotation.tolist(),
+            ]
     parts += [true_lens(table.lens) for table in plan.solvers.values() if table.lens]
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
@@ -365,6 +381,7 @@ def _columns(plan: Plan, scenarios: list[Scenario], first: int, batch: Batch) ->
         notes = outcome.note.tolist()
         for name, values in outcome.metrics.items():
             columns[f'{node}.{name}'] = [
-                None if note else v for v, note in zip(values.tolist(), notes, strict=True)]
+                None if note else v for v, note in zip(values.tolist(), notes, strict=True)
+            ]
         columns[f'{node}.note'] = [note or None for note in notes]
     return columns

@@ -63,8 +63,11 @@ class LensTrust:
     @property
     def doubtful_shift(self) -> dict[str, Admissible]:
         """The coefficients of a viewpoint shift that a target of another shape can explain."""
-        return {name: range_ for name, range_ in self.admissible.items()
-                if name in _SHIFT_NAMES and not range_.settled}
+        return {
+            name: range_
+            for name, range_ in self.admissible.items()
+            if name in _SHIFT_NAMES and not range_.settled
+        }
 
 
 def calibrate_without_outliers(
@@ -100,9 +103,11 @@ def assess_lens(observations: Observations, lens: Lens, names: Sequence[str]) ->
     moved, covariance = _free_target(null, len(names))
     values = parameter_values(lens, names)
     admissible = {
-        name: _admissible(name, (value, error), (value + step, spread)) for name, value, error,
-        step, spread in zip(names, values, errors, moved, np.sqrt(np.diag(covariance)),
-                            strict=True)}
+        name: _admissible(name, (value, error), (value + step, spread))
+        for name, value, error, step, spread in zip(
+            names, values, errors, moved, np.sqrt(np.diag(covariance)), strict=True
+        )
+    }
     # The values stand for a target as it is said to be: what another would move them by is
     # doubt, too.
     covariance = covariance + np.outer(moved, moved)
@@ -117,9 +122,14 @@ def with_covariance(lens: Lens, trusted: LensTrust) -> Lens:
     stderr: one each, by name; covariance: of all, in the same order.
     """
     errors = np.sqrt(np.diag(trusted.covariance)).tolist()
-    return replace(lens, calibration={
-        **(lens.calibration or {}), 'stderr': dict(zip(trusted.stderr, errors, strict=True)),
-        'covariance': trusted.covariance.tolist()})
+    return replace(
+        lens,
+        calibration={
+            **(lens.calibration or {}),
+            'stderr': dict(zip(trusted.stderr, errors, strict=True)),
+            'covariance': trusted.covariance.tolist(),
+        },
+    )
 
 
 def _free_target(null: NullModel, count: int) -> tuple[Array, Array]:
@@ -140,14 +150,16 @@ def _free_target(null: NullModel, count: int) -> tuple[Array, Array]:
     )
     own, scale = own[:count], null.scale[:count]
     return (inverse @ information[every, -1])[own] / scale, (
-        inverse[np.ix_(own, own)] / np.outer(scale, scale))
+        inverse[np.ix_(own, own)] / np.outer(scale, scale)
+    )
 
 
 def _admissible(name: str, *found: tuple[float, float]) -> Admissible:
     """Return the range of a parameter from values and standard errors, by target said and free."""
     (value, stderr), (moved, spread) = found
-    ends = [middle + sign * _INTERVAL_SIGMAS * error
-            for middle, error in found for sign in (-1, 1)]
+    ends = [
+        middle + sign * _INTERVAL_SIGMAS * error for middle, error in found for sign in (-1, 1)
+    ]
     sure = name not in _SHIFT_NAMES or min(ends) > 0 or max(ends) < 0
     near = abs(moved - value) < _INTERVAL_SIGMAS * np.hypot(stderr, spread)
     return Admissible(min(ends), max(ends), bool(sure and near))
@@ -175,10 +187,12 @@ def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) 
     """
     found = [np.full((len(points), 3, 3), np.nan) for _ in ErrorParts._fields]
     known = np.flatnonzero(np.isfinite(points).all(axis=1))
-    for rows in (known[i:i + _MAX_POINTS] for i in range(0, len(known), _MAX_POINTS)):
+    for rows in (known[i : i + _MAX_POINTS] for i in range(0, len(known), _MAX_POINTS)):
         views = views_of(points[rows, None], np.zeros((len(rows), 1, 2)))
-        pairs = [(errors, errors.linearize(views, pose)) for errors, pose in (
-            (left, rig.broadcast_to(len(rows))), (right, identity(len(rows))))]
+        pairs = [
+            (errors, errors.linearize(views, pose))
+            for errors, pose in ((left, rig.broadcast_to(len(rows))), (right, identity(len(rows))))
+        ]
         by = [linear.whiten(linear.linear.d_target) / errors.noise for errors, linear in pairs]
         seen = np.asarray(np.isfinite(by[0] + by[1]).all(axis=(1, 2)))
         by = [np.where(seen[:, None, None], one, np.eye(2, 3)) for one in by]
@@ -214,12 +228,17 @@ def known_errors(
         measured['depth_error_m'] = _depth_errors
     pairs = [list(_train_folds(linear, free)) for linear in (before, after)] if measured else []
     found = {
-        name: [np.concatenate([errors(held_out, state) for held_out, state in folds])
-               for folds in pairs]
+        name: [
+            np.concatenate([errors(held_out, state) for held_out, state in folds])
+            for folds in pairs
+        ]
         for name, errors in measured.items()
     }
-    return {name: compare_errors(*both) for name, both in found.items()
-            if np.isfinite(both[0] + both[1]).any()}
+    return {
+        name: compare_errors(*both)
+        for name, both in found.items()
+        if np.isfinite(both[0] + both[1]).any()
+    }
 
 
 def _train_folds(

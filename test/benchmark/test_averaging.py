@@ -28,8 +28,10 @@ def test_a_set_is_seen_and_its_lens_has_no_ray_error_to_itself() -> None:
 
 
 def test_the_page_has_geometric_means_and_lenses_that_got_worse() -> None:
-    outcomes = [Outcome(0.002, 0.001, 0.001, 0.5, False, (1.0, 0.5, 0.25)),
-                Outcome(0.002, 0.001, 0.001, 0.5, False, (1.0, 2.0, 1.0))]
+    outcomes = [
+        Outcome(0.002, 0.001, 0.001, 0.5, False, (1.0, 0.5, 0.25)),
+        Outcome(0.002, 0.001, 0.001, 0.5, False, (1.0, 2.0, 1.0)),
+    ]
     page = report(outcomes, 'command')
     assert '| a shift that is not named | 2 | 1.000 (1) | 0.500 (0) |' in page
     assert 'no shift |' not in page and '    command' in page

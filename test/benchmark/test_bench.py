@@ -70,8 +70,13 @@ def test_what_is_not_there_is_left_out_with_a_reason():
 
 
 def test_a_ratio_is_how_many_times_faster():
-    row = Row('work', 'ms', 1e-3, [Timing('fisheye-svp, x', (1.0, 2.0, 9.0)), Timing('b', (6.0,))],
-              goals=[Goal('fisheye-svp, x', 'b', 2.5), Goal('fisheye-svp, x', 'c', 1.0)])
+    row = Row(
+        'work',
+        'ms',
+        1e-3,
+        [Timing('fisheye-svp, x', (1.0, 2.0, 9.0)), Timing('b', (6.0,))],
+        goals=[Goal('fisheye-svp, x', 'b', 2.5), Goal('fisheye-svp, x', 'c', 1.0)],
+    )
     assert row.ratio('fisheye-svp, x', 'b') == 3.0
     assert row.ratio('fisheye-svp, x', 'c') is None
     assert [line[-1] for line in report.goals([row]).rows] == ['yes', '-']
@@ -88,8 +93,9 @@ def test_the_hand_written_kernel_is_right(lens):
     kernel, model = Kernel(lens), ForwardModel(lens)
     world = points(500, np.radians(80.0))
     pose = Pose(rotation_from_vector(np.array([0.1, -0.2, 0.05])), np.array([0.01, 0.02, -0.03]))
-    linear = model.linearise(Pose(*(array[None] for array in pose)), views_of(
-        world, np.zeros((1, 500, 2))))
+    linear = model.linearise(
+        Pose(*(array[None] for array in pose)), views_of(world, np.zeros((1, 500, 2)))
+    )
     uv, jacobian = kernel.linearise(world, *pose)
     np.testing.assert_allclose(uv, linear.uv[0], atol=1e-7)
     np.testing.assert_allclose(jacobian, linear.d_pose[0], rtol=1e-7, atol=1e-5)
@@ -166,8 +172,15 @@ def test_variants_and_growth_can_be_measured():
 
 
 def test_the_report_is_markdown_with_versions_goals_and_reasons():
-    row = Row('work', 'ms', 1e-3, [Timing('fisheye-svp, numpy', (1e-3,), 2e-12)], 'm',
-              {'peer': 'not installed'}, [Goal('fisheye-svp, numpy', 'peer', 2.0)])
+    row = Row(
+        'work',
+        'ms',
+        1e-3,
+        [Timing('fisheye-svp, numpy', (1e-3,), 2e-12)],
+        'm',
+        {'peer': 'not installed'},
+        [Goal('fisheye-svp, numpy', 'peer', 2.0)],
+    )
     text = report.document('python -m benchmark.speed', 0.3, [row])
     assert '| fisheye-svp, numpy | 1 | 1 to 1 | 2.0e-12 |' in text
     assert '- peer did not take part: not installed.' in text
@@ -177,8 +190,9 @@ def test_the_report_is_markdown_with_versions_goals_and_reasons():
 def test_every_frame_of_the_board_has_its_own_pose():
     table, names = on_board(3, 32, 2)
     assert len(table) == 3 * 32 * 2 and table.cameras == names
-    centres = [table.uv[(table.frame == frame) & (table.camera == 0)].mean(axis=0)
-               for frame in range(3)]
+    centres = [
+        table.uv[(table.frame == frame) & (table.camera == 0)].mean(axis=0) for frame in range(3)
+    ]
     assert min(np.linalg.norm(centres[i] - centres[i - 1]) for i in range(3)) > 10.0
 
 

@@ -31,9 +31,15 @@ RUNS = 10_000
 # then binomial.
 NAMED, ADEQUATE = 0.92, 0.92
 FIXED = tuple(
-    Task('one', 0.5, (name,), 2024, 0) for name in (
-        'viewpoint_shift', 'radial_profile', 'sensor_tilt', 'focal_drift', 'board_pose',
-        'rolling_shutter', 'wrong_ids',
+    Task('one', 0.5, (name,), 2024, 0)
+    for name in (
+        'viewpoint_shift',
+        'radial_profile',
+        'sensor_tilt',
+        'focal_drift',
+        'board_pose',
+        'rolling_shutter',
+        'wrong_ids',
     )
 )
 
@@ -51,7 +57,8 @@ def test_the_catalogue_is_hidden_whole():
 
 
 @pytest.mark.parametrize(
-    ('number', 'size'), [(82, 0.5), (112, 1.0), (76, 1.0), (118, 0.5), (100, 1.0)])
+    ('number', 'size'), [(82, 0.5), (112, 1.0), (76, 1.0), (118, 0.5), (100, 1.0)]
+)
 def test_landmarks_of_two_colours_have_no_name(number, size):
     """The lens magnifies one of them more; the landmarks of a cloud are seen unevenly."""
     outcome = run_trial(Task('outside', size, ('colour',), 71, number))
@@ -89,10 +96,22 @@ def test_held_out_frames_are_other_frames_of_the_same_scene():
     assert not set(table.frames) & set(other.frames)
 
 
-@pytest.mark.parametrize('name', [
-    'viewpoint_shift', 'focal_length', 'principal_point', 'aspect', 'skew', 'sensor_tilt',
-    'landmark_survey', 'dot_centroid', 'detector_bias', 'rolling_shutter', 'stereo_time_offset',
-])
+@pytest.mark.parametrize(
+    'name',
+    [
+        'viewpoint_shift',
+        'focal_length',
+        'principal_point',
+        'aspect',
+        'skew',
+        'sensor_tilt',
+        'landmark_survey',
+        'dot_centroid',
+        'detector_bias',
+        'rolling_shutter',
+        'stereo_time_offset',
+    ],
+)
 def test_true_values_mean_what_the_catalogue_says(name):
     case, truth = case_with_truth(name)
     scene = case.scene

@@ -31,8 +31,17 @@ from fisheye_svp_ros.pose import rotation_from_vector
 from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.simulate.simulation import simulate
 
-LENS = Lens('camera', 800, 700, 220.0, 220.0, 400.0, 350.0, KannalaBrandt(-0.02, 0.004, -0.003),
-            np.radians(85))
+LENS = Lens(
+    'camera',
+    800,
+    700,
+    220.0,
+    220.0,
+    400.0,
+    350.0,
+    KannalaBrandt(-0.02, 0.004, -0.003),
+    np.radians(85),
+)
 
 
 @pytest.fixture(scope='module')
@@ -58,7 +67,8 @@ def test_boards_become_grids(data):
         places = np.array([grid.places[board + one] for one in range(63)])
         assert sorted(map(tuple, places)) in (
             sorted((i, j) for i in range(9) for j in range(7)),
-            sorted((i, j) for i in range(7) for j in range(9)))
+            sorted((i, j) for i in range(7) for j in range(9)),
+        )
 
 
 def test_landmarks_on_no_grid_are_refused(data):
@@ -79,7 +89,7 @@ def test_awarped_places_board_lies_on_the_nominal_one(data):
     across, along = np.meshgrid(np.arange(9), np.arange(9))
     flat = grid.spacing * np.stack([across, along, 0 * across], axis=-1)
     assert np.abs(warped_places(data.test, grid, flat) - data.test.xyz).max() < 1e-6
-    bow = 1e-3 * (across / 8)**2
+    bow = 1e-3 * (across / 8) ** 2
     bent = warped_places(data.test, grid, flat + np.stack([0 * bow, 0 * bow, bow], axis=-1))
     assert 8e-4 < np.abs(bent - data.test.xyz).max() < 1.1e-3
 
@@ -88,8 +98,9 @@ def test_opencv_finds_the_lens_and_poses_are_fitted(data):
     start = fsvp.localize(data.test, LENS)
     start = replace(start, pose=start.pose.retract(np.full(6, 0.01)))
     fitted = opencv_fisheye(data, grid_of(data), 200.0)[0]
-    apart = residuals(fitted.project, data.test.frame, fitted.places(data.test), data.test.uv,
-                      start.pose)
+    apart = residuals(
+        fitted.project, data.test.frame, fitted.places(data.test), data.test.uv, start.pose
+    )
     assert rms(apart) < 1e-3
     off = data.test.uv + np.where(np.arange(len(data.test)) % 2, 0.5, -0.5)[:, None]
     apart = residuals(fitted.project, data.test.frame, data.test.xyz, off, start.pose)
@@ -102,11 +113,14 @@ def test_a_missing_tool_says_so(data):
         PEERS['mrcal, CAHVORE'](data, grid_of(data), 220.0)
 
 
-@pytest.mark.parametrize(('tool', 'module', 'largest'), [
-    ('lensboy, rational', 'lensboy', 0.3),  # another model
-    ('calibsense, fisheye', 'calibsense', 1e-3),
-    ('ds-msp, Kannala-Brandt', 'ds_msp', 1e-3),
-])
+@pytest.mark.parametrize(
+    ('tool', 'module', 'largest'),
+    [
+        ('lensboy, rational', 'lensboy', 0.3),  # another model
+        ('calibsense, fisheye', 'calibsense', 1e-3),
+        ('ds-msp, Kannala-Brandt', 'ds_msp', 1e-3),
+    ],
+)
 def test_tools_of_the_index_find_the_lens(data, tool, module, largest):
     if find_spec(module) is None:
         with pytest.raises(NotHereError, match='not installed'):
@@ -114,8 +128,9 @@ def test_tools_of_the_index_find_the_lens(data, tool, module, largest):
         pytest.skip(f'{module} is not installed')
     fitted = PYTHON_PEERS[tool](data, grid_of(data), 200.0)[0]
     start = fsvp.localize(data.test, LENS)
-    apart = residuals(fitted.project, data.test.frame, fitted.places(data.test), data.test.uv,
-                      start.pose)
+    apart = residuals(
+        fitted.project, data.test.frame, fitted.places(data.test), data.test.uv, start.pose
+    )
     assert rms(apart) < largest
     for error in fitted.errors.values():
         off = fitted.intrinsics - [LENS.fx, LENS.fy, LENS.cx, LENS.cy]
@@ -138,9 +153,13 @@ def test_halves_are_disjoint_and_whole(data):
 
 def test_differences_are_counted_beside_their_errors():
     ones = np.ones(4)
-    found = {'a': [Difference('tool', np.array([0.5, -1.5, 3.0, 0.0]), ones)],
-             'b': [Difference('tool', 0 * ones, np.array([1.0, 1.0, 1.0, np.nan])),
-                   Difference('other', 2 * ones, ones)]}
+    found = {
+        'a': [Difference('tool', np.array([0.5, -1.5, 3.0, 0.0]), ones)],
+        'b': [
+            Difference('tool', 0 * ones, np.array([1.0, 1.0, 1.0, np.nan])),
+            Difference('other', 2 * ones, ones),
+        ],
+    }
     lines = honesty_table(found)
     assert lines[2] == '| tool | 7 | 86 % | 75 % | 100 % | 1.28 | 1.00 / 1.00 |'
     assert lines[3] == '| other | 4 | 0 % | - | 0 % | 2.00 | - / 1.00 |'

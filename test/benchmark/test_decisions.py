@@ -15,8 +15,9 @@ def test_a_sound_lens_is_kept():
 @pytest.mark.parametrize('kind', KINDS)
 def test_the_page_counts_what_was_decided(kind):
     one = Outcome(kind, 'keep', 'keep', (), 1e-3, 5e-4, 0.0, 0.1, -0.5, 'focal length')
-    others = [Outcome(other, 'undecided', 'keep', (), np.nan, 0.0, 0.1, 0.2, 0.2)
-              for other in KINDS]
+    others = [
+        Outcome(other, 'undecided', 'keep', (), np.nan, 0.0, 0.1, 0.2, 0.2) for other in KINDS
+    ]
     lines = report([one, one, *others], 'command').splitlines()
     row = next(line for line in lines if line.startswith(f'| {kind} '))
     assert row.endswith('| 2 | 0 | 0 | 1 |')

@@ -13,21 +13,24 @@ def kinds(before, after):
     return [kind for kind, _ in differences(before, after)]
 
 
-@pytest.mark.parametrize(('before', 'after', 'found'), [
-    ({'rms': 0.5}, {'rms': 0.5 * (1 + 5e-7)}, []),
-    ({'rms': 0.5}, {'rms': 0.5 * (1 + 5e-6)}, ['value']),
-    ({'e0': 1e-3}, {'e0': 1e-3 + 5e-10}, []),
-    ({'verdict': 'explained'}, {'verdict': 'adequate'}, ['value']),
-    ({'causes': ['skew']}, {'causes': []}, ['value']),
-    ({'causes': ['skew', 'aspect']}, {'causes': ['aspect', 'skew']}, ['value', 'value']),
-    ({'rms': 0.5}, {'rms': 0.5, 'photographs': []}, ['new']),
-    ({'rms': 0.5, 'gain': 0.1}, {'rms': 0.5}, ['value']),
-    ('off by 1.25 px', 'off by 1.26 px', []),
-    ('off by 1.25 px', 'off by 1.27 px', ['value']),
-    ('off by 1.25 px', 'astray by 1.25 px', ['words']),
-    ('off by 1.25 px', 'off by 1.25 px in 3 frames', ['value']),
-    (None, 0.5, ['value']),
-])
+@pytest.mark.parametrize(
+    ('before', 'after', 'found'),
+    [
+        ({'rms': 0.5}, {'rms': 0.5 * (1 + 5e-7)}, []),
+        ({'rms': 0.5}, {'rms': 0.5 * (1 + 5e-6)}, ['value']),
+        ({'e0': 1e-3}, {'e0': 1e-3 + 5e-10}, []),
+        ({'verdict': 'explained'}, {'verdict': 'adequate'}, ['value']),
+        ({'causes': ['skew']}, {'causes': []}, ['value']),
+        ({'causes': ['skew', 'aspect']}, {'causes': ['aspect', 'skew']}, ['value', 'value']),
+        ({'rms': 0.5}, {'rms': 0.5, 'photographs': []}, ['new']),
+        ({'rms': 0.5, 'gain': 0.1}, {'rms': 0.5}, ['value']),
+        ('off by 1.25 px', 'off by 1.26 px', []),
+        ('off by 1.25 px', 'off by 1.27 px', ['value']),
+        ('off by 1.25 px', 'astray by 1.25 px', ['words']),
+        ('off by 1.25 px', 'off by 1.25 px in 3 frames', ['value']),
+        (None, 0.5, ['value']),
+    ],
+)
 def test_what_counts_as_a_difference(before, after, found):
     assert kinds(before, after) == found
 

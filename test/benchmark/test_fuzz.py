@@ -23,8 +23,13 @@ NAMES = [surface.name for surface in surfaces()]
 def test_input_is_taken_or_refused_in_one_line(name: str) -> None:
     trial = trial_of(name)
 
-    @hypothesis.settings(max_examples=15, deadline=None, derandomize=True, database=None,
-                         suppress_health_check=list(hypothesis.HealthCheck))
+    @hypothesis.settings(
+        max_examples=15,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=list(hypothesis.HealthCheck),
+    )
     @hypothesis.given(hypothesis.strategies.randoms(use_true_random=False))
     def check(random: Random) -> None:
         try:
@@ -37,8 +42,20 @@ def test_input_is_taken_or_refused_in_one_line(name: str) -> None:
 
 def test_a_short_run_over_all_surfaces_finds_no_fault() -> None:
     done = subprocess.run(
-        [sys.executable, '-m', 'benchmark.fuzz', '--inputs', '2500', '--workers', '1',
-         '--no-docs'], cwd=ROOT, capture_output=True, text=True)
+        [
+            sys.executable,
+            '-m',
+            'benchmark.fuzz',
+            '--inputs',
+            '2500',
+            '--workers',
+            '1',
+            '--no-docs',
+        ],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-1000:]
     assert 'crashed 0, hung or died 0, wrong 0, slow 0, large 0' in done.stdout
 

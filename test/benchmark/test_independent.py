@@ -39,8 +39,15 @@ SEED = 5
 def scene_of(kind='board', model='equidistant', *, stereo=False, moving=False, fitted=False):
     rng = np.random.default_rng(SEED)
     while True:
-        scene = draw_scene(rng, draw_lens(rng, model, 1.4), kind, fitted=fitted, stereo=stereo,
-                           moving=moving, noise=0.1)
+        scene = draw_scene(
+            rng,
+            draw_lens(rng, model, 1.4),
+            kind,
+            fitted=fitted,
+            stereo=stereo,
+            moving=moving,
+            noise=0.1,
+        )
         if scene is not None:
             return scene
 
@@ -63,12 +70,18 @@ def local_points(scene):
 def test_the_package_is_not_imported():
     for path in Path(independent.__file__).parent.glob('*.py'):
         for node in ast.walk(ast.parse(path.read_text())):
-            names = [a.name for a in node.names] if isinstance(node, ast.Import) else \
-                [node.module] if isinstance(node, ast.ImportFrom) else []
+            names = (
+                [a.name for a in node.names]
+                if isinstance(node, ast.Import)
+                else [node.module]
+                if isinstance(node, ast.ImportFrom)
+                else []
+            )
             for name in names:
                 assert not name.startswith('fisheye_svp_ros'), path
                 assert not name.startswith('benchmark.') or name.startswith(
-                    'benchmark.independent'), path
+                    'benchmark.independent'
+                ), path
 
 
 @pytest.mark.parametrize('model', ['orthographic', 'equisolid', 'stereographic', 'kannala_brandt'])
@@ -84,7 +97,7 @@ def test_jacobians(model):
     numeric = (project(wider, points) - project(lens, points)) / 1e-3
     np.testing.assert_allclose(rows[..., 0], numeric, atol=1e-6)
     for i, k in enumerate(lens.k):
-        bent = replace(lens, k=(*lens.k[:i], k + 1e-6, *lens.k[i + 1:]))
+        bent = replace(lens, k=(*lens.k[:i], k + 1e-6, *lens.k[i + 1 :]))
         numeric = (project(bent, points) - project(lens, points)) / 1e-6
         np.testing.assert_allclose(rows[..., 4 + i], numeric, atol=1e-4)
 
@@ -101,7 +114,7 @@ def test_viewpoint_shift_solves_the_equation_of_the_design():
     assert np.abs(left).max() < 1e-13
     near_axis = np.array([1e-3, 2e-3])
     small = pupil(near_axis, near_axis)[:, 2]
-    np.testing.assert_allclose(np.abs(small), 0.01 * near_axis ** 2 / 6, rtol=1e-4)
+    np.testing.assert_allclose(np.abs(small), 0.01 * near_axis**2 / 6, rtol=1e-4)
 
 
 def test_flat_port_refracts_and_is_the_shift_of_a_window():
@@ -119,13 +132,21 @@ def test_flat_port_refracts_and_is_the_shift_of_a_window():
 def test_effects_on_the_intrinsics():
     scene = scene_of()
     q = from_centre(scene)
-    moved = {name: hidden(name, scene, amount)[1] for name, amount in (
-        ('focal_length', 0.01), ('principal_point', 2.0), ('aspect', 0.01), ('skew', 0.01))}
+    moved = {
+        name: hidden(name, scene, amount)[1]
+        for name, amount in (
+            ('focal_length', 0.01),
+            ('principal_point', 2.0),
+            ('aspect', 0.01),
+            ('skew', 0.01),
+        )
+    }
     np.testing.assert_allclose(np.abs(moved['focal_length']), 0.01 * np.abs(q), atol=1e-9)
     assert np.ptp(moved['principal_point'], axis=0).max() < 1e-9
     assert np.linalg.norm(moved['principal_point'][0]) == pytest.approx(2.0)
-    np.testing.assert_allclose(moved['aspect'][:, 0] * q[:, 1],
-                               -moved['aspect'][:, 1] * q[:, 0], atol=1e-9)
+    np.testing.assert_allclose(
+        moved['aspect'][:, 0] * q[:, 1], -moved['aspect'][:, 1] * q[:, 0], atol=1e-9
+    )
     assert np.abs(moved['skew'][:, 1]).max() < 1e-9
     np.testing.assert_allclose(np.abs(moved['skew'][:, 0]), 0.01 * np.abs(q[:, 1]), atol=1e-9)
     profile = hidden('radial_profile', scene, 2.0)[1]
@@ -189,13 +210,16 @@ def test_effects_on_the_target():
         assert np.abs(np.einsum('ij,ij->i', stretch[on], across)).max() < 1e-12
         assert np.abs(np.cross(bow[on], across)).max() < 1e-12
         x, y = target.local[on].T
-        smooth = np.stack([x ** i * y ** j for i in range(4) for j in range(4 - i)], 1)
+        smooth = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], 1)
         height = np.einsum('ij,ij->i', bow[on], across)
         fitted = smooth @ np.linalg.lstsq(smooth, height)[0]
         np.testing.assert_allclose(fitted, height, atol=1e-12)
         before, after = target.points[on], target.points[on] + askew[on]
-        np.testing.assert_allclose(np.linalg.norm(after - after[0], axis=1),
-                                   np.linalg.norm(before - before[0], axis=1), atol=1e-9)
+        np.testing.assert_allclose(
+            np.linalg.norm(after - after[0], axis=1),
+            np.linalg.norm(before - before[0], axis=1),
+            atol=1e-9,
+        )
     apart = np.linalg.norm(target.points + askew - target.points[0] - askew[0], axis=1)
     assert np.abs(apart - np.linalg.norm(target.points - target.points[0], axis=1)).max() > 1e-6
 
@@ -263,15 +287,24 @@ def test_ripple_has_a_tenth_of_the_picture_for_its_period():
     assert np.abs(after - field(start[:, 0])[:, None]).max((0, 2)).min() < 0.1
 
 
-@pytest.mark.parametrize('name', [
-    'viewpoint_shift', 'sensor_tilt', 'dot_centroid', 'board_pose', 'rolling_shutter', 'rig_flex',
-    *(name for name in OUTSIDE if not OUTSIDE[name].direct)])
+@pytest.mark.parametrize(
+    'name',
+    [
+        'viewpoint_shift',
+        'sensor_tilt',
+        'dot_centroid',
+        'board_pose',
+        'rolling_shutter',
+        'rig_flex',
+        *(name for name in OUTSIDE if not OUTSIDE[name].direct),
+    ],
+)
 def test_sizes_are_what_poses_and_intrinsics_leave(name):
     blind = generate(SEED, 1, ((name, 0.5),), 0.0)
     scene = blind.scene
     assert blind.hidden[0].amount <= CATALOGUE[name].limit
     left = Free.of(scene).step(blind.uv - simulated(scene)).left
-    excess = np.mean(left ** 2) / scene.noise ** 2 - 1
+    excess = np.mean(left**2) / scene.noise**2 - 1
     parameters = 6 * scene.frames + 6 * (scene.rig is not None) + 8 * scene.fitted
     expected = 0.25 - parameters / (2 * len(left))
     assert excess == pytest.approx(expected, abs=6 / np.sqrt(len(left)))
@@ -298,8 +331,11 @@ def test_fitted_lens_is_a_fit():
             break
     kept = ~blind.scene.held[blind.scene.frame]
     points = local_points(blind.scene)
-    fitted = Free.of(blind.scene, blind.lens).step(project(blind.lens, points) - simulated(
-        blind.scene)).left
+    fitted = (
+        Free.of(blind.scene, blind.lens)
+        .step(project(blind.lens, points) - simulated(blind.scene))
+        .left
+    )
     assert blind.lens != blind.scene.lens
     assert np.sqrt(np.mean(fitted[kept] ** 2)) < 0.2 * blind.scene.noise
     degrees = 2 * kept.sum() - 6 * (~blind.scene.held).sum() - 14
@@ -344,8 +380,16 @@ def test_the_command_line_reads_what_is_written(name, tmp_path):
         held = table == 'held_out'
         assert len(rows) == (blind.scene.held[blind.scene.frame] == held).sum()
     output = tmp_path / 'out'
-    assert not main(['localize', str(tmp_path / 'held_out.csv'),
-                     '--lens', str(tmp_path / 'lens.yaml'), '-o', str(output)])
+    assert not main(
+        [
+            'localize',
+            str(tmp_path / 'held_out.csv'),
+            '--lens',
+            str(tmp_path / 'lens.yaml'),
+            '-o',
+            str(output),
+        ]
+    )
     found = [json.loads(path.read_text()) for path in output.rglob('localize.json')]
     assert len(found) == 1 + (blind.scene.rig is not None)
     assert sum(one['observations'] for one in found) > 0.9 * len(rows)
@@ -357,9 +401,15 @@ def test_the_command_line_reads_what_is_written(name, tmp_path):
 
 
 def said(*causes, verdict='explained', components=()):
-    return {'verdict': verdict, 'causes': [
-        {'effect': effect, 'indistinguishable_from': alike, 'p_value': 1e-9}
-        for effect, alike in causes], 'components': list(components), 'seconds': 1.0}
+    return {
+        'verdict': verdict,
+        'causes': [
+            {'effect': effect, 'indistinguishable_from': alike, 'p_value': 1e-9}
+            for effect, alike in causes
+        ],
+        'components': list(components),
+        'seconds': 1.0,
+    }
 
 
 def component(stage, sd, p=1e-6):
@@ -367,11 +417,34 @@ def component(stage, sd, p=1e-6):
 
 
 def test_scores():
-    truth = {'hidden': [{'effect': 'flat_port', 'size': 1.0, 'amount': 0.01, 'stage': 'lens'}],
-             **dict.fromkeys(('noise_px', 'target', 'model', 'fitted', 'stereo', 'moving',
-                              'frames', 'observations', 'background'))}
-    facts = score(truth, said(('viewpoint_shift', ['flat_port']), ('skew', []), components=[
-        component('lens', 0.2), component('target', 0.1), component('frame', 0.5, 0.2)]))
+    truth = {
+        'hidden': [{'effect': 'flat_port', 'size': 1.0, 'amount': 0.01, 'stage': 'lens'}],
+        **dict.fromkeys(
+            (
+                'noise_px',
+                'target',
+                'model',
+                'fitted',
+                'stereo',
+                'moving',
+                'frames',
+                'observations',
+                'background',
+            )
+        ),
+    }
+    facts = score(
+        truth,
+        said(
+            ('viewpoint_shift', ['flat_port']),
+            ('skew', []),
+            components=[
+                component('lens', 0.2),
+                component('target', 0.1),
+                component('frame', 0.5, 0.2),
+            ],
+        ),
+    )
     assert (facts['found'], facts['exactly'], facts['false']) == ([True], [False], ['skew'])
     assert facts['stage_right'] == [True]
     assert stage_right('lens or frame', {'frame': 1.0, 'lens': 0.1})
@@ -388,7 +461,8 @@ def test_trials_are_not_diagnosed_twice_and_reported(mode, tmp_path, monkeypatch
     scores = [run.trial(this, i, tmp_path) for i in range(2)]
     assert scores == [run.trial(this, i, tmp_path) for i in range(2)]
     report.write_reports(
-        tmp_path / 'docs/results', this.name, {**this._asdict(), 'scores': scores})
+        tmp_path / 'docs/results', this.name, {**this._asdict(), 'scores': scores}
+    )
     table = json.loads((tmp_path / f'docs/results/blind/independent_{this.name}.json').read_text())
     assert table['scores'] == scores
     page = (tmp_path / 'docs/results/blind_independent.md').read_text()

@@ -59,7 +59,10 @@ def test_what_is_written_is_what_was_found(found, tmp_path):
         assert read.fx == pytest.approx(numbers[0], abs=0.006)
         np.testing.assert_allclose(read.viewpoint_shift.coefficients, numbers[1:], atol=1e-7)
         assert (read.name, read.width, read.max_incidence) == (
-            lens.name, lens.width, lens.max_incidence)
+            lens.name,
+            lens.width,
+            lens.max_incidence,
+        )
     layout = tmp_path / 'layout.yaml'
     layout.write_text(yaml.safe_dump(layout_document(best, 32)), encoding='utf-8')
     written = environment('whole', 1.0, layout).points

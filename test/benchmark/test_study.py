@@ -11,7 +11,8 @@ def test_only_the_section_of_a_page_is_written_anew(tmp_path):
     write_section(page, 'a', r'new \1')
     write_figures(page, ['1', '2'])
     assert page.read_text() == (
-        'head\n<!-- a -->\nnew \\1\n<!-- end of a -->\n<!-- figures -->\n1\n2\n')
+        'head\n<!-- a -->\nnew \\1\n<!-- end of a -->\n<!-- figures -->\n1\n2\n'
+    )
 
 
 def test_tables_have_as_many_columns_as_names():

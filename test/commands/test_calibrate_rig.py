@@ -62,7 +62,7 @@ def test_transforms_of_a_robot_are_the_same_rig(written: Path, tmp_path: Path) -
         assert all(f'{camera}_optical_frame' in text for camera in CAMERAS)
         path = tmp_path / name
         path.write_text(text.replace('cam1', 'left').replace('cam2', 'right'))
-        found, = load_rigs(path)
+        (found,) = load_rigs(path)
         assert found.position == pytest.approx(wanted.position, abs=1e-9)
         assert found.rotation == pytest.approx(wanted.rotation, abs=1e-9)
 
@@ -78,13 +78,15 @@ def test_what_scripts_read(written: Path) -> None:
     assert document['cameras']['cam0']['covariance'] is None
 
 
-def test_the_command_calibrates_all(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_calibrates_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_observations(tmp_path / 'obs.csv', photographs(2, (45.0, 135.0, 225.0), 36))
     out = tmp_path / 'rig'
-    assert cli.main(['calibrate', str(tmp_path / 'obs.csv'), '--image-size', '1280x800',
-                     '-o', str(out)]) == 0
+    assert (
+        cli.main(
+            ['calibrate', str(tmp_path / 'obs.csv'), '--image-size', '1280x800', '-o', str(out)]
+        )
+        == 0
+    )
     printed = capsys.readouterr().out
     assert 'rig: cameras in cam0, from 36 frames that several cameras see' in printed
     assert cameras_in(out) == CAMERAS  # rig, camchain and tf_static are no lenses
@@ -105,8 +107,10 @@ def test_cameras_that_nothing_holds_are_named(
 
 def test_diagnosis_names_cameras_that_share_no_frame(capsys: pytest.CaptureFixture[str]) -> None:
     note_unconnected(photographs(3, (45.0, 225.0), 8))
-    assert ('cam2 and cam3: no frame shared with cam0 and cam1, so their relative pose is not '
-            'estimated') in capsys.readouterr().err
+    assert (
+        'cam2 and cam3: no frame shared with cam0 and cam1, so their relative pose is not '
+        'estimated'
+    ) in capsys.readouterr().err
 
 
 def test_boards_of_the_cameras_own_are_named(
@@ -115,7 +119,8 @@ def test_boards_of_the_cameras_own_are_named(
     table, _ = moving_rig(1, cameras=2)
     write_fitted(table, dict.fromkeys(CAMERAS[:2], LENS), tmp_path)
     assert 'related by the motion of the rig: one seen by cam0, another by cam1' in (
-        capsys.readouterr().out)
+        capsys.readouterr().out
+    )
     cameras = json.loads((tmp_path / 'rig.json').read_text())['cameras']
     assert [camera['board'] for camera in cameras.values()] == [0, 1]
     assert cameras['cam1']['position'] == pytest.approx(RIG.position[1], abs=1e-3)
@@ -130,11 +135,14 @@ def test_a_rig_file_of_many_cameras_is_a_chain(tmp_path: Path) -> None:
     assert cli.main(['lens', str(tmp_path / 'broken.yaml')]) == 2
 
 
-@pytest.mark.parametrize('cameras', [
-    ('front-cam', 'front cam', 'cam.0', "d'Orsay: #2"),
-    ('car_in_front', 'car_in_back', 'car_in_left'),
-    ('base', 'car_in_back'),
-])
+@pytest.mark.parametrize(
+    'cameras',
+    [
+        ('front-cam', 'front cam', 'cam.0', "d'Orsay: #2"),
+        ('car_in_front', 'car_in_back', 'car_in_left'),
+        ('base', 'car_in_back'),
+    ],
+)
 def test_a_rig_file_holds_cameras_of_any_name(tmp_path: Path, cameras: tuple[str, ...]) -> None:
     check_camera_names(cameras, cameras, 'rig.csv')
     steps = [Pose(np.eye(3), np.array([i, 0.0, 0.0])) for i in range(1, len(cameras))]
@@ -144,23 +152,44 @@ def test_a_rig_file_holds_cameras_of_any_name(tmp_path: Path, cameras: tuple[str
     assert places.position[:, 0].tolist() == [-i * (i + 1) / 2 for i in range(len(cameras))]
 
 
-@pytest.mark.parametrize(('cameras', 'said'), [
-    (('cam0', 'rig'), "obs.csv: camera 'rig' has the name of a file of the rig, rig.yaml; rename "
-     'the camera, for example rig0'),
-    (('camchain', 'left'), "camera 'camchain' has the name of a file of the rig, camchain.yaml"),
-    (('rig', 'camchain'), "camera 'rig' has the name of a file of the rig, rig.yaml"),
-    (('front', 'car_in_back'), 'obs.csv: camera car_in_back: with _in_ in its name'),
-    (('car_in_back', 'car_in_front'), 'obs.csv: camera car_in_back, car_in_front: with _in_ in '
-     'its name, rig.yaml does not say which camera is in which; rename it'),
-])
+@pytest.mark.parametrize(
+    ('cameras', 'said'),
+    [
+        (
+            ('cam0', 'rig'),
+            "obs.csv: camera 'rig' has the name of a file of the rig, rig.yaml; rename "
+            'the camera, for example rig0',
+        ),
+        (
+            ('camchain', 'left'),
+            "camera 'camchain' has the name of a file of the rig, camchain.yaml",
+        ),
+        (('rig', 'camchain'), "camera 'rig' has the name of a file of the rig, rig.yaml"),
+        (('front', 'car_in_back'), 'obs.csv: camera car_in_back: with _in_ in its name'),
+        (
+            ('car_in_back', 'car_in_front'),
+            'obs.csv: camera car_in_back, car_in_front: with _in_ in '
+            'its name, rig.yaml does not say which camera is in which; rename it',
+        ),
+    ],
+)
 def test_names_that_a_rig_cannot_hold_are_refused_before_the_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], cameras: tuple[str, str], said: str
 ) -> None:
     table = photographs(2, (45.0,), 2)
-    write_observations(tmp_path / 'obs.csv', replace(
-        table.take(table.camera < 2), cameras=(*cameras, *table.cameras[2:])))
-    assert said in refused(capsys, 'calibrate', tmp_path / 'obs.csv', '--image-size', '1280x800',
-                           '-o', tmp_path / 'out')
+    write_observations(
+        tmp_path / 'obs.csv',
+        replace(table.take(table.camera < 2), cameras=(*cameras, *table.cameras[2:])),
+    )
+    assert said in refused(
+        capsys,
+        'calibrate',
+        tmp_path / 'obs.csv',
+        '--image-size',
+        '1280x800',
+        '-o',
+        tmp_path / 'out',
+    )
     assert not (tmp_path / 'out').exists()
 
 
@@ -174,10 +203,11 @@ def test_a_rig_of_three_is_posed_and_diagnosed_as_one(
     save_lens(LENS.svp(), lens)
     lenses = [f'--lens=cam{i}={lens}' for i in range(3)]
     out = tmp_path / 'diagnosis'
-    assert cli.main(['diagnose', str(tmp_path / 'obs.csv'), *lenses, '--quick',
-                     '-o', str(out)]) == 0
+    assert (
+        cli.main(['diagnose', str(tmp_path / 'obs.csv'), *lenses, '--quick', '-o', str(out)]) == 0
+    )
     found = json.loads((out / 'diagnosis.json').read_text())
-    shift, = (cause for cause in found['causes'] if cause['effect'] == 'viewpoint_shift')
+    (shift,) = (cause for cause in found['causes'] if cause['effect'] == 'viewpoint_shift')
     for camera in CAMERAS[:3]:
         e0 = shift['parameters'][f'{camera}.e0']
         assert abs(e0['value'] - 0.004) < 4 * e0['stderr'] < 0.012
@@ -185,8 +215,20 @@ def test_a_rig_of_three_is_posed_and_diagnosed_as_one(
     assert 'with their relative poses in <code>rig.yaml</code>' in report
     capsys.readouterr()
     extended = [f'--lens=cam{i}={out}/cam{i}/extended_lens.yaml' for i in range(3)]
-    assert cli.main(['localize', str(tmp_path / 'obs.csv'), *extended, '--rig',
-                     str(out / 'rig.yaml'), '-o', str(tmp_path / 'poses')]) == 0
+    assert (
+        cli.main(
+            [
+                'localize',
+                str(tmp_path / 'obs.csv'),
+                *extended,
+                '--rig',
+                str(out / 'rig.yaml'),
+                '-o',
+                str(tmp_path / 'poses'),
+            ]
+        )
+        == 0
+    )
     assert 'cam0 in the world, from' in capsys.readouterr().out
     document = json.loads((tmp_path / 'poses' / 'localize.json').read_text())
     assert document['frames'] == 24 and list(document['cameras']) == list(CAMERAS[:3])

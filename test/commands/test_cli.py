@@ -57,8 +57,12 @@ def scene(tmp_path_factory):
 def process(*arguments, **options):
     """Start the command line in a process of its own."""
     return subprocess.Popen(
-        [sys.executable, '-m', 'fisheye_svp_ros.cli', *map(str, arguments)], cwd=ROOT,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hears_sigint,
+        [sys.executable, '-m', 'fisheye_svp_ros.cli', *map(str, arguments)],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=hears_sigint,
         **options,
     )
 
@@ -86,8 +90,9 @@ def refused(capsys, *arguments):
 
 def printed(code):
     """Run code in an interpreter of its own and return what it prints."""
-    return subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True,
-                          check=True).stdout
+    return subprocess.run(
+        [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
 
 
 class TestLocalize:
@@ -152,8 +157,10 @@ class TestLocalize:
         axes = ('x', 'y', 'z', 'rx', 'ry', 'rz')
         table = CsvTable(output / 'covariance.csv', ['frame'])
         covariance = table.numbers(*(f'{a}_{b}' for a in axes for b in axes)).reshape(-1, 6, 6)
-        worst = [np.sqrt(np.linalg.eigvalsh(covariance[:, p, p]).max(axis=1))
-                 for p in (slice(0, 3), slice(3, 6))]
+        worst = [
+            np.sqrt(np.linalg.eigvalsh(covariance[:, p, p]).max(axis=1))
+            for p in (slice(0, 3), slice(3, 6))
+        ]
         np.testing.assert_allclose(shown[:, 0], 1000 * worst[0], atol=6e-4)
         np.testing.assert_allclose(shown[:, 1], np.degrees(worst[1]), atol=6e-5)
 
@@ -201,33 +208,48 @@ class TestLocalize:
         code = cli.main(['localize', *map(str, arguments), '-o', str(tmp_path / 'file' / 'out')])
         assert code == 2
         assert 'file is not a folder; choose another' in capsys.readouterr().err
-        for command in ('detect {0} --board chessboard:9x6:25mm -o {0}',  # before it searches
-                        'calibrate {1} --image-size 1280x960 -o {0}', 'lens fish180 -o {0}'):
+        for command in (
+            'detect {0} --board chessboard:9x6:25mm -o {0}',  # before it searches
+            'calibrate {1} --image-size 1280x960 -o {0}',
+            'lens fish180 -o {0}',
+        ):
             said = refused(capsys, *command.format(tmp_path, folder / 'observations.csv').split())
             assert 'it is a folder; name a file' in said
-        said = refused(capsys, 'detect', tmp_path, '--board', 'chessboard:9x6:25mm', '--overlays',
-                       tmp_path / 'file')
+        said = refused(
+            capsys,
+            'detect',
+            tmp_path,
+            '--board',
+            'chessboard:9x6:25mm',
+            '--overlays',
+            tmp_path / 'file',
+        )
         assert '--overlays' in said and 'it is a file; name a folder' in said
 
-    @pytest.mark.parametrize('command', [
-        'localize {0}/observations.csv --lens {0}/lens.yaml -o {0}/lens.yaml',
-        'calibrate {0}/observations.csv --image-size 1280x960 -o {0}/observations.csv',
-        'lens {0}/lens.yaml -o {0}/lens.yaml', 'undistort fish180 {0} -o {0}',
-        'undistort fish180 {0}/a.png -o {0}',
-        'detect {0} --board chessboard:9x6:25mm -o {0}/a.png',
-        'calibrate {0} --board chessboard:9x6:25mm -o {0}/a.png',
-        'detect {0} --board chessboard:9x6:25mm --overlays {0}',
-        'detect {0}/a.png --board chessboard:9x6:25mm --overlays {0}',
-        'detect {0}/.. --board chessboard:9x6:25mm --overlays {0}',
-    ])
+    @pytest.mark.parametrize(
+        'command',
+        [
+            'localize {0}/observations.csv --lens {0}/lens.yaml -o {0}/lens.yaml',
+            'calibrate {0}/observations.csv --image-size 1280x960 -o {0}/observations.csv',
+            'lens {0}/lens.yaml -o {0}/lens.yaml',
+            'undistort fish180 {0} -o {0}',
+            'undistort fish180 {0}/a.png -o {0}',
+            'detect {0} --board chessboard:9x6:25mm -o {0}/a.png',
+            'calibrate {0} --board chessboard:9x6:25mm -o {0}/a.png',
+            'detect {0} --board chessboard:9x6:25mm --overlays {0}',
+            'detect {0}/a.png --board chessboard:9x6:25mm --overlays {0}',
+            'detect {0}/.. --board chessboard:9x6:25mm --overlays {0}',
+        ],
+    )
     def test_no_input_is_overwritten(self, scene, capsys, tmp_path, command):
         for name in ('observations.csv', 'lens.yaml'):
             (tmp_path / name).write_bytes((scene[0] / name).read_bytes())
         (tmp_path / 'a.png').write_bytes(b'a photograph')
         before = {path: path.read_bytes() for path in tmp_path.iterdir()}
         assert cli.main(command.format(tmp_path).split()) == 2
-        assert re.search('would overwrite the input|is a file; name a folder',
-                         capsys.readouterr().err)
+        assert re.search(
+            'would overwrite the input|is a file; name a folder', capsys.readouterr().err
+        )
         assert before == {path: path.read_bytes() for path in tmp_path.iterdir()}
 
 
@@ -237,7 +259,10 @@ def test_frames_that_are_doubtful_alike_are_one_line(scene, capsys):
     note_doubtful(table, range(7), reasons)
     said = capsys.readouterr().err.splitlines()
     assert [line.partition('note: ')[2] for line in said] == [
-        'frame 0: off by 2 px', 'frames 3, 4, 5 and 6: likewise', 'frame 2: far']
+        'frame 0: off by 2 px',
+        'frames 3, 4, 5 and 6: likewise',
+        'frame 2: far',
+    ]
 
 
 def test_views_that_are_set_aside_as_a_whole_are_named(scene, capsys):
@@ -262,8 +287,21 @@ class TestCalibrate:
 
         monkeypatch.setattr('fisheye_svp_ros.commands.calibrate.stages', stages)
         lens = tmp_path / 'lens.yaml'
-        assert cli.main(['calibrate', str(scene[0] / 'observations.csv'), '--model',
-                         'equidistant', '--image-size', '1280x960', '-o', str(lens)]) == 0
+        assert (
+            cli.main(
+                [
+                    'calibrate',
+                    str(scene[0] / 'observations.csv'),
+                    '--model',
+                    'equidistant',
+                    '--image-size',
+                    '1280x960',
+                    '-o',
+                    str(lens),
+                ]
+            )
+            == 0
+        )
         fx = load_lens(lens).fx
         assert [line.partition(',')[0] for line in shown] == [f'fx {fx:.6g}']
         assert shown[0].endswith('standard errors')
@@ -271,10 +309,23 @@ class TestCalibrate:
     def test_writes_the_lens_and_its_covariance(self, scene, capsys, tmp_path):
         folder, _, table = scene
         observations, out = str(folder / 'observations.csv'), tmp_path / 'new' / 'mine.yaml'
-        assert cli.main([
-            'calibrate', observations, '--model', 'equidistant', '--image-size', '1280x960',
-            '--free', 'f,cx,cy', '-o', str(out),
-        ]) == 0
+        assert (
+            cli.main(
+                [
+                    'calibrate',
+                    observations,
+                    '--model',
+                    'equidistant',
+                    '--image-size',
+                    '1280x960',
+                    '--free',
+                    'f,cx,cy',
+                    '-o',
+                    str(out),
+                ]
+            )
+            == 0
+        )
         shown, err = capsys.readouterr()
         assert f'{len(table)} points in 6 frames' in shown
         assert err == ''
@@ -287,10 +338,13 @@ class TestCalibrate:
         covariance = np.array(lens.calibration.pop('covariance'))
         assert np.sqrt(np.diag(covariance)) == pytest.approx([*stderr.values()])
         assert lens.calibration == {
-            'rms_px': pytest.approx(0.1 * np.sqrt(2), rel=0.1), 'observations': len(table),
-            'frames': 6, 'source': observations,
+            'rms_px': pytest.approx(0.1 * np.sqrt(2), rel=0.1),
+            'observations': len(table),
+            'frames': 6,
+            'source': observations,
             'reached_deg': pytest.approx(
-                np.degrees(back_project(LENS, table.uv).theta.max()), 0.01),
+                np.degrees(back_project(LENS, table.uv).theta.max()), 0.01
+            ),
         }
         document = json.loads(out.with_suffix('.calibrate.json').read_text())
         assert document['sigma_px'] == pytest.approx(0.1, rel=0.1)
@@ -314,8 +368,23 @@ class TestCalibrate:
     ):
         folder, _, _ = scene
         observations = str(folder / 'observations.csv')
-        assert cli.main(['calibrate', observations, '--model', 'equidistant', '--image-size',
-                         '1280x960', '--free', 'f,cx,cy', '-o', str(tmp_path / 'mine.yaml')]) == 0
+        assert (
+            cli.main(
+                [
+                    'calibrate',
+                    observations,
+                    '--model',
+                    'equidistant',
+                    '--image-size',
+                    '1280x960',
+                    '--free',
+                    'f,cx,cy',
+                    '-o',
+                    str(tmp_path / 'mine.yaml'),
+                ]
+            )
+            == 0
+        )
         page = (tmp_path / 'mine.calibrate.html').read_text()
         assert '`' not in page and 'noise of the image points is unknown (no sigma)' in page
         for heading in ('Parameters', 'Coverage', 'Residuals', 'Uncertainty'):
@@ -333,8 +402,21 @@ class TestCalibrate:
         write_observations(tmp_path / 'middle.csv', table.take(middle))
         said = {}
         for path in (folder / 'observations.csv', tmp_path / 'middle.csv'):
-            assert cli.main(['calibrate', str(path), '--model', 'equidistant', '--image-size',
-                             '1280x960', '-o', str(out)]) == 0
+            assert (
+                cli.main(
+                    [
+                        'calibrate',
+                        str(path),
+                        '--model',
+                        'equidistant',
+                        '--image-size',
+                        '1280x960',
+                        '-o',
+                        str(out),
+                    ]
+                )
+                == 0
+            )
             said[path.stem] = capsys.readouterr()
         assert said['observations'].err == ''
         assert 'photograph the target near the edges' in said['middle'].err
@@ -347,23 +429,56 @@ class TestCalibrate:
         _, _, table = scene
         write_observations(tmp_path / 'left.csv', replace(table, cameras=('left',)))
         for out, lens in (('lens.yaml', 'lens.yaml'), ('rig', 'rig/left.yaml')):
-            assert cli.main(['calibrate', str(tmp_path / 'left.csv'), '--model', 'equidistant',
-                             '--image-size', '1280x960', '-o', str(tmp_path / out)]) == 0
+            assert (
+                cli.main(
+                    [
+                        'calibrate',
+                        str(tmp_path / 'left.csv'),
+                        '--model',
+                        'equidistant',
+                        '--image-size',
+                        '1280x960',
+                        '-o',
+                        str(tmp_path / out),
+                    ]
+                )
+                == 0
+            )
             assert load_lens(tmp_path / lens).name == 'left'
 
     def test_an_image_size_that_is_too_large_is_doubted(self, scene, capsys):
         folder, _, _ = scene
-        assert cli.main(['calibrate', str(folder / 'observations.csv'), '--model', 'equidistant',
-                         '--image-size', '1920x1080']) == 0
+        assert (
+            cli.main(
+                [
+                    'calibrate',
+                    str(folder / 'observations.csv'),
+                    '--model',
+                    'equidistant',
+                    '--image-size',
+                    '1920x1080',
+                ]
+            )
+            == 0
+        )
         assert 'the principal point lies -30' in capsys.readouterr().err  # 650 - 959.5
 
     def test_prints_without_writing(self, scene, capsys, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         folder, _, _ = scene
-        assert cli.main([
-            'calibrate', str(folder / 'observations.csv'), '--model', 'kannala_brandt',
-            '--image-size', '1280x960',
-        ]) == 0
+        assert (
+            cli.main(
+                [
+                    'calibrate',
+                    str(folder / 'observations.csv'),
+                    '--model',
+                    'kannala_brandt',
+                    '--image-size',
+                    '1280x960',
+                ]
+            )
+            == 0
+        )
         assert 'k4' in capsys.readouterr().out
         assert list(tmp_path.iterdir()) == []
 
@@ -382,7 +497,8 @@ class TestCalibrate:
         for port in ('flat:-1mm:1.5', 'flat:1mm:9', 'dome:-1mm'):
             assert f': --port {port}: port: ' in refused(capsys, *sized, '--port', port)
         assert ': --medium 9: port: medium_index' in refused(
-            capsys, *sized, '--medium', '9', '--port', 'flat:-1mm')
+            capsys, *sized, '--medium', '9', '--port', 'flat:-1mm'
+        )
         assert "no parameter 'k1'" in refused(capsys, *sized, '--free', 'f,k1')
         assert 's0 is confounded' in refused(capsys, *sized, '--free', 'f,s0')
         out = tmp_path / 'lens.yaml'
@@ -407,7 +523,8 @@ class TestCalibrate:
 
         monkeypatch.setattr('fisheye_svp_ros.study.trust.assess_lens', trust)
         assert 'the fitted lens has no rays to some of the observed points' in refused(
-            capsys, 'calibrate', scene[0] / 'observations.csv', '--image-size', '1280x960')
+            capsys, 'calibrate', scene[0] / 'observations.csv', '--image-size', '1280x960'
+        )
 
 
 class TestCommandLine:
@@ -448,7 +565,8 @@ class TestCommandLine:
 
     def test_interrupt_is_silent(self, tmp_path):
         (tmp_path / 'a.yaml').write_text(
-            f'synthetic_camera: {{ros__parameters: {{sweep.seed: {list(range(9000))}}}}}')
+            f'synthetic_camera: {{ros__parameters: {{sweep.seed: {list(range(9000))}}}}}'
+        )
         running = process('sweep', tmp_path / 'a.yaml', '-o', tmp_path / 'out')
         until(lambda: (tmp_path / 'out' / 'parts' / 'sweep.txt').exists())
         running.send_signal(signal.SIGINT)
@@ -471,9 +589,7 @@ class TestCommandLine:
 
     def test_broken_pipe_is_silent(self, scene):
         folder, _, _ = scene
-        running = process(
-            'localize', folder / 'observations.csv', '--lens', folder / 'lens.yaml'
-        )
+        running = process('localize', folder / 'observations.csv', '--lens', folder / 'lens.yaml')
         running.stdout.close()
         err = running.stderr.read()
         running.wait(timeout=60)
@@ -493,25 +609,47 @@ class TestCommandLine:
 @pytest.mark.skipif(not OV_PLANE.exists(), reason='the measured data are not here')
 def test_measured_data(tmp_path):
     lens = tmp_path / 'lens.yaml'
-    assert cli.main([
-        'calibrate', str(OV_PLANE / 'train.csv'), '--model', 'kannala_brandt',
-        '--image-size', '1280x800', '-o', str(lens),
-    ]) == 0
+    assert (
+        cli.main(
+            [
+                'calibrate',
+                str(OV_PLANE / 'train.csv'),
+                '--model',
+                'kannala_brandt',
+                '--image-size',
+                '1280x800',
+                '-o',
+                str(lens),
+            ]
+        )
+        == 0
+    )
     assert load_lens(lens).calibration['rms_px'] <= 0.482
     test = str(OV_PLANE / 'test.csv')
     assert cli.main(['localize', test, '--lens', str(lens), '-o', str(tmp_path)]) == 0
     assert json.loads((tmp_path / 'localize.json').read_text())['rms_px'] <= 0.475
 
 
-@pytest.mark.parametrize(('words', 'said'), [
-    (['localize', 'o.csv', '--lens', 'fish21'],
-     "'fish21' is neither a file nor one of the lenses of this package: fish180, fish214"),
-    (['localize', 'o.csv', '--lens', '/dev/zero'],
-     "'/dev/zero' is neither a file nor one of the lenses of this package: fish180, fish214"),
-    (['sweep', 'nois'], "'nois' is neither a file nor one of the sweeps of this package: env"),
-    (['diagnose', 'o.csv', '--lens', 'fish214', '--held_out', 'x'],
-     'unknown argument --held_out; did you mean --held-out? (see fisheye-svp diagnose --help)'),
-    (['plot', 'x', '--foo'], 'unknown argument --foo (see fisheye-svp plot --help)'),
-])
+@pytest.mark.parametrize(
+    ('words', 'said'),
+    [
+        (
+            ['localize', 'o.csv', '--lens', 'fish21'],
+            "'fish21' is neither a file nor one of the lenses of this package: fish180, fish214",
+        ),
+        (
+            ['localize', 'o.csv', '--lens', '/dev/zero'],
+            "'/dev/zero' is neither a file nor one of the lenses of this package: "
+            'fish180, fish214',
+        ),
+        (['sweep', 'nois'], "'nois' is neither a file nor one of the sweeps of this package: env"),
+        (
+            ['diagnose', 'o.csv', '--lens', 'fish214', '--held_out', 'x'],
+            'unknown argument --held_out; did you mean --held-out? (see fisheye-svp '
+            'diagnose --help)',
+        ),
+        (['plot', 'x', '--foo'], 'unknown argument --foo (see fisheye-svp plot --help)'),
+    ],
+)
 def test_a_slip_is_answered_with_what_there_is(words, said, capsys):
     assert said in refused(capsys, *words)

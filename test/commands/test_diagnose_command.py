@@ -113,9 +113,16 @@ class TestFiles:
         # Both beside the noise, though the table says nothing of it.
         assert found['base']['chi2_per_dof'] > 1.2
         assert found['extended']['chi2_per_dof'] == pytest.approx(1.0, abs=0.2)
-        cause, = found['causes']
-        assert {'effect', 'parameters', 'p_value', 'heldout_rms_px', 'gain',
-                'indistinguishable_from', 'to_separate'} <= set(cause)
+        (cause,) = found['causes']
+        assert {
+            'effect',
+            'parameters',
+            'p_value',
+            'heldout_rms_px',
+            'gain',
+            'indistinguishable_from',
+            'to_separate',
+        } <= set(cause)
         assert cause['effect'] == 'viewpoint_shift'
         e0 = cause['parameters']['e0']
         assert e0['unit'] == 'm'
@@ -123,8 +130,10 @@ class TestFiles:
         assert cause['survives'] is True and 0 < cause['share'] < 1
         assert isinstance(found['remaining']['structure'], list)
         parts = {part['name']: part for part in found['components']}
-        assert all(set(part) == {'name', 'stage', 'sd_px', 'share', 'named_share', 'p_value'}
-                   for part in parts.values())
+        assert all(
+            set(part) == {'name', 'stage', 'sd_px', 'share', 'named_share', 'p_value'}
+            for part in parts.values()
+        )
         assert {part['stage'] for part in parts.values()} <= {'lens', 'target', 'frame', 'noise'}
         assert sum(part['share'] for part in parts.values()) == pytest.approx(1)
         assert parts['named_lens']['named_share'] == pytest.approx(cause['share'])
@@ -139,9 +148,14 @@ class TestFiles:
         assert found['file']['extended_px'] < found['file']['given_px']
         assert found['candidates'] == []
         assert {name: one['say'] for name, one in found['decision'].items()} == {
-            'lens': 'use_extended', 'target': 'keep', 'photographs': 'enough'}
-        assert all({'say', 'why', 'figure', 'confidence'} <= set(one)
-                   for one in found['decision'].values())
+            'lens': 'use_extended',
+            'target': 'keep',
+            'photographs': 'enough',
+        }
+        assert all(
+            {'say', 'why', 'figure', 'confidence'} <= set(one)
+            for one in found['decision'].values()
+        )
         assert found['advice'][0]['gain'] > 0.5 and found['gross'] == []
         assert {tuple(entry) for entry in found['untestable']} == {('effect', 'why')}
         assert found['extended']['heldout_rms_px'] < 0.9 * found['base']['heldout_rms_px']
@@ -152,8 +166,19 @@ class TestFiles:
         assert lens.corrections == {}
         figures = []
         for path in (scene / 'lens.yaml', output / 'extended_lens.yaml'):
-            assert cli.main(['localize', str(scene / 'shift.csv'), '--lens', str(path),
-                             '-o', str(tmp_path)]) == 0
+            assert (
+                cli.main(
+                    [
+                        'localize',
+                        str(scene / 'shift.csv'),
+                        '--lens',
+                        str(path),
+                        '-o',
+                        str(tmp_path),
+                    ]
+                )
+                == 0
+            )
             figures.append(json.loads((tmp_path / 'localize.json').read_text())['rms_px'])
         found = document(output)
         assert figures[0] == pytest.approx(found['base']['rms_px'], rel=1e-3)
@@ -173,8 +198,10 @@ class TestFiles:
         names = ['frame', 'landmark', 'u', 'v', 'theta', 'range']
         table = CsvTable(output / 'residuals.csv', names)
         given = CsvTable(scene / 'shift.csv', ['frame', 'landmark', 'u', 'v'])
-        np.testing.assert_array_equal(table.numbers('frame', 'landmark', 'u', 'v'),
-                                      given.numbers('frame', 'landmark', 'u', 'v'))
+        np.testing.assert_array_equal(
+            table.numbers('frame', 'landmark', 'u', 'v'),
+            given.numbers('frame', 'landmark', 'u', 'v'),
+        )
         assert not table.integers('outlier').any()
         found = document(output)
         for side, fit in (('before', 'base'), ('after', 'named')):
@@ -191,11 +218,21 @@ class TestFiles:
         assert '@import' not in page and '<script' not in page
         for word in ('Explained', 'viewpoint_shift', 'mm', 'extended_lens.yaml', 'untestable'):
             assert word in page
-        assert re.search(r'lens \(stays in the image\): \d+ % \(\d+ identified: viewpoint_shift\)',
-                         page)
+        assert re.search(
+            r'lens \(stays in the image\): \d+ % \(\d+ identified: viewpoint_shift\)', page
+        )
         pictures = {path.stem for path in output.glob('*.png')}
-        assert pictures == {'field', 'theta', 'range', 'landmark', 'frame', 'phase', 'histogram',
-                            'evidence', 'uncertainty'}
+        assert pictures == {
+            'field',
+            'theta',
+            'range',
+            'landmark',
+            'frame',
+            'phase',
+            'histogram',
+            'evidence',
+            'uncertainty',
+        }
         assert all(path.read_bytes().startswith(b'\x89PNG') for path in output.glob('*.png'))
         assert not [path for path in output.iterdir() if path.name.startswith('.')]
 
@@ -206,8 +243,7 @@ class TestTerminal:
         assert run('shift.csv', scene, '--poses', scene / 'poses.csv') == 0
         out, err = capsys.readouterr()
         assert all(line.startswith('diagnosing: ') for line in err.splitlines())
-        said = re.search(r'position error ([\d.]+) mm → ([\d.]+) mm',
-                         ' '.join(out.split()))
+        said = re.search(r'position error ([\d.]+) mm → ([\d.]+) mm', ' '.join(out.split()))
         assert float(said[2]) < 0.5 * float(said[1])
 
     def test_next_photographs_that_cannot_be_planned_take_nothing_away(self, scene, capsys):
@@ -220,8 +256,10 @@ class TestTerminal:
     def test_a_rig_has_a_lens_a_camera(self, scene, capsys):
         table, _ = seen({})
         other = replace(table, camera=np.ones_like(table.camera), uv=table.uv + 0.1)
-        both = {name: np.concatenate([getattr(table, name), getattr(other, name)])
-                for name in ('frame', 'landmark', 'board', 'camera', 'uv', 'xyz', 't', 'sigma')}
+        both = {
+            name: np.concatenate([getattr(table, name), getattr(other, name)])
+            for name in ('frame', 'landmark', 'board', 'camera', 'uv', 'xyz', 't', 'sigma')
+        }
         write_observations(scene / 'rig.csv', replace(table, cameras=('left', 'right'), **both))
         lens = scene / 'lens.yaml'
         given = ['diagnose', scene / 'rig.csv', '--lens', f'left={lens}']
@@ -239,7 +277,8 @@ class TestTerminal:
         document = json.loads((scene / 'rig' / 'diagnosis.json').read_text())
         assert document['external']['cameras'][0]['cameras'] == ['left', 'right']
         assert load_lens(scene / 'rig' / 'right' / 'extended_lens.yaml').fx == pytest.approx(
-            LENS.fx, rel=0.01)
+            LENS.fx, rel=0.01
+        )
 
     def test_held_out_file(self, scene, capsys, tmp_path):
         assert run('shift.csv', scene, '--held-out', scene / 'test.csv') == 0
@@ -256,8 +295,22 @@ class TestTerminal:
         lens = load_lens(scene / 'lens.yaml')
         for name, scale in (('same.yaml', 1.0), ('other.yaml', 1.01)):
             save_lens(replace(lens, fx=scale * lens.fx, fy=scale * lens.fy), tmp_path / name)
-            assert cli.main(['diagnose', str(scene / 'clean.csv'), '--lens', str(tmp_path / name),
-                             '--free', 'intrinsics', '--quick', '-o', str(tmp_path)]) == 0
+            assert (
+                cli.main(
+                    [
+                        'diagnose',
+                        str(scene / 'clean.csv'),
+                        '--lens',
+                        str(tmp_path / name),
+                        '--free',
+                        'intrinsics',
+                        '--quick',
+                        '-o',
+                        str(tmp_path),
+                    ]
+                )
+                == 0
+            )
             out = ' '.join(capsys.readouterr().out.split())
             assert ('Do not use the lens as given' in out) == (scale != 1)
             assert ('Keep the lens' in out) == (scale == 1)
@@ -271,17 +324,33 @@ class TestTerminal:
     def test_intrinsics_that_are_no_better_known_are_not(self, scene, capsys, tmp_path):
         lens, names = load_lens(scene / 'lens.yaml'), ('fx', 'fy')
         known = {'stderr': dict.fromkeys(names, 3.0), 'covariance': [[9.0, 8.0], [8.0, 9.0]]}
-        save_lens(replace(lens.with_parameters(names, [1.01 * lens.fx, 1.01 * lens.fy]),
-                          calibration=known), tmp_path / 'rough.yaml')
-        assert cli.main(['diagnose', str(scene / 'clean.csv'), '--quick',
-                         '--lens', str(tmp_path / 'rough.yaml')]) == 0
+        save_lens(
+            replace(
+                lens.with_parameters(names, [1.01 * lens.fx, 1.01 * lens.fy]), calibration=known
+            ),
+            tmp_path / 'rough.yaml',
+        )
+        assert (
+            cli.main(
+                [
+                    'diagnose',
+                    str(scene / 'clean.csv'),
+                    '--quick',
+                    '--lens',
+                    str(tmp_path / 'rough.yaml'),
+                ]
+            )
+            == 0
+        )
         assert 'Keep the lens' in capsys.readouterr().out
 
     def test_a_frame_that_is_there_twice_counts_once(self, scene, capsys, tmp_path):
         table = read_observations(scene / 'clean.csv')
         again = table.take(table.frame == 3)
-        more = {name: np.concatenate([getattr(table, name), getattr(again, name)])
-                for name in ('landmark', 'uv', 'xyz', 'camera', 'board', 't', 'sigma')}
+        more = {
+            name: np.concatenate([getattr(table, name), getattr(again, name)])
+            for name in ('landmark', 'uv', 'xyz', 'camera', 'board', 't', 'sigma')
+        }
         frame = np.concatenate([table.frame, np.full(len(again), 99)])
         write_observations(tmp_path / 'twice.csv', replace(table, frame=frame, **more))
         command = ['--lens', scene / 'lens.yaml', '--quick']
@@ -291,7 +360,8 @@ class TestTerminal:
         once = capsys.readouterr().out
         name = str(scene / 'clean.csv')
         assert ' '.join(twice.out.replace(str(tmp_path / 'twice.csv'), name).split()) == (
-            ' '.join(once.split()))
+            ' '.join(once.split())
+        )
         assert 'image points repeat those of an earlier frame: frame 99' in twice.err
 
     def test_options_that_cannot_be(self, scene, capsys):
@@ -309,12 +379,15 @@ class TestTerminal:
         assert 'left out' in err and 'frame 2' in err
         assert f'in {FRAMES - 1} frames' in out
 
-    @pytest.mark.parametrize(('more', 'said'), [
-        (['--poses', 'few.csv'], 'frame 3 of'),
-        (['--poses', 'lens.yaml'], "columns 'frame', "),
-        (['--held-out', 'nothing.csv'], 'nothing.csv'),
-        (['--lens', 'nothing.yaml'], 'nothing.yaml'),
-    ])
+    @pytest.mark.parametrize(
+        ('more', 'said'),
+        [
+            (['--poses', 'few.csv'], 'frame 3 of'),
+            (['--poses', 'lens.yaml'], "columns 'frame', "),
+            (['--held-out', 'nothing.csv'], 'nothing.csv'),
+            (['--lens', 'nothing.yaml'], 'nothing.yaml'),
+        ],
+    )
     def test_bad_input(self, scene, capsys, more, said):
         assert run('shift.csv', scene, more[0], scene / more[1]) == 2
         out, err = capsys.readouterr()
@@ -345,48 +418,64 @@ class TestWords:
         assert f'do not transfer to it: with them {worse.heldout_rms_px:.3g} px' in gained
 
     def test_a_class_is_named_with_what_would_separate_it(self, found):
-        cause = replace(found.causes[0], indistinguishable_from=['flat_port', 'radial_profile'],
-                        to_separate='go nearer; or farther')
+        cause = replace(
+            found.causes[0],
+            indistinguishable_from=['flat_port', 'radial_profile'],
+            to_separate='go nearer; or farther',
+        )
         wrong, _, following = verdict_sentences(with_changes(found, causes=[cause]))
         assert 'viewpoint_shift, confounded with flat_port or radial_profile' in wrong
         assert 'to separate viewpoint_shift from flat_port and radial_profile: go nearer, or' in (
-            following)
+            following
+        )
 
     def test_unexplained(self, found):
-        left = [Structure('outliers', 0.0, 0.5), Structure('theta', 1e-9, 0.1),
-                Structure('range', 1e-9, 0.3)]
+        left = [
+            Structure('outliers', 0.0, 0.5),
+            Structure('theta', 1e-9, 0.1),
+            Structure('range', 1e-9, 0.3),
+        ]
         wrong, gained, following = verdict_sentences(
-            with_changes(found, causes=[], advice=[], remaining=left))
+            with_changes(found, causes=[], advice=[], remaining=left)
+        )
         assert 'depend on the distance of the landmark and the incidence angle' in wrong
         assert 'a few points are outliers' in wrong
         assert 'no extension improved on it' in gained
         assert 'look for the cause' in following
-        *_, following = verdict_sentences(with_changes(
-            found, remaining=[Structure('frame', 0.0, 0.5)], untestable={'focal_drift': 'no t'}))
+        *_, following = verdict_sentences(
+            with_changes(
+                found, remaining=[Structure('frame', 0.0, 0.5)], untestable={'focal_drift': 'no t'}
+            )
+        )
         assert 'give the time of each frame (a column t, s)' in following
 
     def test_frames_that_do_not_predict_each_other_leave_more_than_noise(self, found):
         for times, said in ((1.1, 'that is the noise'), (3.0, '3.0 times the noise')):
             error = replace(found.figures.base, heldout_rms_px=times * 2**0.5 * found.noise_px)
-            _, gained, _ = verdict_sentences(with_changes(
-                found, causes=[], base=error, named=error, extended=error))
+            _, gained, _ = verdict_sentences(
+                with_changes(found, causes=[], base=error, named=error, extended=error)
+            )
             assert said in gained
 
     def test_what_was_almost_named_is_told(self, found):
-        step = replace(found.trace[0], accepted=False, corrected=3e-6,
-                       why='does not predict better')
+        step = replace(
+            found.trace[0], accepted=False, corrected=3e-6, why='does not predict better'
+        )
         left = [Structure('range', 1e-9, 0.3)]
-        wrong, _, _ = verdict_sentences(with_changes(
-            found, causes=[], advice=[], remaining=left, trace=[step]))
+        wrong, _, _ = verdict_sentences(
+            with_changes(found, causes=[], advice=[], remaining=left, trace=[step])
+        )
         assert '; viewpoint_shift is significant (p = 3e-06), but does not improve' in wrong
 
     def test_what_remains_is_told_in_numbers(self, found):
         gross = [{'frame': 4, 'landmark': 17, 'px': 12.3456, 'why': 'far off'}] * 2
         left = [Structure('outliers', 0.0, 0.5), Structure('size', 0.0, 0.0)]
         extended = replace(found.figures.extended, chi2_per_dof=9.0)
-        wrong, _, _ = verdict_sentences(with_changes(
-            found, causes=[], advice=[], remaining=left, gross=gross,
-            extended=extended))
+        wrong, _, _ = verdict_sentences(
+            with_changes(
+                found, causes=[], advice=[], remaining=left, gross=gross, extended=extended
+            )
+        )
         assert '2 points are outliers, the largest frame 4 landmark 17 (12.3 px)' in wrong
         assert 'the residuals are 3 times as large as sigma states' in wrong
 
@@ -394,54 +483,69 @@ class TestWords:
         """Of several parameters the most significant one, whatever their order."""
         first = found.causes[0]
         entry = next(iter(first.parameters.values()))
-        board = replace(first, form='board_pose', share=2 * first.share, parameters={
-            f'board1.{name}': entry | {'value': 1e-3 * value, 'stderr': 1e-4, 'unit': 'm'}
-            for name, value in zip('xyz', (0.1, 0.2, 0.6), strict=True)})
+        board = replace(
+            first,
+            form='board_pose',
+            share=2 * first.share,
+            parameters={
+                f'board1.{name}': entry | {'value': 1e-3 * value, 'stderr': 1e-4, 'unit': 'm'}
+                for name, value in zip('xyz', (0.1, 0.2, 0.6), strict=True)
+            },
+        )
         words = headline(with_changes(found, causes=[first, board]))
-        assert words.startswith('The relative poses of the boards are wrong (board1.z = 0.60 ± '
-                                '0.10 mm), and the viewpoint of the lens shifts with the '
-                                'angle (e0 = ')
+        assert words.startswith(
+            'The relative poses of the boards are wrong (board1.z = 0.60 ± '
+            '0.10 mm), and the viewpoint of the lens shifts with the '
+            'angle (e0 = '
+        )
 
     def test_points_that_are_set_aside_are_no_riddle(self, found):
         gross = [{'frame': 4, 'landmark': 17, 'px': 12.3456, 'why': 'far off'}] * 2
         left = [Structure('outliers', 0.0, 0.5)]
-        clean = with_changes(found, causes=[], advice=[], remaining=left,
-                        gross=gross)
+        clean = with_changes(found, causes=[], advice=[], remaining=left, gross=gross)
         assert headline(clean).startswith('2 image points are outliers; nothing else is wrong')
         *_, following = verdict_sentences(clean)
         partly = with_changes(found, remaining=left, gross=gross)
         assert headline(partly).startswith(
-            'The viewpoint of the lens shifts with the angle (e0 = ')
+            'The viewpoint of the lens shifts with the angle (e0 = '
+        )
         more = [*left, Structure('range', 1e-9, 0.3)]
         assert headline(with_changes(clean, remaining=more)).startswith(
-            'No effect of the catalog explains the residual error')
+            'No effect of the catalog explains the residual error'
+        )
         *_, following = verdict_sentences(with_changes(clean, remaining=more))
         assert 'look for the cause' in following
 
     def test_what_happened_to_the_frames_is_no_reason_to_keep_the_lens(self, found):
         cause = replace(found.causes[0], form='rolling_shutter', to_separate='use a tripod')
         shutter = replace(found.lens, corrections={'rolling_shutter': {}})
-        told = [verdict_sentences(with_changes(
-            found, causes=[cause], advice=[], lenses={'': lens}))[2]
-            for lens in (found.lens, shutter)]
+        told = [
+            verdict_sentences(with_changes(found, causes=[cause], advice=[], lenses={'': lens}))[2]
+            for lens in (found.lens, shutter)
+        ]
         assert told[0] == 'Use extended_lens.yaml; to confirm rolling_shutter: use a tripod.'
         assert told[1].startswith('Use extended_lens.yaml; it includes rolling_shutter; to')
-        following = verdict_sentences(with_changes(
-            found, causes=[*found.causes, cause], lenses={'': shutter}))[2]
+        following = verdict_sentences(
+            with_changes(found, causes=[*found.causes, cause], lenses={'': shutter})
+        )[2]
         assert following.count('extended_lens.yaml') == 1
         worse = replace(found.figures.named, heldout_rms_px=2 * found.figures.base.heldout_rms_px)
-        refuted = verdict_sentences(with_changes(
-            found, causes=[cause], advice=[], lenses={'': shutter}, named=worse))
+        refuted = verdict_sentences(
+            with_changes(found, causes=[cause], advice=[], lenses={'': shutter}, named=worse)
+        )
         assert 'do not correct' in refuted[1]
 
     def test_a_frame_that_several_cameras_saw_is_named_once(self):
         assert advice_text(Advice('look', frames=[4, 1, 4])) == 'look (frames 4 and 1)'
 
     def test_errors_against_the_truth_go_or_stay(self, found):
-        _, gained, _ = verdict_sentences(found, {
-            'position_error_m': Comparison(0.002, 0.001, 0.5, 0.3, 0.6),
-            'depth_error_m': Comparison(0.0021, 0.002, 0.05, -0.1, 0.2),
-        })
+        _, gained, _ = verdict_sentences(
+            found,
+            {
+                'position_error_m': Comparison(0.002, 0.001, 0.5, 0.3, 0.6),
+                'depth_error_m': Comparison(0.0021, 0.002, 0.05, -0.1, 0.2),
+            },
+        )
         assert 'the position error goes from 2 mm to 1 mm' in gained
         assert 'the stereo error stays at 2 mm' in gained
 
@@ -452,17 +556,28 @@ class TestWords:
 
     def test_parameters_that_the_data_leave_open_are_not_shown(self, found):
         entry = {'value': 0.1, 'stderr': 1e20, 'unit': '1'}
-        cause = replace(found.causes[0], parameters={
-            **found.causes[0].parameters, 'open': entry,
-            'nothing': {'value': 0.0, 'stderr': float('nan'), 'unit': '1'}})
-        row, = cause_rows(with_changes(found, causes=[cause]))
+        cause = replace(
+            found.causes[0],
+            parameters={
+                **found.causes[0].parameters,
+                'open': entry,
+                'nothing': {'value': 0.0, 'stderr': float('nan'), 'unit': '1'},
+            },
+        )
+        (row,) = cause_rows(with_changes(found, causes=[cause]))
         assert row[1].startswith('e0 = ') and 'open' not in row[1] and 'nothing' not in row[1]
 
 
-@pytest.fixture(params=[np.linalg.LinAlgError('SVD did not converge'),
-                        GeometryError('frame 3 has 0 usable points in it')], ids=repr)
+@pytest.fixture(
+    params=[
+        np.linalg.LinAlgError('SVD did not converge'),
+        GeometryError('frame 3 has 0 usable points in it'),
+    ],
+    ids=repr,
+)
 def without_solution(monkeypatch, request):
     """Have the equations of a diagnosis no solution."""
+
     def singular(*_, **__):
         raise request.param
 
@@ -471,7 +586,7 @@ def without_solution(monkeypatch, request):
 
 def test_views_that_cannot_be_fitted_are_one_line(scene, without_solution, capsys):
     assert run('shift.csv', scene) == 2
-    said, = capsys.readouterr().err.strip().splitlines()
+    (said,) = capsys.readouterr().err.strip().splitlines()
     assert 'shift.csv: its views cannot be fitted with this lens: ' in said
     assert 'camera in the world' not in said
     assert run('shift.csv', scene, '--poses', scene / 'poses.csv') == 2
@@ -513,11 +628,16 @@ def test_each_camera_of_a_rig_has_pictures_of_its_own_image(tmp_path, monkeypatc
     table, _ = seen({})
     step = np.array([LENS.width, 100.0])  # the other image lies beside the first
     other = replace(table, camera=np.ones_like(table.camera), uv=table.uv + step)
-    both = {name: np.concatenate([getattr(table, name), getattr(other, name)])
-            for name in ('frame', 'landmark', 'board', 'camera', 'uv', 'xyz', 't', 'sigma')}
+    both = {
+        name: np.concatenate([getattr(table, name), getattr(other, name)])
+        for name in ('frame', 'landmark', 'board', 'camera', 'uv', 'xyz', 't', 'sigma')
+    }
     larger = replace(LENS, width=2 * LENS.width, cx=LENS.cx + step[0], cy=LENS.cy + step[1])
-    found = diagnose(replace(table, cameras=('left', 'right'), **both),
-                     {'left': LENS, 'right': larger}, options=DiagnosisOptions(quick=True))
+    found = diagnose(
+        replace(table, cameras=('left', 'right'), **both),
+        {'left': LENS, 'right': larger},
+        options=DiagnosisOptions(quick=True),
+    )
     shown = PlotData.from_diagnosis(found, point_residuals(found.simulation, found.cause_fit))
     named = {name: (draw, arguments) for name, draw, arguments in residual_pictures(shown)}
     draw, arguments = named['field']
@@ -525,18 +645,23 @@ def test_each_camera_of_a_rig_has_pictures_of_its_own_image(tmp_path, monkeypatc
     axes = figures[-1].axes
     assert [axis.get_xlim()[1] for axis in axes] == 4 * [LENS.width] + 4 * [larger.width]
     assert [axis.get_title().split(':')[0] for axis in axes if axis.get_title()] == [
-        'left before', 'left after', 'right before', 'right after']
+        'left before',
+        'left after',
+        'right before',
+        'right after',
+    ]
     for axis in axes:
         u = axis.collections[0].get_offsets()[:, 0]
         assert len(u) and ((u >= LENS.width) == (axis in axes[4:])).all()
     radial, across = diagnosis_plots._polar(
-        shown, shown.points.uv - (shown.points.camera == 1)[:, None] * step
-        - [LENS.cx, LENS.cy]).T
+        shown, shown.points.uv - (shown.points.camera == 1)[:, None] * step - [LENS.cx, LENS.cy]
+    ).T
     assert np.abs(across).max() < 1e-9 and radial.min() > 0
     evidence_plots.draw_uncertainty(tmp_path / 'uncertainty.png', found)
     images = [axis.images[0] for axis in figures[-1].axes if axis.images]
     assert [image.get_extent()[1] for image in images] == (
-        3 * [LENS.width - 0.5] + 3 * [larger.width - 0.5])
+        3 * [LENS.width - 0.5] + 3 * [larger.width - 0.5]
+    )
 
 
 def test_the_bow_of_a_board_is_measured_between_its_extremes():
@@ -547,7 +672,7 @@ def test_the_bow_of_a_board_is_measured_between_its_extremes():
     effect = TargetShapeEffect.candidates(found.model.scene)[0]
     bow = np.array([0.002, 0.0, 0.0])
     state = replace(found.model.state, terms=((effect, bow),))
-    one, = board_maps(found.model.data.views, state.terms, state.lens)
+    (one,) = board_maps(found.model.data.views, state.terms, state.lens)
     assert len(one.height) == len(board.ids)
     x = one.place[:, 0] / np.abs(one.place[:, 0]).max()
     expected = 0.002 * x**2
@@ -577,12 +702,15 @@ def test_the_depth_of_a_rig_gains_too():
     assert known_errors(found.simulation, Linearization(found.model.data, late, ()), ()) == {}
 
 
-@pytest.mark.parametrize(('board', 'included', 'found'), [
-    ('chessboard:9x6:25mm', [], ('skew', 'dot_centroid')),
-    ('circles:7x5:20mm', [], ('skew',)),
-    ('', [], ('skew',)),
-    ('chessboard:9x6:25mm', ['dot_centroid'], ('skew',)),
-])
+@pytest.mark.parametrize(
+    ('board', 'included', 'found'),
+    [
+        ('chessboard:9x6:25mm', [], ('skew', 'dot_centroid')),
+        ('circles:7x5:20mm', [], ('skew',)),
+        ('', [], ('skew',)),
+        ('chessboard:9x6:25mm', ['dot_centroid'], ('skew',)),
+    ],
+)
 def test_corners_have_no_dots(board, included, found):
     asked = SimpleNamespace(board=board, included=included, left_out=['skew'])
     assert effects_left_out(asked) == found

@@ -29,7 +29,8 @@ _ALL = {
 }
 # A block that another one begins with runs there.
 BLOCKS = [
-    pytest.param(block, id=name, marks=pytest.mark.slow) for name, block in _ALL.items()
+    pytest.param(block, id=name, marks=pytest.mark.slow)
+    for name, block in _ALL.items()
     if not any(other != block and other.startswith(block) for other in _ALL.values())
 ]
 
@@ -38,7 +39,8 @@ BLOCKS = [
 def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int) -> None:
     if 'dask' in block:
         pytest.importorskip(
-            'distributed', reason='dask.distributed is not installed (extra `dask`)')
+            'distributed', reason='dask.distributed is not installed (extra `dask`)'
+        )
         with socket.socket() as probe:
             if probe.connect_ex(('127.0.0.1', 8786)) == 0:
                 pytest.skip('somebody else has a Dask scheduler on port 8786')
@@ -56,9 +58,14 @@ def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int)
     }
     log = tmp_path / 'log'
     with log.open('w') as stream:
-        process = subprocess.Popen(['bash', '-euc', block], cwd=tmp_path, env=env,
-                                   start_new_session=True, stdout=stream,
-                                   stderr=subprocess.STDOUT)
+        process = subprocess.Popen(
+            ['bash', '-euc', block],
+            cwd=tmp_path,
+            env=env,
+            start_new_session=True,
+            stdout=stream,
+            stderr=subprocess.STDOUT,
+        )
         try:
             status = process.wait(300)
         finally:
@@ -74,7 +81,8 @@ def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int)
 def test_every_command_is_one(page: Path) -> None:
     blocks = re.findall(r'```(?:ba)?sh\n(.*?)```', page.read_text(), re.DOTALL)
     text = '\n'.join(blocks).replace('\\\n', ' ') + '\n'.join(
-        re.findall(r'`(fisheye-svp [a-z]+ [^`…]*)`', page.read_text()))
+        re.findall(r'`(fisheye-svp [a-z]+ [^`…]*)`', page.read_text())
+    )
     for command in _COMMAND.findall(text):
         name, *words = shlex.split(command.translate(str.maketrans('', '', '[]')))
         if name == '--help':
@@ -95,7 +103,11 @@ def test_architecture_names_every_room_and_what_is_there() -> None:
     for room in (ROOT / 'fisheye_svp_ros').iterdir():
         if (room / '__init__.py').exists():
             assert re.search(rf'\b{re.escape(room.name)}\b', page), room.name
-    for registry, home in (('READERS', 'io/readers.py'), ('COMMANDS', 'cli.py'),
-                           ('_drawings', 'paper/report.py'), ('CATALOGUE', 'effects/catalogue.py'),
-                           ('IMAGE_HEIGHTS', 'optics/curves.py')):
+    for registry, home in (
+        ('READERS', 'io/readers.py'),
+        ('COMMANDS', 'cli.py'),
+        ('_drawings', 'paper/report.py'),
+        ('CATALOGUE', 'effects/catalogue.py'),
+        ('IMAGE_HEIGHTS', 'optics/curves.py'),
+    ):
         assert registry in (ROOT / 'fisheye_svp_ros' / home).read_text()

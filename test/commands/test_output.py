@@ -31,14 +31,43 @@ from fisheye_svp_ros.simulate.simulation import simulate
 SWEEP = 'synthetic_camera: {ros__parameters: {sweep.seed: [1, 2, 3], noise_px: 0.2}}\n'
 COMMANDS = {
     'localize': ('localize', '{obs}', '--lens', '{lens}', '-o', '{out}'),
-    'calibrate': ('calibrate', '{obs}', '--image-size', '1536x1536', '--model', 'equidistant',
-                  '-o', '{out}/new.yaml'),
+    'calibrate': (
+        'calibrate',
+        '{obs}',
+        '--image-size',
+        '1536x1536',
+        '--model',
+        'equidistant',
+        '-o',
+        '{out}/new.yaml',
+    ),
     'sweep': ('sweep', '{sweep}', '-o', '{out}'),
     'plot': ('plot', '{table}', '-o', '{out}'),
-    'plan': ('plan', '--lens', 'fish180', '--board', 'chessboard:4x3:25mm', '--room', '0.1', '0.5',
-             '--count', '1', '-o', '{out}'),
-    'render': ('render', '--lens', 'fish180', '--board', 'chessboard:4x3:25mm', '--count', '1',
-               '-o', '{out}'),
+    'plan': (
+        'plan',
+        '--lens',
+        'fish180',
+        '--board',
+        'chessboard:4x3:25mm',
+        '--room',
+        '0.1',
+        '0.5',
+        '--count',
+        '1',
+        '-o',
+        '{out}',
+    ),
+    'render': (
+        'render',
+        '--lens',
+        'fish180',
+        '--board',
+        'chessboard:4x3:25mm',
+        '--count',
+        '1',
+        '-o',
+        '{out}',
+    ),
 }
 
 
@@ -46,15 +75,28 @@ COMMANDS = {
 def given(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Return input files by name."""
     folder, rng = tmp_path_factory.mktemp('given'), np.random.default_rng(4)
-    paths = {name: folder / f'{name}{suffix}' for name, suffix in (
-        ('obs', '.csv'), ('lens', '.yaml'), ('sweep', '.yaml'), ('table', '.csv'))}
+    paths = {
+        name: folder / f'{name}{suffix}'
+        for name, suffix in (
+            ('obs', '.csv'),
+            ('lens', '.yaml'),
+            ('sweep', '.yaml'),
+            ('table', '.csv'),
+        )
+    }
     lens = load_lens(lens_path('fish214')).svp()
-    write_observations(paths['obs'], simulate(
-        ForwardModel(lens), plane(), poses_around(plane(), 5, rng, widest=0.5), 0.1, rng))
+    write_observations(
+        paths['obs'],
+        simulate(ForwardModel(lens), plane(), poses_around(plane(), 5, rng, widest=0.5), 0.1, rng),
+    )
     save_lens(lens, paths['lens'])
     paths['sweep'].write_text(SWEEP)
-    paths['table'].write_text('radius,noise_px,localizer.rms_px\n' + ''.join(
-        f'{radius},{noise},{radius * noise}\n' for radius in (0.2, 2) for noise in (0.1, 0.3)))
+    paths['table'].write_text(
+        'radius,noise_px,localizer.rms_px\n'
+        + ''.join(
+            f'{radius},{noise},{radius * noise}\n' for radius in (0.2, 2) for noise in (0.1, 0.3)
+        )
+    )
     return paths
 
 
@@ -75,14 +117,18 @@ def full_at(size: int) -> Iterator[None]:
 
 def results(folder: Path) -> list[str]:
     """Return the names of all files but the parts of a sweep, which are kept for --resume."""
-    return sorted(path.name for path in folder.rglob('*')
-                  if path.is_file() and path.parent.name != 'parts')
+    return sorted(
+        path.name for path in folder.rglob('*') if path.is_file() and path.parent.name != 'parts'
+    )
 
 
 @pytest.mark.parametrize('name', COMMANDS)
 @pytest.mark.parametrize('size', [0, 700, 4000])
 def test_on_a_full_disk_there_is_one_line_and_no_file(
-    name: str, size: int, given: dict[str, Path], tmp_path: Path,
+    name: str,
+    size: int,
+    given: dict[str, Path],
+    tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / 'out'
@@ -99,7 +145,10 @@ def test_on_a_full_disk_there_is_one_line_and_no_file(
 
 @pytest.mark.parametrize('number', [errno.EACCES, errno.EROFS, errno.ENOSPC, errno.EDQUOT])
 def test_where_nothing_can_be_written_there_is_one_line(
-    number: int, given: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    number: int,
+    given: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     def fail(*_: Any, **__: Any) -> None:
@@ -177,10 +226,14 @@ def test_a_command_that_is_killed_leaves_all_or_nothing(
     length, outcome = time.monotonic() - begun, kills.Outcome()
     whole, rest = kills.files(tmp_path / 'whole')
     assert 'localize.json' in whole and not rest
-    for number, (how, part) in enumerate((
-        (signal.SIGTERM, 0.5), (signal.SIGTERM, 0.95), (signal.SIGKILL, 0.9),
-        (signal.SIGKILL, 0.97),
-    )):
+    for number, (how, part) in enumerate(
+        (
+            (signal.SIGTERM, 0.5),
+            (signal.SIGTERM, 0.95),
+            (signal.SIGKILL, 0.9),
+            (signal.SIGKILL, 0.97),
+        )
+    ):
         out = tmp_path / str(number)
         kills.kill(words('localize', given, out), out, how, part * length, whole, outcome)
     assert not outcome.told
@@ -197,8 +250,9 @@ os.setsid()
 subprocess.Popen(['sleep', '60'], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 print(os.getpid())
 """
-    lost = subprocess.run([sys.executable, '-c', script], stdout=subprocess.PIPE, text=True,
-                          check=True)
+    lost = subprocess.run(
+        [sys.executable, '-c', script], stdout=subprocess.PIPE, text=True, check=True
+    )
     orphans = kills.left_running(int(lost.stdout))
     assert len(orphans) == 1
     os.kill(orphans[0], signal.SIGKILL)

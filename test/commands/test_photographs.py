@@ -45,8 +45,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_beside_photographs_a_table_is_a_table(tmp_path: Path) -> None:
-    table = make_observations(np.zeros(4, dtype=int), np.arange(4), np.ones((4, 2)),
-                              np.ones((4, 3)))
+    table = make_observations(
+        np.zeros(4, dtype=int), np.arange(4), np.ones((4, 2)), np.ones((4, 3))
+    )
     write_observations(tmp_path / 'test.csv', table)
     read, sizes = read_input(str(tmp_path / 'test.csv'), Namespace(board=BOARD))
     assert len(read) == 4 and not sizes
@@ -56,8 +57,21 @@ def test_detect_then_calibrate(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / 'observations.csv'
-    assert cli.main(['detect', str(folder), '--board', BOARD, '-o', str(out),
-                     '--overlays', str(tmp_path / 'overlays')]) == 0
+    assert (
+        cli.main(
+            [
+                'detect',
+                str(folder),
+                '--board',
+                BOARD,
+                '-o',
+                str(out),
+                '--overlays',
+                str(tmp_path / 'overlays'),
+            ]
+        )
+        == 0
+    )
     said = capsys.readouterr()
     told = re.search(r'found in 10 of 11 photographs, (\d+) points', said.out)
     assert told and 290 <= int(told[1]) <= 300  # a corner at the edge may be refused
@@ -68,8 +82,19 @@ def test_detect_then_calibrate(
     assert len(list((tmp_path / 'overlays').glob('*.png'))) == 12
     assert cv2.imread(str(tmp_path / 'overlays' / '00.png')).shape[2] == 3
     assert np.isfinite(read_observations(out).sigma).all()
-    assert cli.main(['calibrate', str(out), '--free', 'fx,fy,cx,cy,k1,k2,k3,e0',
-                     '-o', str(tmp_path / 'lens.yaml')]) == 0
+    assert (
+        cli.main(
+            [
+                'calibrate',
+                str(out),
+                '--free',
+                'fx,fy,cx,cy,k1,k2,k3,e0',
+                '-o',
+                str(tmp_path / 'lens.yaml'),
+            ]
+        )
+        == 0
+    )
     lens = load_lens(tmp_path / 'lens.yaml')
     assert (lens.width, lens.calibration['frames']) == (424, 10)
     assert lens.calibration['rms_px'] < 0.1
@@ -81,8 +106,21 @@ def test_files_given_one_by_one_keep_their_names(tmp_path: Path) -> None:
     where, overlays = poses(2, 8), tmp_path / 'overlays'
     write(tmp_path / 'photos', [photograph(where.take(i), seed=i) for i in range(2)])
     files = sorted(map(str, (tmp_path / 'photos').glob('*.png')))
-    assert cli.main(['detect', *files, '--board', BOARD, '-o', str(tmp_path / 'o.csv'),
-                     '--overlays', str(overlays)]) == 0
+    assert (
+        cli.main(
+            [
+                'detect',
+                *files,
+                '--board',
+                BOARD,
+                '-o',
+                str(tmp_path / 'o.csv'),
+                '--overlays',
+                str(overlays),
+            ]
+        )
+        == 0
+    )
     assert {path.name for path in overlays.iterdir()} >= {Path(file).name for file in files}
 
 
@@ -93,10 +131,25 @@ def test_equal_names_in_two_folders_are_different_frames(
     for name, views in (('first', (0, 1)), ('second', (2, 3))):
         write(tmp_path / name, [photograph(where.take(i), seed=i) for i in views])
     folders, out = [str(tmp_path / name) for name in ('first', 'second')], tmp_path / 'o.csv'
-    assert cli.main(['detect', *folders, '--board', BOARD, '-o', str(out),
-                     '--overlays', str(tmp_path / 'overlays')]) == 0
-    assert (f'{folders[0]}, {folders[1]}: photographs of equal names are different frames of one '
-            'camera; for the cameras of a rig give the folder above') in capsys.readouterr().err
+    assert (
+        cli.main(
+            [
+                'detect',
+                *folders,
+                '--board',
+                BOARD,
+                '-o',
+                str(out),
+                '--overlays',
+                str(tmp_path / 'overlays'),
+            ]
+        )
+        == 0
+    )
+    assert (
+        f'{folders[0]}, {folders[1]}: photographs of equal names are different frames of one '
+        'camera; for the cameras of a rig give the folder above'
+    ) in capsys.readouterr().err
     assert len(read_observations(out).frames) == 4  # refused, where a landmark is twice in a frame
     assert len([*(tmp_path / 'overlays').iterdir()]) == 5
     # In one folder they would be one frame.
@@ -113,8 +166,10 @@ def test_images_in_a_subfolder_beside_photographs_are_told(
     shutil.copytree(folder, tmp_path / 'photographs' / 'second')
     (tmp_path / 'photographs' / 'empty').mkdir()
     command = ['detect', '--board', BOARD, '-o', str(tmp_path / 'out.csv')]
-    for paths, told in (['photographs'], ['second: its 11 images are skipped']), (
-            ['photographs', 'photographs/second'], []):
+    for paths, told in (
+        (['photographs'], ['second: its 11 images are skipped']),
+        (['photographs', 'photographs/second'], []),
+    ):
         assert cli.main([*command, *(str(tmp_path / path) for path in paths)]) == 0
         lines = [x for x in capsys.readouterr().err.splitlines() if 'images are skipped' in x]
         assert len(lines) == len(told)
@@ -136,8 +191,21 @@ def test_localize_photographs(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_lens(LENS, tmp_path / 'lens.yaml')
-    assert cli.main(['localize', str(folder), '--board', BOARD, '--lens',
-                     str(tmp_path / 'lens.yaml'), '-o', str(tmp_path / 'out')]) == 0
+    assert (
+        cli.main(
+            [
+                'localize',
+                str(folder),
+                '--board',
+                BOARD,
+                '--lens',
+                str(tmp_path / 'lens.yaml'),
+                '-o',
+                str(tmp_path / 'out'),
+            ]
+        )
+        == 0
+    )
     assert json.loads((tmp_path / 'out' / 'localize.json').read_text())['rms_px'] < 0.1
     said = refused(capsys, 'localize', folder, '--lens', tmp_path / 'lens.yaml')
     assert '--board chessboard' in said
@@ -148,18 +216,27 @@ def test_a_lens_of_another_image_size_is_refused(
 ) -> None:
     save_lens(replace(LENS, width=848, height=800), tmp_path / 'large.yaml')
     table = tmp_path / 'observations.csv'
-    write_observations(table, make_observations(
-        np.repeat(0, 8), np.arange(8), np.arange(16.0).reshape(8, 2), PRINTED.corners[:8]))
+    write_observations(
+        table,
+        make_observations(
+            np.repeat(0, 8), np.arange(8), np.arange(16.0).reshape(8, 2), PRINTED.corners[:8]
+        ),
+    )
     (tmp_path / 'observations.detect.json').write_text('{"image_sizes": {"": [424, 400]}}')
     photographs = str(folder), '--board', BOARD
-    for command, *rest in (('localize', str(table)), ('diagnose', str(table)),
-                           ('calibrate', str(table), '--medium', 'water'),
-                           ('localize', *photographs)):
+    for command, *rest in (
+        ('localize', str(table)),
+        ('diagnose', str(table)),
+        ('calibrate', str(table), '--medium', 'water'),
+        ('localize', *photographs),
+    ):
         assert cli.main([command, *rest, '--lens', str(tmp_path / 'large.yaml')]) == 2
         said = capsys.readouterr().err
         assert "424x400 px, lens 'small' is for 848x800 px" in said
-    for call in (lambda: fsvp.localize(table, tmp_path / 'large.yaml'),
-                 lambda: fsvp.diagnose(str(table), tmp_path / 'large.yaml')):
+    for call in (
+        lambda: fsvp.localize(table, tmp_path / 'large.yaml'),
+        lambda: fsvp.diagnose(str(table), tmp_path / 'large.yaml'),
+    ):
         with pytest.raises(LensError, match='is for 848x800 px'):
             call()
     said = refused(capsys, 'calibrate', table, '--image-size', '400x424')
@@ -174,39 +251,71 @@ def test_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for camera, pose in enumerate((where.compose(left_in_right), where)):
         image = project(LENS, pose.into_body(PRINTED.corners))
         frame, corner = np.nonzero(image.valid)
-        columns.append((frame, corner, image.uv[frame, corner], PRINTED.corners[corner],
-                        np.full(len(frame), camera)))
+        columns.append(
+            (
+                frame,
+                corner,
+                image.uv[frame, corner],
+                PRINTED.corners[corner],
+                np.full(len(frame), camera),
+            )
+        )
     frame, corner, uv, xyz, camera = (np.concatenate(part) for part in zip(*columns, strict=True))
     table = tmp_path / 'rig.csv'
-    write_observations(table, make_observations(
-        frame, corner, uv, xyz, camera=camera, cameras=('left', 'right')))
+    write_observations(
+        table, make_observations(frame, corner, uv, xyz, camera=camera, cameras=('left', 'right'))
+    )
     out = tmp_path / 'rig'
-    assert cli.main(['calibrate', str(table), '--image-size', '424x400', '--free',
-                     'fx,fy,cx,cy,k1,k2,k3,e0', '-o', str(out)]) == 0
+    assert (
+        cli.main(
+            [
+                'calibrate',
+                str(table),
+                '--image-size',
+                '424x400',
+                '--free',
+                'fx,fy,cx,cy,k1,k2,k3,e0',
+                '-o',
+                str(out),
+            ]
+        )
+        == 0
+    )
     assert '-50.0' in capsys.readouterr().out
     assert {path.name for path in out.glob('*.yaml')} == {
-        'left.yaml', 'right.yaml', 'rig.yaml', 'camchain.yaml', 'tf_static.yaml'}
+        'left.yaml',
+        'right.yaml',
+        'rig.yaml',
+        'camchain.yaml',
+        'tf_static.yaml',
+    }
     assert json.loads((out / 'rig.json').read_text())['cameras']['right']['covariance']
     lenses = [f'--lens={name}={out / name}.yaml' for name in ('left', 'right')]
     assert cli.main(['localize', str(table), *lenses, '-o', str(tmp_path / 'poses')]) == 0
     assert json.loads((tmp_path / 'poses' / 'right' / 'localize.json').read_text())['frames'] == 10
     assert 'camera right has no lens' in refused(capsys, 'localize', table, lenses[0])
     assert 'the observations hold left, right' in refused(
-        capsys, 'localize', table, f'--lens=up={out}/left.yaml')
+        capsys, 'localize', table, f'--lens=up={out}/left.yaml'
+    )
     # Both lenses in one file: Kalibr's camchain, whose cameras are the table's in its order.
-    chain = write_camchain(tmp_path / 'camchain.yaml', LENS, replace(LENS, fx=LENS.fx + 40),
-                           left_in_right)
-    assert cli.main(['localize', str(table), f'--lens={chain}',
-                     '-o', str(tmp_path / 'chain')]) == 0
-    left, right = (json.loads((tmp_path / 'chain' / name / 'localize.json').read_text())['rms_px']
-                   for name in ('left', 'right'))
+    chain = write_camchain(
+        tmp_path / 'camchain.yaml', LENS, replace(LENS, fx=LENS.fx + 40), left_in_right
+    )
+    assert (
+        cli.main(['localize', str(table), f'--lens={chain}', '-o', str(tmp_path / 'chain')]) == 0
+    )
+    left, right = (
+        json.loads((tmp_path / 'chain' / name / 'localize.json').read_text())['rms_px']
+        for name in ('left', 'right')
+    )
     assert left < 1 < right
 
 
 def test_lenses_of_one_file_go_by_name_or_by_order(tmp_path: Path) -> None:
     other = replace(LENS, fx=LENS.fx + 1)
-    given = load_lenses([str(write_camchain(tmp_path / 'two.yaml', LENS, other,
-                                            rig('parallel', 0.1)))])
+    given = load_lenses(
+        [str(write_camchain(tmp_path / 'two.yaml', LENS, other, rig('parallel', 0.1)))]
+    )
 
     def focal(*cameras: str) -> list[float]:
         return [round(lens.fx - LENS.fx, 6) for lens in lenses_of(cameras, given).values()]
@@ -220,11 +329,14 @@ def test_lenses_of_one_file_go_by_name_or_by_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('file', ['{}.yaml', '{}/extended_lens.yaml'])
-@pytest.mark.parametrize(('folder', 'cameras'), [
-    ('rig', ('cam#0', 'links (Süd) #1')),
-    ('f=8,run#3/rig', ('cam#0', 'links (Süd) #1')),
-    ('rig', ('front/left', 'front/links (Süd) #1')),
-])
+@pytest.mark.parametrize(
+    ('folder', 'cameras'),
+    [
+        ('rig', ('cam#0', 'links (Süd) #1')),
+        ('f=8,run#3/rig', ('cam#0', 'links (Süd) #1')),
+        ('rig', ('front/left', 'front/links (Süd) #1')),
+    ],
+)
 def test_lenses_of_a_folder_may_have_any_name(
     tmp_path: Path, folder: str, cameras: tuple[str, str], file: str
 ) -> None:
@@ -238,11 +350,18 @@ def test_lenses_of_a_folder_may_have_any_name(
         assert one.fx == pytest.approx(LENS.fx + 1)
 
 
-@pytest.mark.parametrize(('camera', 'lens', 'note'), [
-    ('right', 'right', ''),
-    ('', 'left', 'rig/: it holds left, right, and no camera is named; the lens of left is used; '
-     'use {0}#right for another'),
-])
+@pytest.mark.parametrize(
+    ('camera', 'lens', 'note'),
+    [
+        ('right', 'right', ''),
+        (
+            '',
+            'left',
+            'rig/: it holds left, right, and no camera is named; the lens of left is used; '
+            'use {0}#right for another',
+        ),
+    ],
+)
 def test_one_camera_of_a_rig_has_its_own_lens(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], camera: str, lens: str, note: str
 ) -> None:
@@ -252,8 +371,12 @@ def test_one_camera_of_a_rig_has_its_own_lens(
     image = project(of_lens, poses(4, 3).into_body(PRINTED.corners))
     frame, corner = np.nonzero(image.valid)
     table, rig_folder = tmp_path / 'one.csv', f'{tmp_path}/rig/'
-    write_observations(table, make_observations(
-        frame, corner, image.uv[frame, corner], PRINTED.corners[corner], cameras=(camera,)))
+    write_observations(
+        table,
+        make_observations(
+            frame, corner, image.uv[frame, corner], PRINTED.corners[corner], cameras=(camera,)
+        ),
+    )
     out = tmp_path / 'out'
     assert cli.main(['localize', str(table), '--lens', rig_folder, '-o', str(out)]) == 0
     assert note.format(rig_folder) in capsys.readouterr().err
@@ -279,10 +402,13 @@ def test_what_does_not_fit_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.skipif(not PHOTOS.exists(), reason='the photographs are not here')
-@pytest.mark.parametrize(('folder', 'board', 'frames', 'rms'), [
-    ('chessboard', 'chessboard:4x6:30mm', 26, 0.25),
-    ('square_grid', 'squares:3x4:30mm:30mm', 22, 0.65),
-])
+@pytest.mark.parametrize(
+    ('folder', 'board', 'frames', 'rms'),
+    [
+        ('chessboard', 'chessboard:4x6:30mm', 26, 0.25),
+        ('square_grid', 'squares:3x4:30mm:30mm', 22, 0.65),
+    ],
+)
 def test_real_photographs(
     tmp_path: Path, folder: str, board: str, frames: int, rms: float
 ) -> None:
@@ -305,26 +431,55 @@ def test_few_boards_may_be_another_board(
     assert f'no {BOARD} in most photographs; check kind and size (inner corners)' in said
 
 
-@pytest.mark.parametrize('said', [
-    ('--seed', '-1'), ('--blur', 'nan'), ('--noise', 'inf'), ('--bow', 'nan'),
-    ('--ranges', '0.1', 'inf'),
-])
+@pytest.mark.parametrize(
+    'said',
+    [
+        ('--seed', '-1'),
+        ('--blur', 'nan'),
+        ('--noise', 'inf'),
+        ('--bow', 'nan'),
+        ('--ranges', '0.1', 'inf'),
+    ],
+)
 def test_render_with_what_is_no_size(said, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    assert cli.main(['render', '--lens', 'fish180', '--board', BOARD, '-o', str(tmp_path / 'a'),
-                     '--count', '1', *said]) == 2
+    assert (
+        cli.main(
+            [
+                'render',
+                '--lens',
+                'fish180',
+                '--board',
+                BOARD,
+                '-o',
+                str(tmp_path / 'a'),
+                '--count',
+                '1',
+                *said,
+            ]
+        )
+        == 2
+    )
     assert said[0] in capsys.readouterr().err
     assert not (tmp_path / 'a').exists()
 
 
-@pytest.mark.parametrize('said', [
-    ('--count', '3', '--poses', 'poses.csv'), ('--ranges', '0.1', '0.2', '--poses', 'poses.csv'),
-    ('--ranges', '0.1', '0.2', '--target', 'room'),
-])
+@pytest.mark.parametrize(
+    'said',
+    [
+        ('--count', '3', '--poses', 'poses.csv'),
+        ('--ranges', '0.1', '0.2', '--poses', 'poses.csv'),
+        ('--ranges', '0.1', '0.2', '--target', 'room'),
+    ],
+)
 def test_render_refuses_what_has_no_effect(
     said: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(['render', '--lens', 'fish180', '--board', BOARD, '-o', str(tmp_path / 'a'),
-                     *said]) == 2
+    assert (
+        cli.main(
+            ['render', '--lens', 'fish180', '--board', BOARD, '-o', str(tmp_path / 'a'), *said]
+        )
+        == 2
+    )
     err = capsys.readouterr().err
     assert f'{said[0]} is of ' in err and err.count('\n') == 1
     assert not (tmp_path / 'a').exists()
@@ -333,19 +488,62 @@ def test_render_refuses_what_has_no_effect(
 def test_render_and_example_are_deterministic(tmp_path: Path) -> None:
     save_lens(LENS, tmp_path / 'lens.yaml')
     for name in ('one', 'two'):
-        assert cli.main(['render', '--lens', str(tmp_path / 'lens.yaml'), '--board', BOARD,
-                         '--count', '2', '--bow', '1', '-o', str(tmp_path / name)]) == 0
+        assert (
+            cli.main(
+                [
+                    'render',
+                    '--lens',
+                    str(tmp_path / 'lens.yaml'),
+                    '--board',
+                    BOARD,
+                    '--count',
+                    '2',
+                    '--bow',
+                    '1',
+                    '-o',
+                    str(tmp_path / name),
+                ]
+            )
+            == 0
+        )
     assert (tmp_path / 'one/001.png').read_bytes() == (tmp_path / 'two/001.png').read_bytes()
     assert len(read_observations(tmp_path / 'one/observations.csv').frames) == 2
 
 
 def test_the_truth_about_a_room(tmp_path: Path) -> None:
     save_lens(LENS, tmp_path / 'lens.yaml')
-    assert cli.main(['render', '--lens', str(tmp_path / 'lens.yaml'), '--board', BOARD, '--target',
-                     'room', '--count', '3', '-o', str(tmp_path)]) == 0
+    assert (
+        cli.main(
+            [
+                'render',
+                '--lens',
+                str(tmp_path / 'lens.yaml'),
+                '--board',
+                BOARD,
+                '--target',
+                'room',
+                '--count',
+                '3',
+                '-o',
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
     assert len(set(read_observations(tmp_path / 'observations.csv').board.tolist())) > 3
-    assert cli.main(['localize', str(tmp_path / 'observations.csv'), '--lens',
-                     str(tmp_path / 'lens.yaml'), '-o', str(tmp_path / 'found')]) == 0
+    assert (
+        cli.main(
+            [
+                'localize',
+                str(tmp_path / 'observations.csv'),
+                '--lens',
+                str(tmp_path / 'lens.yaml'),
+                '-o',
+                str(tmp_path / 'found'),
+            ]
+        )
+        == 0
+    )
     found, true = (read_poses(tmp_path / name).pose for name in ('found/poses.csv', 'poses.csv'))
     assert np.abs(found.position - true.position).max() < 1e-6
 
@@ -354,8 +552,19 @@ def test_photographs_of_before_are_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_lens(LENS, tmp_path / 'lens.yaml')
-    command = ['render', '--lens', str(tmp_path / 'lens.yaml'), '--board', BOARD,
-               '-o', str(tmp_path / 'out'), '--ranges', '0.1', '0.2', '--count']
+    command = [
+        'render',
+        '--lens',
+        str(tmp_path / 'lens.yaml'),
+        '--board',
+        BOARD,
+        '-o',
+        str(tmp_path / 'out'),
+        '--ranges',
+        '0.1',
+        '0.2',
+        '--count',
+    ]
     assert cli.main([*command, '2']) == cli.main([*command, '2']) == 0
     assert capsys.readouterr().err == ''
     assert cli.main([*command, '1']) == 0

@@ -21,8 +21,10 @@ from fisheye_svp_ros.study.dependence import curves, grid, noise_spreads, swept_
 from fisheye_svp_ros.study.sweep import plan_sweep, sweep_rows
 
 TABLE = {
-    'radius': [1.0, 1.0, 2.0, 2.0, 1.0, 2.0], 'environment': ['a', 'a', 'a', 'a', 'b', 'b'],
-    'seed': [0, 1, 0, 1, 0, 0], 'shift_scale': [1.0] * 6,
+    'radius': [1.0, 1.0, 2.0, 2.0, 1.0, 2.0],
+    'environment': ['a', 'a', 'a', 'a', 'b', 'b'],
+    'seed': [0, 1, 0, 1, 0, 0],
+    'shift_scale': [1.0] * 6,
     'localizer.rms_px': [1.0, 3.0, 5.0, None, -7.0, 8.0],
 }
 
@@ -52,12 +54,20 @@ def test_a_picture_shows_no_more_curves_than_can_be_told_apart(
     monkeypatch.setattr('fisheye_svp_ros.reporting.sweep_plots.legend_below', lambda *_: None)
     rows = list(product([1.0, 2.0], range(7), 'abc'))
     radius, scale, environment = (list(column) for column in zip(*rows, strict=True))
-    draw_table({'radius': radius, 'shift_scale': scale, 'environment': environment,
-                'localizer.rms_px': [float(i) for i in range(len(rows))]}, tmp_path)
+    draw_table(
+        {
+            'radius': radius,
+            'shift_scale': scale,
+            'environment': environment,
+            'localizer.rms_px': [float(i) for i in range(len(rows))],
+        },
+        tmp_path,
+    )
     figure = next(one for one in drawn if one.axes[0].get_xlabel().startswith('range'))
     labels = [line.get_label() for line in figure.axes[0].lines]
-    assert labels == [f'shift_scale {i}, environment {name}' for i in (0, 2, 4, 6)
-                      for name in 'ac']
+    assert labels == [
+        f'shift_scale {i}, environment {name}' for i in (0, 2, 4, 6) for name in 'ac'
+    ]
     assert '4 of 7 values of shift_scale; 2 of 3 values of environment' in str(figure.texts)
 
 
@@ -68,18 +78,24 @@ def test_a_grid_holds_magnitudes() -> None:
 
 
 def test_of_calibrations_only_those_of_all_sets_count() -> None:
-    table = {'radius': [1.0] * 3, 'set': [0, 1, 2], 'sets': [3, 3, 3],
-             'stereo_calibrator.position_error_m': [9.0, 8.0, 1.0]}
-    curve, = curves(table, 'stereo_calibrator.position_error_m', 'radius', [])
+    table = {
+        'radius': [1.0] * 3,
+        'set': [0, 1, 2],
+        'sets': [3, 3, 3],
+        'stereo_calibrator.position_error_m': [9.0, 8.0, 1.0],
+    }
+    (curve,) = curves(table, 'stereo_calibrator.position_error_m', 'radius', [])
     assert curve.median.tolist() == [1.0]
 
 
 def test_noise_alone_leaves_what_is_predicted() -> None:
-    plan = plan_sweep({
-        'synthetic_camera': {'noise_px': 0.2, 'sweep.seed': list(range(300))},
-        'localizer': {'svp': False},
-    })
-    spread, = noise_spreads(sweep_rows(plan, range(300)), None)
+    plan = plan_sweep(
+        {
+            'synthetic_camera': {'noise_px': 0.2, 'sweep.seed': list(range(300))},
+            'localizer': {'svp': False},
+        }
+    )
+    (spread,) = noise_spreads(sweep_rows(plan, range(300)), None)
     step = spread.at[1] - spread.at[0]
     assert spread.density.sum() * step == pytest.approx(1.0, abs=1e-6)
     mean = (spread.at * spread.density).sum() * step
@@ -90,12 +106,18 @@ def test_noise_alone_leaves_what_is_predicted() -> None:
 
 def test_a_sweep_is_drawn_against_everything_that_was_swept(tmp_path: Path) -> None:
     path = tmp_path / 'file.yaml'
-    path.write_text('synthetic_camera: {ros__parameters: {sweep.radius: [2.0, 0.5, 0.2], '
-                    'noise_px: 0.5, sweep.shift_scale: [0.0, 1.0], sweep.seed: [1, 2, 3]}}')
+    path.write_text(
+        'synthetic_camera: {ros__parameters: {sweep.radius: [2.0, 0.5, 0.2], '
+        'noise_px: 0.5, sweep.shift_scale: [0.0, 1.0], sweep.seed: [1, 2, 3]}}'
+    )
     assert main(['sweep', str(path), '-o', str(tmp_path / 'out')]) == 0
     assert main(['plot', str(tmp_path / 'out'), '-o', str(tmp_path / 'plots')]) == 0
-    names = ['error_against_radius.png', 'error_against_shift_scale.png',
-             'heat_map_shift_scale_radius.png', 'residuals_and_noise.png']
+    names = [
+        'error_against_radius.png',
+        'error_against_shift_scale.png',
+        'heat_map_shift_scale_radius.png',
+        'residuals_and_noise.png',
+    ]
     assert sorted(p.name for p in (tmp_path / 'plots').iterdir()) == names
     for name in names:
         image = imread(tmp_path / 'plots' / name)
@@ -124,7 +146,8 @@ def test_residuals_are_drawn_against_angle_and_range(tmp_path: Path) -> None:
     assert pictures[0].shape[1] > 500
     # Colours of their own and a legend tell lenses apart.
     assert len(np.unique(pictures[1].reshape(-1, 4), axis=0)) > (
-        len(np.unique(pictures[0].reshape(-1, 4), axis=0)))
+        len(np.unique(pictures[0].reshape(-1, 4), axis=0))
+    )
 
 
 def test_a_table_in_which_nothing_differs_is_refused(

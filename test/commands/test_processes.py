@@ -42,8 +42,10 @@ def test_children_end_with_their_parent(tmp_path: Path, number: signal.Signals) 
     waits.write_text('#!/bin/sh\nexec sleep 600\n')
     waits.chmod(0o755)
     parent = subprocess.Popen(
-        [sys.executable, '-c', _PARENT, str(waits), str(tmp_path)], stdout=subprocess.PIPE,
-        text=True)
+        [sys.executable, '-c', _PARENT, str(waits), str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     assert parent.stdout
     children = [int(word) for word in parent.stdout.readline().split()]
     assert len(children) == 2 and all(map(psutil.pid_exists, children))
@@ -58,8 +60,11 @@ def _held(pid: int) -> set[str]:
     Neither those of others, which it maps too, nor ports, which others soon have.
     """
     files = map(_target, Path(f'/proc/{pid}/fd').iterdir())
-    return {segment[1] for file in files
-            if (segment := re.fullmatch(r'/dev/shm/(fastrtps_[0-9a-f]{16})_el', file))}
+    return {
+        segment[1]
+        for file in files
+        if (segment := re.fullmatch(r'/dev/shm/(fastrtps_[0-9a-f]{16})_el', file))
+    }
 
 
 def _target(link: Path) -> str:

@@ -16,11 +16,20 @@ from fisheye_svp_ros.commands import processes
 SWEEP = 'synthetic_camera: {ros__parameters: {sweep.radius: [1.0, 2.0]}}'
 
 
-@pytest.mark.parametrize('words', [
-    ['run', 'localizer'], ['run', 'localizer', '--help'], ['watch'], ['record', '-o', 'BAG'],
-    ['record', '-o', 'BAG', '--sweep', 'FILE']])
+@pytest.mark.parametrize(
+    'words',
+    [
+        ['run', 'localizer'],
+        ['run', 'localizer', '--help'],
+        ['watch'],
+        ['record', '-o', 'BAG'],
+        ['record', '-o', 'BAG', '--sweep', 'FILE'],
+    ],
+)
 def test_without_ros_a_command_says_the_ways_to_get_it(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / 'sweep.yaml').write_text(SWEEP)
@@ -37,17 +46,24 @@ def test_a_ros_of_another_python_is_none(tmp_path: Path) -> None:
     (tmp_path / 'rclpy').mkdir()
     (tmp_path / 'rclpy' / '__init__.py').touch()
     (tmp_path / 'rclpy' / 'node.py').write_text(
-        'raise ImportError("no C extension for this Python\\nPlease refer to ...")')
+        'raise ImportError("no C extension for this Python\\nPlease refer to ...")'
+    )
     code = 'from fisheye_svp_ros.commands import processes; print(processes.missing_rclpy())'
     env = os.environ | {'PYTHONPATH': f'{tmp_path}{os.pathsep}{ROOT}'}
     done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True, text=True)
     assert done.stdout == 'no C extension for this Python\n', done.stderr
 
 
-@pytest.mark.parametrize(('given', 'taken'), [
-    ({}, 'LOCALHOST'), ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, 'SUBNET'),
-    ({'ROS_DISTRO': 'jazzy'}, None), ({'ROS_LOCALHOST_ONLY': '0'}, None),
-    ({'ROS_STATIC_PEERS': '192.0.2.1'}, None)])
+@pytest.mark.parametrize(
+    ('given', 'taken'),
+    [
+        ({}, 'LOCALHOST'),
+        ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, 'SUBNET'),
+        ({'ROS_DISTRO': 'jazzy'}, None),
+        ({'ROS_LOCALHOST_ONLY': '0'}, None),
+        ({'ROS_STATIC_PEERS': '192.0.2.1'}, None),
+    ],
+)
 def test_nodes_stay_on_this_machine_where_no_environment_says_otherwise(
     given: dict[str, str], taken: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

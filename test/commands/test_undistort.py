@@ -56,14 +56,23 @@ def matrix(document: dict[str, object], name: str) -> NDArray[np.float64]:
 
 def test_one_camera(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lens = folder / 'lenses' / 'left.yaml'
-    run(lens, folder / 'photos' / 'left' / '00.png', '-o', tmp_path, '--fov', 100, '--size',
-        '500x300', '--range', 0.3)
+    run(
+        lens,
+        folder / 'photos' / 'left' / '00.png',
+        '-o',
+        tmp_path,
+        '--fov',
+        100,
+        '--size',
+        '500x300',
+        '--range',
+        0.3,
+    )
     out = capsys.readouterr().out
     assert 'pinhole 500x300 px, f 209.77 px, 100.0 deg wide' in out
     for text in ('the maps are exact at 0.3 m', 'below 0.5 px from', 'infinity'):
         assert text in out
-    side = fsvp.undistort_maps(lens, size=(500, 300), field_of_view=np.radians(100.0),
-                               range_m=0.3)
+    side = fsvp.undistort_maps(lens, size=(500, 300), field_of_view=np.radians(100.0), range_m=0.3)
     raw = cv2.imread(str(folder / 'photos' / 'left' / '00.png'), cv2.IMREAD_GRAYSCALE)
     image = cv2.imread(str(tmp_path / '00.png'), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(image, cv2.remap(raw, side.maps.u, side.maps.v, 1))
@@ -71,7 +80,8 @@ def test_one_camera(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         arrays = dict(file)
     storage = cv2.FileStorage(str(tmp_path / 'maps.yml'), cv2.FILE_STORAGE_READ)
     for name, expected in zip(
-        ('map1', 'map2', 'mask', 'K', 'R', 'P'), (*side.maps, side.k, side.rotation, side.p),
+        ('map1', 'map2', 'mask', 'K', 'R', 'P'),
+        (*side.maps, side.k, side.rotation, side.p),
         strict=True,
     ):
         np.testing.assert_array_equal(arrays[name], expected)
@@ -100,16 +110,16 @@ def test_a_lens_of_one_viewpoint_and_maps_alone(
     run(tmp_path / 'svp.yaml', '-o', tmp_path / 'out', '--as', 'fisheye')
     out = capsys.readouterr().out
     assert 'the lens has one viewpoint: the maps are exact at every range' in out
-    assert json.loads((tmp_path / 'out' / 'undistort.json').read_text())[
-        'cameras']['small']['shift'] is None
+    assert (
+        json.loads((tmp_path / 'out' / 'undistort.json').read_text())['cameras']['small']['shift']
+        is None
+    )
     assert not (tmp_path / 'out' / 'shift.png').exists()
     ideal = load_lens(tmp_path / 'out' / 'camera_info.yaml')
     assert ideal.image_height == KannalaBrandt()  # equidistant, all coefficients 0
 
 
-def test_rows_of_a_pair_without_a_shift_agree_at_every_range(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_rows_of_a_pair_without_a_shift_agree_at_every_range(folder: Path, tmp_path: Path) -> None:
     for name, lens in (('left', LENS), ('right', RIGHT)):
         save_lens(lens.svp(), tmp_path / 'lenses' / f'{name}.yaml')
     save_rig(RIG, tmp_path / 'lenses' / 'rig.yaml')
@@ -131,9 +141,18 @@ def test_color_stays(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize('way', ['folder', 'options'])
 def test_a_rig(folder: Path, tmp_path: Path, way: str, capsys: pytest.CaptureFixture[str]) -> None:
     lenses = folder / 'lenses'
-    given: list[object] = [f'{lenses}/'] if way == 'folder' else [
-        '--lens', f'left={lenses / "left.yaml"}', '--lens', f'right={lenses / "right.yaml"}',
-        '--rig', lenses / 'rig.yaml']
+    given: list[object] = (
+        [f'{lenses}/']
+        if way == 'folder'
+        else [
+            '--lens',
+            f'left={lenses / "left.yaml"}',
+            '--lens',
+            f'right={lenses / "right.yaml"}',
+            '--rig',
+            lenses / 'rig.yaml',
+        ]
+    )
     run(*given, folder / 'photos', '-o', tmp_path, '--range', 0.2)
     out = capsys.readouterr().out
     assert 'baseline 60.21 mm; difference between the rows of left and right' in out
@@ -144,8 +163,14 @@ def test_a_rig(folder: Path, tmp_path: Path, way: str, capsys: pytest.CaptureFix
             np.testing.assert_array_equal(file['map2'], side.maps.v)
             assert file['P'] == pytest.approx(side.p)
         assert {path.name for path in (tmp_path / name).iterdir()} == {
-            '00.png', '01.png', 'camera_info.yaml', 'maps.npz', 'maps.yml', 'mask.png',
-            'shift.png'}
+            '00.png',
+            '01.png',
+            'camera_info.yaml',
+            'maps.npz',
+            'maps.yml',
+            'mask.png',
+            'shift.png',
+        }
     document = json.loads((tmp_path / 'undistort.json').read_text())
     assert document['baseline_m'] == pytest.approx(pair.baseline)
     rows = document['rows']
@@ -160,15 +185,27 @@ def lenses_by_name(folder: Path, *names: str) -> list[str]:
     return [f'--lens={name}={folder / "lenses" / name}.yaml' for name in names]
 
 
-@pytest.mark.parametrize(('names', 'said'), [
-    (('left', 'right'), 'note: left and right are not rectified as a pair, since no rig is named; '
-     'add --rig FILE\n'),
-    (('left', 'right', 'rear'), 'note: 3 cameras are not rectified as a pair; name two of them '
-     'and their rig: --lens left=LENS --lens right=LENS --rig FILE\n'),
-])
+@pytest.mark.parametrize(
+    ('names', 'said'),
+    [
+        (
+            ('left', 'right'),
+            'note: left and right are not rectified as a pair, since no rig is named; '
+            'add --rig FILE\n',
+        ),
+        (
+            ('left', 'right', 'rear'),
+            'note: 3 cameras are not rectified as a pair; name two of them '
+            'and their rig: --lens left=LENS --lens right=LENS --rig FILE\n',
+        ),
+    ],
+)
 def test_lenses_without_a_rig_are_undistorted_each_by_itself(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], names: tuple[str, ...],
-    said: str
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    names: tuple[str, ...],
+    said: str,
 ) -> None:
     lens = folder / 'lenses' / 'left.yaml'
     run(*(f'--lens={name}={lens}' for name in names), '-o', tmp_path, '--size', '64x48')
@@ -201,8 +238,9 @@ def test_no_photograph_is_lost_to_a_result_of_its_name(
 ) -> None:
     photograph = tmp_path / f'{name}.jpg'
     photograph.write_bytes((folder / 'color' / 'a.jpg').read_bytes())
-    said = refused(capsys, 'undistort', folder / 'lenses' / 'left.yaml', photograph, '-o',
-                   tmp_path / 'out')
+    said = refused(
+        capsys, 'undistort', folder / 'lenses' / 'left.yaml', photograph, '-o', tmp_path / 'out'
+    )
     assert f'{photograph}: {name}.png is a result of this command too; rename the photo' in said
     assert not (tmp_path / 'out').exists()
 
@@ -217,8 +255,9 @@ def test_what_cannot_be_done_is_said_in_a_line(
     assert "'fisheye' has no straight epipolar rows" in said
     said = refused(capsys, 'undistort', lens, photos / 'left', '--range', 0.001, *end)
     assert 'range is 0.001 m' in said
-    said = refused(capsys, 'undistort', lens, photos / 'left', '--rig',
-                   folder / 'lenses' / 'rig.yaml', *end)
+    said = refused(
+        capsys, 'undistort', lens, photos / 'left', '--rig', folder / 'lenses' / 'rig.yaml', *end
+    )
     assert 'a rig of two cameras needs two lenses, got 1' in said
     small = tmp_path / 'small'
     small.mkdir()
@@ -230,7 +269,8 @@ def test_what_cannot_be_done_is_said_in_a_line(
     assert cli.main(['undistort', str(lens), str(tmp_path / 'a.csv'), '-o', str(out)]) == 2
     assert 'no photograph can be read; images are .png' in capsys.readouterr().err
     assert 'another photograph is also called 00' in refused(
-        capsys, 'undistort', lens, *twice, *end)
+        capsys, 'undistort', lens, *twice, *end
+    )
     assert not out.exists() or not [*out.rglob('*.*')]
 
 
@@ -289,17 +329,37 @@ class TestLensForOneViewpoint:
         lens = folder / 'lenses' / 'left.yaml'
         said = refused(capsys, 'lens', lens, '-o', tmp_path / 'x.yaml', '--range', 1)
         assert '--range 1 needs --format, for example ros' in said
-        said = refused(capsys, 'lens', lens, '-o', tmp_path / 'x', '--format', 'ros',
-                       '--range', -1)
+        said = refused(
+            capsys, 'lens', lens, '-o', tmp_path / 'x', '--format', 'ros', '--range', -1
+        )
         assert "range is -1 m; lens 'small' needs more than" in said
 
 
 def test_a_rendered_rig_has_its_truth(folder: Path, tmp_path: Path) -> None:
     """Each camera sees the corners from where the rig file says that it stands."""
-    assert cli.main(['render', '--lens', f'{folder / "lenses"}/', '--board', 'chessboard:6x5:30mm',
-                     '--count', '3', '--ranges', '0.15', '0.2', '-o', str(tmp_path)]) == 0
-    table, poses_of = fsvp.read_observations(tmp_path / 'observations.csv'), fsvp.read_poses(
-        tmp_path / 'poses.csv')
+    assert (
+        cli.main(
+            [
+                'render',
+                '--lens',
+                f'{folder / "lenses"}/',
+                '--board',
+                'chessboard:6x5:30mm',
+                '--count',
+                '3',
+                '--ranges',
+                '0.15',
+                '0.2',
+                '-o',
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
+    table, poses_of = (
+        fsvp.read_observations(tmp_path / 'observations.csv'),
+        fsvp.read_poses(tmp_path / 'poses.csv'),
+    )
     assert table.cameras == ('left', 'right') and len(poses_of.pose.position) == 3
     both = {'left': (LENS, Pose(np.eye(3), np.zeros(3))), 'right': (RIGHT, RIG.inverse())}
     for number, (name, (lens, place)) in enumerate(both.items()):
@@ -308,7 +368,8 @@ def test_a_rendered_rig_has_its_truth(folder: Path, tmp_path: Path) -> None:
         seen = fsvp.project(lens, camera.inverse().transform(mine.xyz)).uv
         assert np.abs(seen - mine.uv).max() < 1e-5
         assert {path.name for path in (tmp_path / name).iterdir()} == {
-            f'{frame:03d}.png' for frame in np.unique(mine.frame)}
+            f'{frame:03d}.png' for frame in np.unique(mine.frame)
+        }
     run(f'{folder / "lenses"}/', tmp_path, '-o', tmp_path / 'out', '--range', 0.2)
     assert (tmp_path / 'out' / 'pair.png').exists()
 
@@ -317,16 +378,38 @@ def test_a_rendered_rig_has_its_truth(folder: Path, tmp_path: Path) -> None:
 def test_a_rig_of_more_cameras_than_photographs_is_rendered(
     folder: Path, tmp_path: Path, more: tuple[str, ...]
 ) -> None:
-    assert cli.main(['render', '--lens', f'{folder / "lenses"}/', '--board', 'chessboard:6x5:20mm',
-                     '--count', '1', *more, '--ranges', '0.15', '0.2', '-o', str(tmp_path)]) == 0
+    assert (
+        cli.main(
+            [
+                'render',
+                '--lens',
+                f'{folder / "lenses"}/',
+                '--board',
+                'chessboard:6x5:20mm',
+                '--count',
+                '1',
+                *more,
+                '--ranges',
+                '0.15',
+                '0.2',
+                '-o',
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
     assert len(fsvp.read_poses(tmp_path / 'poses.csv').frame) == 1
 
 
 def test_what_cannot_be_rendered_is_said_in_a_line(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    away = Pose.stack([Pose(pose.rotation, 1000 * pose.position)
-                       for pose in (poses(2).take(i) for i in range(2))])
+    away = Pose.stack(
+        [
+            Pose(pose.rotation, 1000 * pose.position)
+            for pose in (poses(2).take(i) for i in range(2))
+        ]
+    )
     write_poses(tmp_path / 'mm.csv', np.arange(2), away)
     end = '--board', 'chessboard:6x5:30mm', '-o', tmp_path / 'out'
     said = refused(capsys, 'render', '--lens', 'fish180', '--poses', tmp_path / 'mm.csv', *end)

@@ -16,10 +16,14 @@ from fisheye_svp_ros.detect.points import find_points
 from fisheye_svp_ros.simulate.render import Exposure
 
 
-@pytest.mark.parametrize(('spec', 'number'), [
-    ('circles:8x6:25mm', 2), ('circles:4x9:18mm:asymmetric', 1),
-    ('circles:4x9:18mm:asymmetric', 3),
-])
+@pytest.mark.parametrize(
+    ('spec', 'number'),
+    [
+        ('circles:8x6:25mm', 2),
+        ('circles:4x9:18mm:asymmetric', 1),
+        ('circles:4x9:18mm:asymmetric', 3),
+    ],
+)
 def test_centres_are_unbiased_and_as_sure_as_stated(spec: str, number: int) -> None:
     pattern = parse_pattern(spec)
     image, true = pattern_photograph(pattern, number)
@@ -27,8 +31,10 @@ def test_centres_are_unbiased_and_as_sure_as_stated(spec: str, number: int) -> N
     assert not isinstance(found, str), found
     assert len(found.ids) > 0.95 * len(true)
     orders = [np.argsort(turn.source) for turn in pattern.symmetries]
-    error = min((found.uv - true[order][found.ids] for order in orders),
-                key=lambda error: float(np.abs(error).max()))
+    error = min(
+        (found.uv - true[order][found.ids] for order in orders),
+        key=lambda error: float(np.abs(error).max()),
+    )
     # The middle of the ellipse is up to a tenth of a pixel beside the image of the centre.
     assert np.abs(error.mean(axis=0)).max() < 0.003
     # Centres of one photograph share what is wrong with the lens that fits it.
@@ -50,8 +56,10 @@ def test_centres_at_the_edge_of_the_field() -> None:
     image, true = pattern_photograph(pattern, 3)
     found = find_points(image, pattern, 'circles')
     assert not isinstance(found, str), found
-    error = min((found.uv - true[np.argsort(turn.source)][found.ids]
-                 for turn in pattern.symmetries), key=lambda error: float(np.abs(error).max()))
+    error = min(
+        (found.uv - true[np.argsort(turn.source)][found.ids] for turn in pattern.symmetries),
+        key=lambda error: float(np.abs(error).max()),
+    )
     outer = np.linalg.norm(found.uv - (LENS.cx, LENS.cy), axis=1) > 355
     assert outer.sum() > 3
     assert np.linalg.norm(error[outer].mean(axis=0)) < 0.006
@@ -71,8 +79,10 @@ def test_a_lens_that_is_off_the_middle_of_its_image() -> None:
     image, true = pattern_photograph(pattern, 0, lens=lens)
     found = find_points(image, pattern, 'circles')
     assert not isinstance(found, str), found
-    error = min((found.uv - true[np.argsort(turn.source)][found.ids]
-                 for turn in pattern.symmetries), key=lambda error: float(np.abs(error).max()))
+    error = min(
+        (found.uv - true[np.argsort(turn.source)][found.ids] for turn in pattern.symmetries),
+        key=lambda error: float(np.abs(error).max()),
+    )
     assert np.abs(error).max() < 0.05
 
 

@@ -33,20 +33,35 @@ def corners(
     soft = GaussianBlur(sharp, (0, 0), 5 * BLUR).reshape(SIDE, 5, SIDE, 5).mean(axis=(1, 3))
     image = 120 + 95 * np.tile(soft, (1, COUNT))
     image += NOISE * rng.standard_normal(image.shape)
-    image[:, SIDE - band:SIDE] = 0.0
+    image[:, SIDE - band : SIDE] = 0.0
     if gain:
         image = np.clip(np.round(gain * image), 0, 255).astype(np.uint8)
     start = np.stack([place[0] + SIDE * np.arange(COUNT), np.full(COUNT, place[1])], axis=-1)
-    found = fit_corners(image, start + rng.uniform(-0.3, 0.3, start.shape),
-                        np.tile(axes, (COUNT, 1, 1)), np.full(COUNT, clearance), square)
+    found = fit_corners(
+        image,
+        start + rng.uniform(-0.3, 0.3, start.shape),
+        np.tile(axes, (COUNT, 1, 1)),
+        np.full(COUNT, clearance),
+        square,
+    )
     error = (found.uv - start)[found.ok]
     return found, float(np.sqrt(((error - error.mean(axis=0)) ** 2).mean()))
 
 
-@pytest.mark.parametrize(('angle', 'clearance', 'square'), [
-    (90, 40, False), (90, 13, False), (70, 20, False), (50, 20, False), (40, 20, False),
-    (70, 9, False), (90, 6, False), (90, 12, True), (60, 20, True),
-])
+@pytest.mark.parametrize(
+    ('angle', 'clearance', 'square'),
+    [
+        (90, 40, False),
+        (90, 13, False),
+        (70, 20, False),
+        (50, 20, False),
+        (40, 20, False),
+        (70, 9, False),
+        (90, 6, False),
+        (90, 12, True),
+        (60, 20, True),
+    ],
+)
 def test_scatter_is_the_stated_sigma(angle: float, clearance: float, square: bool) -> None:
     found, scatter = corners(angle, clearance, square)
     assert found.ok.mean() > 0.97
@@ -79,8 +94,10 @@ def test_a_corner_by_the_edge_of_the_field_is_none() -> None:
     assert found.ok[1:].all()
 
 
-@pytest.mark.parametrize(('bend', 'blur', 'column', 'slope'), [
-    (1 / 200, 1.6, 20.3, 0.0), (0.0, 1.0, 6.3, 0.0), (0.0, 1.0, 20.3, 0.012)])
+@pytest.mark.parametrize(
+    ('bend', 'blur', 'column', 'slope'),
+    [(1 / 200, 1.6, 20.3, 0.0), (0.0, 1.0, 6.3, 0.0), (0.0, 1.0, 20.3, 0.012)],
+)
 def test_bent_edges_the_border_and_slopes_of_light_move_no_corner(
     bend: float, blur: float, column: float, slope: float
 ) -> None:

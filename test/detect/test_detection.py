@@ -62,10 +62,10 @@ def reasons(detection: Detection) -> dict[str, str]:
 
 
 def test_a_damaged_jpeg_is_called_so_and_libjpeg_writes_nothing(
-    capfd: pytest.CaptureFixture[str]
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     data = cv2.imencode('.jpg', photograph(poses(1).take(0)))[1].tobytes()
-    half = data[:len(data) // 2] + data[-2:]
+    half = data[: len(data) // 2] + data[-2:]
     seen = examine(_Task(Photograph('a.jpg', 'a', '', 0.0, half), PATTERN, 'quick'))
     assert seen.size == (LENS.width, LENS.height)
     assert 'damaged' in seen.notes[0]
@@ -73,7 +73,7 @@ def test_a_damaged_jpeg_is_called_so_and_libjpeg_writes_nothing(
 
 
 def test_corners_do_not_depend_on_where_the_search_saw_them(
-    monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Windows about rough points lean to one side, and reach into the next edge."""
     pose = poses(1).take(0)
@@ -81,8 +81,10 @@ def test_corners_do_not_depend_on_where_the_search_saw_them(
     rough = np.random.default_rng(0).uniform(-2, 2, true.shape)
 
     def seen(off: float) -> np.ndarray:
-        monkeypatch.setattr('fisheye_svp_ros.detect.points.DETECTORS', {
-            'saddle': ((), lambda *_: (np.arange(len(true)), true + off * rough))})
+        monkeypatch.setattr(
+            'fisheye_svp_ros.detect.points.DETECTORS',
+            {'saddle': ((), lambda *_: (np.arange(len(true)), true + off * rough))},
+        )
         points = find_points(image, PATTERN, 'saddle')
         assert not isinstance(points, str)
         assert len(points.ids) == len(true)
@@ -115,22 +117,43 @@ def test_live_corners_are_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class TestPatterns:
-    @pytest.mark.parametrize('spec', [
-        'chessboard', 'chessboard:9x6', 'chessboard:9x6:24', 'chessboard:9x6:-1mm',
-        'chessboard:2x6:1mm', 'chessboard:9x6:24m', 'checker:9x6:24mm', 'chessboard:9x6:1.2.3mm',
-        'charuco:5x4:20mm:30mm', 'squares:3x4:30mm', 'circles:3x4:1mm:symmetric',
-        'aprilgrid:missing.yaml', 'chessboard:900x600:1mm',
-    ])
+    @pytest.mark.parametrize(
+        'spec',
+        [
+            'chessboard',
+            'chessboard:9x6',
+            'chessboard:9x6:24',
+            'chessboard:9x6:-1mm',
+            'chessboard:2x6:1mm',
+            'chessboard:9x6:24m',
+            'checker:9x6:24mm',
+            'chessboard:9x6:1.2.3mm',
+            'charuco:5x4:20mm:30mm',
+            'squares:3x4:30mm',
+            'circles:3x4:1mm:symmetric',
+            'aprilgrid:missing.yaml',
+            'chessboard:900x600:1mm',
+        ],
+    )
     def test_refused_in_one_line(self, spec: str) -> None:
         with pytest.raises(ParameterError) as error:
             parse_pattern(spec)
         assert '\n' not in str(error.value)
 
-    @pytest.mark.parametrize(('spec', 'said'), [
-        ('charuco:7x5:30mm:22mm:DICT_9X9_1', 'no dictionary DICT_9X9_1; known are DICT_4X4_50, '),
-        ('charuco:20x20:30mm:22mm:dict_5x5_100', 'it needs 200 markers, and DICT_5X5_100 has 100'),
-        ('aprilgrid:', "board 'aprilgrid:': the file of a Kalibr target is needed"),
-    ])
+    @pytest.mark.parametrize(
+        ('spec', 'said'),
+        [
+            (
+                'charuco:7x5:30mm:22mm:DICT_9X9_1',
+                'no dictionary DICT_9X9_1; known are DICT_4X4_50, ',
+            ),
+            (
+                'charuco:20x20:30mm:22mm:dict_5x5_100',
+                'it needs 200 markers, and DICT_5X5_100 has 100',
+            ),
+            ('aprilgrid:', "board 'aprilgrid:': the file of a Kalibr target is needed"),
+        ],
+    )
     def test_what_is_refused_is_named(self, spec: str, said: str) -> None:
         with pytest.raises(ParameterError, match=re.escape(said)):
             parse_pattern(spec)
@@ -143,11 +166,20 @@ class TestPatterns:
             if name != 'DICT_ARUCO_MIP_36H12' or hasattr(cv2.aruco, 'DICT_ARUCO_MIP_36h12'):
                 assert len(dictionary_of(pattern).bytesList) == count
 
-    @pytest.mark.parametrize(('spec', 'ways'), [
-        ('chessboard:9x6:24mm', 1), ('chessboard:6x4:24mm', 2), ('chessboard:5x3:24mm', 2),
-        ('chessboard:5x5:24mm', 2), ('chessboard:4x4:24mm', 4), ('circles:5x4:2cm', 2),
-        ('circles:4x4:2cm', 4), ('circles:4x11:2cm:asymmetric', 1), ('squares:3x4:30mm:20mm', 2),
-    ])
+    @pytest.mark.parametrize(
+        ('spec', 'ways'),
+        [
+            ('chessboard:9x6:24mm', 1),
+            ('chessboard:6x4:24mm', 2),
+            ('chessboard:5x3:24mm', 2),
+            ('chessboard:5x5:24mm', 2),
+            ('chessboard:4x4:24mm', 4),
+            ('circles:5x4:2cm', 2),
+            ('circles:4x4:2cm', 4),
+            ('circles:4x11:2cm:asymmetric', 1),
+            ('squares:3x4:30mm:20mm', 2),
+        ],
+    )
     def test_in_how_many_ways_it_looks_the_same(self, spec: str, ways: int) -> None:
         assert len(parse_pattern(spec).symmetries) == ways
 
@@ -157,8 +189,9 @@ class TestPatterns:
 
     def test_kalibr_target(self, tmp_path: Path) -> None:
         path = tmp_path / 'april.yaml'
-        path.write_text("target_type: 'aprilgrid'\ntagCols: 3\ntagRows: 2\ntagSize: 0.05\n"
-                        'tagSpacing: 0.3\n')
+        path.write_text(
+            "target_type: 'aprilgrid'\ntagCols: 3\ntagRows: 2\ntagSize: 0.05\ntagSpacing: 0.3\n"
+        )
         pattern = parse_pattern(f'aprilgrid:{path}')
         assert pattern.points[6] == pytest.approx([0.065 + 0.05, 0.05, 0])
 
@@ -180,7 +213,7 @@ class TestCorners:
         for row in range(6):
             for column in range(row % 2, 7, 2):
                 v, u = 20 + 50 * row, 15 + 50 * column
-                drawn[v:v + 50, u:u + 50] = 25
+                drawn[v : v + 50, u : u + 50] = 25
         points = find_points(cv2.GaussianBlur(drawn, (0, 0), 1.0), PATTERN, 'saddle')
         assert not isinstance(points, str), points
         v, u = np.mgrid[:5, :6].reshape(2, -1) * 50.0
@@ -247,9 +280,17 @@ class TestCorners:
         """To find none takes OpenCV up to half a second, to find a board 2 ms."""
         searched: list[tuple[int, ...]] = []
         finder = DETECTORS['quick'][1]
-        monkeypatch.setattr('fisheye_svp_ros.detect.points.DETECTORS', {
-            'quick': (('chessboard',), lambda image, pattern: (
-                searched.append(image.shape), finder(image, pattern))[1])})
+        monkeypatch.setattr(
+            'fisheye_svp_ros.detect.points.DETECTORS',
+            {
+                'quick': (
+                    ('chessboard',),
+                    lambda image, pattern: (searched.append(image.shape), finder(image, pattern))[
+                        1
+                    ],
+                )
+            },
+        )
         pose = poses(4, 2).take(0)
         image, true = photograph(pose), true_corners(pose)
         here = find_points(cv2.resize(image, None, fx=3, fy=3), PATTERN, 'quick', 3 * true)
@@ -260,8 +301,11 @@ class TestCorners:
 
     def test_a_board_of_another_size_is_no_board(self) -> None:
         assert isinstance(
-            find_points(photograph(poses(1).take(0)), parse_pattern('chessboard:9x8:30mm'),
-                        'saddle'), str)
+            find_points(
+                photograph(poses(1).take(0)), parse_pattern('chessboard:9x8:30mm'), 'saddle'
+            ),
+            str,
+        )
 
     def test_a_grid_that_lies_a_square_off_is_no_board(self, monkeypatch: Any) -> None:
         pose = poses(4, 2).take(0)
@@ -269,8 +313,10 @@ class TestCorners:
         beyond = 2 * grid[:, -1:] - grid[:, -2:-1]
         off = np.concatenate([grid[:, 1:], beyond], axis=1).reshape(-1, 2)
         found = np.arange(len(off)), off
-        monkeypatch.setattr('fisheye_svp_ros.detect.points.DETECTORS', {
-            'saddle': (('chessboard',), lambda *_: found)})
+        monkeypatch.setattr(
+            'fisheye_svp_ros.detect.points.DETECTORS',
+            {'saddle': (('chessboard',), lambda *_: found)},
+        )
         assert 'shifted by one square' in str(find_points(photograph(pose), PATTERN, 'saddle'))
 
     def test_a_steep_board_out_of_focus(self) -> None:
@@ -293,8 +339,7 @@ class TestTags:
     def warped(self, flat: np.ndarray) -> tuple:
         """Show a flat print obliquely; return the picture and the homography."""
         turn = np.array([[0.5, 0.06, 60], [-0.04, 0.47, 80], [1.2e-4, 0.8e-4, 1]])
-        image = cv2.warpPerspective(flat, turn, (520, 480), flags=cv2.INTER_AREA,
-                                    borderValue=255)
+        image = cv2.warpPerspective(flat, turn, (520, 480), flags=cv2.INTER_AREA, borderValue=255)
         image = cv2.GaussianBlur(image, (0, 0), 0.7)
         return image, turn
 
@@ -322,7 +367,8 @@ class TestTags:
         if not hasattr(cv2.aruco, 'CharucoDetector'):
             pytest.skip('boards are drawn by OpenCV 4.7 or newer')
         board = cv2.aruco.CharucoBoard(
-            (6, 5), 0.04, 0.028, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100))
+            (6, 5), 0.04, 0.028, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+        )
         image, turn = self.warped(board.generateImage((960, 800)))
         points = find_points(image, pattern, 'charuco')
         assert not isinstance(points, str), points
@@ -331,16 +377,29 @@ class TestTags:
         expected = cv2.perspectiveTransform(flat[None], turn)[0]
         assert np.abs(points.uv - expected).max() < 0.5
 
-    @pytest.mark.parametrize(('name', 'value'), [
-        ('tagCols', '1.5'), ('tagCols', '1000000'), ('tagRows', '600'), ('tagSize', '1e300'),
-        ('tagSize', '.nan'), ('tagSpacing', '-1'),
-    ])
+    @pytest.mark.parametrize(
+        ('name', 'value'),
+        [
+            ('tagCols', '1.5'),
+            ('tagCols', '1000000'),
+            ('tagRows', '600'),
+            ('tagSize', '1e300'),
+            ('tagSize', '.nan'),
+            ('tagSpacing', '-1'),
+        ],
+    )
     def test_an_aprilgrid_that_cannot_be(self, tmp_path: Path, name: str, value: str) -> None:
-        given = {'tagCols': '3', 'tagRows': '2', 'tagSize': '0.1', 'tagSpacing': '0.3',
-                 name: value}
+        given = {
+            'tagCols': '3',
+            'tagRows': '2',
+            'tagSize': '0.1',
+            'tagSpacing': '0.3',
+            name: value,
+        }
         path = tmp_path / 'a.yaml'
-        path.write_text('target_type: aprilgrid\n' + ''.join(
-            f'{key}: {text}\n' for key, text in given.items()))
+        path.write_text(
+            'target_type: aprilgrid\n' + ''.join(f'{key}: {text}\n' for key, text in given.items())
+        )
         with pytest.raises(ParameterError, match=name):
             parse_pattern(f'aprilgrid:{path}')
 
@@ -348,8 +407,9 @@ class TestTags:
         if not hasattr(cv2, 'aruco'):
             pytest.skip('this OpenCV has no markers')
         path = tmp_path / 'april.yaml'
-        path.write_text("target_type: 'aprilgrid'\ntagCols: 3\ntagRows: 2\ntagSize: 0.1\n"
-                        'tagSpacing: 0.3\n')
+        path.write_text(
+            "target_type: 'aprilgrid'\ntagCols: 3\ntagRows: 2\ntagSize: 0.1\ntagSpacing: 0.3\n"
+        )
         pattern = parse_pattern(f'aprilgrid:{path}')
         flat = np.full((700, 1000), 255, np.uint8)
         cell, gap = 20, 60  # a tag of ten cells; 0.1 m are 200 px
@@ -359,11 +419,11 @@ class TestTags:
             draw = getattr(cv2.aruco, 'generateImageMarker', None) or cv2.aruco.drawMarker
             picture = draw(dictionary, tag, 10 * cell, borderBits=2)
             u, v = left + 260 * (tag % 3), bottom - 200 - 260 * (tag // 3)
-            flat[v:v + 200, u:u + 200] = picture
+            flat[v : v + 200, u : u + 200] = picture
         for row in range(3):
             for column in range(4):
                 u, v = left - gap + 260 * column, bottom - 260 * row
-                flat[v:v + gap, u:u + gap] = 0
+                flat[v : v + gap, u : u + gap] = 0
         image, turn = self.warped(flat)
         points = find_points(image, pattern, 'aprilgrid')
         assert not isinstance(points, str), points
@@ -377,15 +437,16 @@ class TestTags:
         if not hasattr(cv2, 'aruco'):
             pytest.skip('this OpenCV has no markers')
         path = tmp_path / 'april.yaml'
-        path.write_text('{target_type: aprilgrid, tagCols: 2, tagRows: 1, tagSize: 0.1, '
-                        'tagSpacing: 0.3}')
+        path.write_text(
+            '{target_type: aprilgrid, tagCols: 2, tagRows: 1, tagSize: 0.1, tagSpacing: 0.3}'
+        )
         pattern = parse_pattern(f'aprilgrid:{path}')
         flat = np.full((300, 500), 255, np.uint8)
         assert find_points(flat, pattern, 'aprilgrid') == 'no board found'
         dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
         draw = getattr(cv2.aruco, 'generateImageMarker', None) or cv2.aruco.drawMarker
         for tag in range(2):
-            flat[70:230, 60 + 208 * tag:220 + 208 * tag] = draw(dictionary, tag, 160)
+            flat[70:230, 60 + 208 * tag : 220 + 208 * tag] = draw(dictionary, tag, 160)
         why = find_points(flat, pattern, 'aprilgrid')
         assert isinstance(why, str) and 'a border of one cell' in why
 
@@ -399,7 +460,8 @@ class TestTags:
         # A camera with f = 400 px that sees the board turned by 35 deg
         place = cv2.Rodrigues(np.radians([-20.0, 28.0, 4.0]))[0][:, :2] / 3000
         turn = np.array([[400.0, 0, 260], [0, 400, 240], [0, 0, 1]]) @ np.column_stack(
-            [place, [0.0, 0.0, 0.33] - place @ [550.0, 450.0]])
+            [place, [0.0, 0.0, 0.33] - place @ [550.0, 450.0]]
+        )
         image = cv2.warpPerspective(flat, turn, (520, 480), flags=cv2.INTER_AREA, borderValue=255)
         image = cv2.GaussianBlur(image, (0, 0), 0.7)
         points = find_points(image, pattern, 'circles')
@@ -414,7 +476,7 @@ class TestTags:
         pattern = parse_pattern('squares:3x4:40mm:30mm')
         flat = np.full((900, 800), 255, np.uint8)
         for x, y in pattern.points[::4, :2] * 2500 + 150:
-            flat[round(y):round(y) + 100, round(x):round(x) + 100] = 0
+            flat[round(y) : round(y) + 100, round(x) : round(x) + 100] = 0
         if shadow:
             flat[300:] = (0.5 * flat[300:]).astype(np.uint8)
             flat[:, 340:] = (0.6 * flat[:, 340:] + 30).astype(np.uint8)
@@ -438,16 +500,22 @@ class TestPhotographs:
         cv2.imwrite(str(folder / '10_copy.png'), images[0])
         cv2.imwrite(str(folder / '11_blank.png'), np.full_like(images[0], 128))
         cv2.imwrite(str(folder / '12_size.png'), images[1][:-10])
-        cv2.imwrite(str(folder / '13_colour.jpg'), cv2.cvtColor(
-            photograph(where.take(4)), cv2.COLOR_GRAY2BGR), [cv2.IMWRITE_JPEG_QUALITY, 98])
+        cv2.imwrite(
+            str(folder / '13_colour.jpg'),
+            cv2.cvtColor(photograph(where.take(4)), cv2.COLOR_GRAY2BGR),
+            [cv2.IMWRITE_JPEG_QUALITY, 98],
+        )
         data = (folder / '13_colour.jpg').read_bytes()
-        (folder / '14_cut.jpg').write_bytes(data[:len(data) // 2])
+        (folder / '14_cut.jpg').write_bytes(data[: len(data) // 2])
         (folder / '15_empty.png').write_bytes(b'')
         (folder / '16_text.png').write_text('no image')
-        cv2.imwrite(str(folder / '17_soft.png'), photograph(
-            where.take(5), exposure=Exposure(blur=2.5)))
-        cv2.imwrite(str(folder / '18_burnt.png'), photograph(
-            where.take(5), exposure=Exposure(gain=1.5), seed=2))
+        cv2.imwrite(
+            str(folder / '17_soft.png'), photograph(where.take(5), exposure=Exposure(blur=2.5))
+        )
+        cv2.imwrite(
+            str(folder / '18_burnt.png'),
+            photograph(where.take(5), exposure=Exposure(gain=1.5), seed=2),
+        )
         deep = photograph(where.take(3), seed=3).astype(np.uint16) * 200
         cv2.imwrite(str(folder / '19_deep.png'), deep)
         return folder
@@ -461,8 +529,15 @@ class TestPhotographs:
     def test_the_odd_ones_are_named_and_the_rest_goes_on(self, detection: Detection) -> None:
         said = reasons(detection)
         assert {name for name, reason in said.items() if not reason} == {
-            '00.png', '01.png', '02.png', '03.png', '13_colour.jpg', '17_soft.png',
-            '18_burnt.png', '19_deep.png'}
+            '00.png',
+            '01.png',
+            '02.png',
+            '03.png',
+            '13_colour.jpg',
+            '17_soft.png',
+            '18_burnt.png',
+            '19_deep.png',
+        }
         assert 'a copy of' in said['10_copy.png']
         assert said['11_blank.png'] == 'no board found'
         assert 'is 424x390 px; the others are 424x400' in said['12_size.png']
@@ -501,7 +576,11 @@ class TestPhotographs:
         detection = found(tmp_path)
         assert detection.image_size == (424, 400)
         assert [*reasons(detection).values()] == [
-            '', '', 'is 424x390 px; the others are 424x400', *('no board found',) * 4]
+            '',
+            '',
+            'is 424x390 px; the others are 424x400',
+            *('no board found',) * 4,
+        ]
 
     def test_a_rig_by_its_folders(self, tmp_path: Path) -> None:
         images = [photograph(poses(2, 4).take(i)) for i in range(2)]
@@ -536,14 +615,17 @@ class TestCameras:
     def cameras(self, *paths: Path) -> list[tuple[str, str]]:
         return [(one.camera, one.key) for one in find_photographs([str(p) for p in paths])]
 
-    @pytest.mark.parametrize(('files', 'cameras'), [
-        (['left/1.png', 'right/1.png'], [('left', '1'), ('right', '1')]),
-        (['cam0/7.png', 'cam1/7.png'], [('cam0', '7'), ('cam1', '7')]),
-        (['left01.png', 'right01.png'], [('left', '01'), ('right', '01')]),
-        (['photos/1.png'], [('', '1')]),
-        (['left01.png', 'left02.png'], [('', 'left01'), ('', 'left02')]),
-        (['1.png', 'results/1.png'], [('', '1')]),
-    ])
+    @pytest.mark.parametrize(
+        ('files', 'cameras'),
+        [
+            (['left/1.png', 'right/1.png'], [('left', '1'), ('right', '1')]),
+            (['cam0/7.png', 'cam1/7.png'], [('cam0', '7'), ('cam1', '7')]),
+            (['left01.png', 'right01.png'], [('left', '01'), ('right', '01')]),
+            (['photos/1.png'], [('', '1')]),
+            (['left01.png', 'left02.png'], [('', 'left01'), ('', 'left02')]),
+            (['1.png', 'results/1.png'], [('', '1')]),
+        ],
+    )
     def test_folders_and_names(
         self, tmp_path: Path, files: list[str], cameras: list[tuple[str, str]]
     ) -> None:
@@ -552,17 +634,27 @@ class TestCameras:
             (tmp_path / name).touch()
         assert self.cameras(tmp_path) == cameras
 
-    @pytest.mark.parametrize(('files', 'told'), [
-        (['left01.png', 'right01.png', 'notes.png'], 'those of one camera, since notes.png names'),
-        (['left01.png', 'right01.png'], ''),
-        (['left01.png', 'other.png'], ''),
-        (['1.png', 'results/1.png'], 'results: its 1 images are skipped'),
-        (['1.png', 'results/1.txt'], ''),
-        (['1.png', 'second/left/1.png', 'second/right/1.png'],
-         'second: its 2 images are skipped'),
-        (['left/1.png', 'right/1.png', 'left/old/1.png'],
-         'left/old: its 1 images are skipped'),
-    ])
+    @pytest.mark.parametrize(
+        ('files', 'told'),
+        [
+            (
+                ['left01.png', 'right01.png', 'notes.png'],
+                'those of one camera, since notes.png names',
+            ),
+            (['left01.png', 'right01.png'], ''),
+            (['left01.png', 'other.png'], ''),
+            (['1.png', 'results/1.png'], 'results: its 1 images are skipped'),
+            (['1.png', 'results/1.txt'], ''),
+            (
+                ['1.png', 'second/left/1.png', 'second/right/1.png'],
+                'second: its 2 images are skipped',
+            ),
+            (
+                ['left/1.png', 'right/1.png', 'left/old/1.png'],
+                'left/old: its 1 images are skipped',
+            ),
+        ],
+    )
     def test_what_may_not_be_meant_is_told(
         self, tmp_path: Path, files: list[str], told: str
     ) -> None:
@@ -573,13 +665,18 @@ class TestCameras:
         assert len(lines) == bool(told)
         assert all(told in line for line in lines)
 
-    @pytest.mark.parametrize(('topics', 'cameras'), [
-        (['/image_raw', '/image_raw/compressed'], ['']),
-        (['/left/image', '/right/image'], ['left', 'right']),
-        (['/camera/left/image_raw/compressed'], ['left']),
-        (['/cam0/image_raw', '/cam0/image_raw/compressed', '/cam1/image_raw/compressed'],
-         ['cam0', 'cam1']),
-    ])
+    @pytest.mark.parametrize(
+        ('topics', 'cameras'),
+        [
+            (['/image_raw', '/image_raw/compressed'], ['']),
+            (['/left/image', '/right/image'], ['left', 'right']),
+            (['/camera/left/image_raw/compressed'], ['left']),
+            (
+                ['/cam0/image_raw', '/cam0/image_raw/compressed', '/cam1/image_raw/compressed'],
+                ['cam0', 'cam1'],
+            ),
+        ],
+    )
     def test_topics(self, tmp_path: Path, topics: list[str], cameras: list[str]) -> None:
         store = get_typestore(Stores.ROS2_JAZZY)
         make = store.types
@@ -610,16 +707,17 @@ def test_a_png_that_announces_more_than_it_holds(tmp_path: Path) -> None:
     good = cv2.imencode('.png', np.zeros((48, 64), np.uint8))[1].tobytes()
     for place in (33, good.index(b'IEND') - 4):
         data = bytearray(good)
-        data[place:place + 4] = b'\x7f\xff\xff\xf0'  # a length; OpenCV 5 makes room for it
+        data[place : place + 4] = b'\x7f\xff\xff\xf0'  # a length; OpenCV 5 makes room for it
         with pytest.raises(ObservationError, match='the PNG is incomplete'):
             decode_image(bytes(data), 'x')
 
 
 def test_a_jpeg_of_thousands_of_scans_is_not_decoded() -> None:
-    data = cv2.imencode('.jpg', np.zeros((48, 64), np.uint8),
-                        [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    data = cv2.imencode('.jpg', np.zeros((48, 64), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[
+        1
+    ].tobytes()
     assert decode_image(data, 'x').shape == (48, 64)
-    again = data[data.rindex(b'\xff\xda'):-2]
+    again = data[data.rindex(b'\xff\xda') : -2]
     with pytest.raises(ObservationError, match='more than 32 scans'):
         decode_image(data[:-2] + 40 * again + data[-2:], 'x')
 
@@ -629,8 +727,20 @@ def test_a_small_file_of_a_huge_image_is_not_decoded(tmp_path: Path) -> None:
     path, side = tmp_path / 'a.pgm', 20_000
     path.write_bytes(b'P5 %d %d 255 ' % (side, side))
     done = subprocess.run(
-        [sys.executable, '-m', 'fisheye_svp_ros.cli', 'detect', path, '--board',
-         'chessboard:9x6:24mm', '-o', tmp_path / 'a.csv'], capture_output=True, text=True)
+        [
+            sys.executable,
+            '-m',
+            'fisheye_svp_ros.cli',
+            'detect',
+            path,
+            '--board',
+            'chessboard:9x6:24mm',
+            '-o',
+            tmp_path / 'a.csv',
+        ],
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 2
     assert 'larger than 67 megapixels, or broken' in done.stderr and 'Traceback' not in done.stderr
 
@@ -672,8 +782,7 @@ class TestOrder:
         rig = Pose(np.diag([-1.0, -1.0, 1.0]), np.array([0.02, 0.0, 0.0]))
         truth = {'left': left, 'right': left.compose(rig)}
         for name, where in truth.items():
-            write(tmp_path / name,
-                  [photograph(where.take(i), board, seed=i) for i in range(12)])
+            write(tmp_path / name, [photograph(where.take(i), board, seed=i) for i in range(12)])
         table = found(tmp_path, 'chessboard:6x4:30mm').observations
         turned: dict[int, set[bool]] = {}
         for i in range(12):

@@ -53,10 +53,10 @@ def test_a_board_that_is_not_there_is_looked_for_a_few_times(
 
 
 def test_once_a_board_is_found_all_are_searched_thoroughly(
-    tmp_path: Path, looks: list[Look], images: list[np.ndarray],
-    monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, looks: list[Look], images: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And those before it once more, with the result of a thorough search."""
+
     def blind(image: np.ndarray, pattern: object) -> None:
         """See nothing at a first look but in the last photographs."""
         return real(image, pattern) if image[0, 0] != 7 else None
@@ -69,7 +69,8 @@ def test_once_a_board_is_found_all_are_searched_thoroughly(
     write(tmp_path, [EMPTY] * 4 + hidden[:2] + [EMPTY] * 2 + images[2:])
     seen = found(tmp_path)
     assert [one.points is not None for one in seen.searched] == [False] * 4 + [True] * 2 + [
-        False] * 2 + [True] * 2
+        False
+    ] * 2 + [True] * 2
     assert looks == [Look.SAMPLE] * 3 + [Look.FIRST_SEARCH] * 6 + [Look.THOROUGH] * 6
     for one, image in zip(seen.searched[4:6], hidden, strict=False):
         alone = points.find_points(image, parse_pattern(BOARD), 'saddle')
@@ -99,7 +100,7 @@ def test_what_cannot_be_read_again_is_searched_at_once() -> None:
 
 
 def test_a_first_look_is_at_the_scale_at_which_large_images_are_searched_first(
-    images: list[np.ndarray]
+    images: list[np.ndarray],
 ) -> None:
     large = cv2.resize(images[0], None, fx=6, fy=6, interpolation=cv2.INTER_CUBIC)
     pattern = parse_pattern(BOARD)

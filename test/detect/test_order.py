@@ -24,8 +24,10 @@ def views(board, rng, count=20):
 
 def test_cameras_that_are_no_rig_are_turned_by_themselves():
     rng = np.random.default_rng(5)
-    one, other = (Pose(rotation_from_vector(rng.normal(size=(9, 3))), rng.normal(size=(9, 3)))
-                  for _ in range(2))
+    one, other = (
+        Pose(rotation_from_vector(rng.normal(size=(9, 3))), rng.normal(size=(9, 3)))
+        for _ in range(2)
+    )
     assert of_rig(one, other, PATTERN.points[:, :2], PATTERN.symmetries) is None
     still = one.compose(other.take(0))
     assert not of_rig(one, still, PATTERN.points[:, :2], PATTERN.symmetries).any()

@@ -28,8 +28,10 @@ def aprilgrid(tmp_path: Path) -> Pattern:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(('number', 'exposure', 'share'), [
-    (0, Exposure(), 0.95), (2, Exposure(noise=6.0), 0.95), (4, Exposure(blur=1.5), 0.85)])
+@pytest.mark.parametrize(
+    ('number', 'exposure', 'share'),
+    [(0, Exposure(), 0.95), (2, Exposure(noise=6.0), 0.95), (4, Exposure(blur=1.5), 0.85)],
+)
 def test_bent_small_and_noisy_tags(
     aprilgrid: Pattern, number: int, exposure: Exposure, share: float
 ) -> None:
@@ -77,10 +79,15 @@ def test_what_is_hidden_is_not_reached(aprilgrid: Pattern) -> None:
     assert np.abs(found.uv - true[found.ids]).max() < 0.2
 
 
-@pytest.mark.parametrize(('columns', 'said'), [
-    (6, ''), (5, r'\d+ of \d+ tags have ids beyond the 5x5 board; check tagCols and tagRows')])
+@pytest.mark.parametrize(
+    ('columns', 'said'),
+    [(6, ''), (5, r'\d+ of \d+ tags have ids beyond the 5x5 board; check tagCols and tagRows')],
+)
 def test_tags_beyond_the_board_are_told(
-    aprilgrid: Pattern, tmp_path: Path, capsys: pytest.CaptureFixture[str], columns: int,
+    aprilgrid: Pattern,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    columns: int,
     said: str,
 ) -> None:
     for number in (1, 2):

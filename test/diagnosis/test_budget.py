@@ -17,8 +17,10 @@ def state():
     """Return data and a fit that holds three causes, two of which undo most of each other."""
     rng = np.random.default_rng(4)
     pose, views = scene(rng, 1, 12)
-    terms = [(CATALOGUE['decentering'](), np.array([0.004, 0.002])),
-             (CATALOGUE['skew'](), np.array([3e-4]))]
+    terms = [
+        (CATALOGUE['decentering'](), np.array([0.004, 0.002])),
+        (CATALOGUE['skew'](), np.array([3e-4])),
+    ]
     data = group_by_frame(observe(lens(), tuple(terms), pose, views, 0.1, rng))
     found = with_effect(initial_state(data, lens()), *terms[0])
     for name in ('sensor_tilt', 'skew'):
@@ -37,8 +39,9 @@ def displacement(null, names):
     frames, rows, _ = linear.frame_columns.shape
     poses = np.zeros((frames, rows, frames, 6))
     poses[np.arange(frames), :, np.arange(frames)] = linear.frame_columns
-    taken = np.concatenate([poses.reshape(frames * rows, -1),
-                            shared[..., :2].reshape(frames * rows, -1)], axis=1)
+    taken = np.concatenate(
+        [poses.reshape(frames * rows, -1), shared[..., :2].reshape(frames * rows, -1)], axis=1
+    )
     apart = signal.ravel() - taken @ np.linalg.lstsq(taken, signal.ravel(), rcond=None)[0]
     weight = linear.row_weight[linear.row_mask]
     return 2 * float(np.mean((apart[linear.row_mask.ravel()] / weight) ** 2))

@@ -34,8 +34,10 @@ def test_a_third_without_it_refutes_a_cause(last, refuting):
 def test_views_of_one_frame_without_a_rig_are_in_one_third():
     """Nine views of three frames that no rig holds together ended in an IndexError."""
     one = photographs(AIR, None, 6, 0.1, 2)
-    both = {name: np.concatenate([getattr(one, name)] * 2)
-            for name in ('frame', 'landmark', 'board', 'uv', 'xyz', 't', 'sigma')}
+    both = {
+        name: np.concatenate([getattr(one, name)] * 2)
+        for name in ('frame', 'landmark', 'board', 'uv', 'xyz', 't', 'sigma')
+    }
     camera = np.repeat([0, 1], len(one.frame))
     pair = replace(one, cameras=('left', 'right'), camera=camera, **both)
     data = unpair_cameras(group_by_frame(pair))

@@ -29,7 +29,8 @@ SAME = FileFigure(0.1, 0.1, 0.01, -0.2, 0.2, 0.55)
 SMALL = EffectBound('viewpoint_shift', 0.0004, 'm', 0.7, 0.02, 0.05)
 LIKELY = EffectBound('viewpoint_shift', 0.0092, 'm', 2.6, 0.32, 0.58)
 SOUND = LensFacts(
-    [], [], False, (0.0, 0.0), SAME, LensOffset(0.3, 0.8, 0.6, 0.1), [SMALL], 0.05, True, 12)
+    [], [], False, (0.0, 0.0), SAME, LensOffset(0.3, 0.8, 0.6, 0.1), [SMALL], 0.05, True, 12
+)
 
 
 def test_a_sound_lens_is_kept_with_the_bound() -> None:
@@ -44,8 +45,10 @@ def test_a_lens_off_by_three_of_its_errors_is_to_be_calibrated_again(causes: lis
     off = SOUND._replace(offset=LensOffset(1.2, 3.0, 0.001, 1.5), causes=causes, file=BETTER)
     found = decide_lens(off)
     assert found.say == 'recalibrate'
-    assert found.why == ('the lens as given is off by at least 1.2 mrad (1.5 px) at 1 m, 3.0 '
-                         'times the combined standard error')
+    assert found.why == (
+        'the lens as given is off by at least 1.2 mrad (1.5 px) at 1 m, 3.0 '
+        'times the combined standard error'
+    )
     assert off.offset is not None
     left = decide_lens(off._replace(offset=off.offset._replace(camera='left')))
     assert left.why.startswith('the lens of left as given is off')
@@ -83,25 +86,41 @@ def test_what_is_likely_and_not_confirmed_keeps_the_lens_from_being_kept() -> No
 
 
 def test_an_error_that_rises_on_the_fitted_frames_recommends_nothing() -> None:
-    facts = SOUND._replace(causes=['target_shape'], named_gain=(0.8, 0.7), file=BETTER,
-                           falling=False)
+    facts = SOUND._replace(
+        causes=['target_shape'], named_gain=(0.8, 0.7), file=BETTER, falling=False
+    )
     found = decide_lens(facts)
     assert found.say == 'undecided' and found.confidence == 0.0
 
 
-@pytest.mark.parametrize('facts', [
-    SOUND._replace(bounds=[LIKELY]),
-    SOUND._replace(lens_causes=['sensor_tilt'], causes=['sensor_tilt'], named_gain=(0.1, 0.02)),
-    SOUND._replace(causes=['focal_length']),
-])
+@pytest.mark.parametrize(
+    'facts',
+    [
+        SOUND._replace(bounds=[LIKELY]),
+        SOUND._replace(
+            lens_causes=['sensor_tilt'], causes=['sensor_tilt'], named_gain=(0.1, 0.02)
+        ),
+        SOUND._replace(causes=['focal_length']),
+    ],
+)
 def test_no_reason_begins_with_the_name_of_an_effect(facts: LensFacts) -> None:
     """Reasons begin sentences: the first screen had "Sensor_tilt is confirmed"."""
     first = decide_lens(facts).why.split()[0]
     assert '_' not in first and first in ('likely', 'it', 'the')
 
 
-TARGET = TargetFacts(['target_shape'], 'board 0 is bent by 0.81 mm', (0.82, 0.76, 1.0), 0.137,
-                     0.05, 4e-5, 1e-6, 0.043, False, 12)
+TARGET = TargetFacts(
+    ['target_shape'],
+    'board 0 is bent by 0.81 mm',
+    (0.82, 0.76, 1.0),
+    0.137,
+    0.05,
+    4e-5,
+    1e-6,
+    0.043,
+    False,
+    12,
+)
 
 
 def test_the_target_is_judged_apart() -> None:
@@ -116,7 +135,7 @@ def test_the_target_is_judged_apart() -> None:
 
 
 def test_a_correction_that_gains_nothing_is_not_blamed_on_offsets_of_nothing() -> None:
-    """"In addition, local offsets cause 0 px (0 % sure)" stood beside a board that was assumed."""
+    """Once "In addition, local offsets cause 0 px (0 % sure)" stood beside an assumed board."""
     found = decide_target(TARGET._replace(gain=(-0.2, -0.5, 0.0), local_px=0.0, local_m=0.0))
     assert found.why.endswith('the correction does not lower the held-out error significantly')
     assert found.confidence is None
@@ -129,7 +148,8 @@ def test_photographs_are_enough_or_not() -> None:
     assert decide_photographs(facts._replace(bad=['1.jpg'])).say == 'enough'
     few = facts._replace(frames=9)
     assert decide_photographs(few._replace(bad=['1.jpg'])).why == (
-        '1 of 9 scatters more than the others or is an outlier as a whole')
+        '1 of 9 scatters more than the others or is an outlier as a whole'
+    )
     assert '1 of 9 is not predicted' in decide_photographs(few._replace(unlike=['1.jpg'])).why
     assert decide_photographs(facts._replace(frames=5)).say == 'more'
     assert decide_photographs(facts._replace(lens='undecided')).say == 'more'
@@ -139,7 +159,7 @@ def test_photographs_are_enough_or_not() -> None:
 
 
 def test_enough_photographs_with_a_large_error_say_where_it_is_from() -> None:
-    """"Enough. Held-out error 15.6 times what noise leaves" asked for a reason."""
+    """Once "Enough. Held-out error 15.6 times what noise leaves" asked for a reason."""
     facts = PhotographsFacts(26, [], [], 0.9, 0.09, 'keep', is_target_off=True)
     assert decide_photographs(facts).why.endswith('leave; the target causes the rest')
     assert decide_photographs(facts._replace(heldout_px=0.1)).why.endswith('frames leave')
@@ -160,18 +180,19 @@ def test_one_frame_decides_nothing() -> None:
     lens = decide_lens(SOUND._replace(frames=1))
     assert lens.say == 'undecided' and 'one frame' in lens.why and not lens.bound
     target = decide_target(
-        TARGET._replace(causes=[], size='', local_px=0.0, local_m=0.0, frames=1))
+        TARGET._replace(causes=[], size='', local_px=0.0, local_m=0.0, frames=1)
+    )
     assert target.confidence is None and 'errors are unknown' in target.why
     displaced = decide_target(TARGET._replace(causes=[], size='', frames=1))
     assert displaced.say == 'keep' and displaced.why == target.why
 
 
 def test_the_gain_of_all_offsets_is_not_that_of_one_landmark() -> None:
-    """"Measure these landmarks (landmark 45)" was to remove 95 % of the held-out variance."""
+    """Once "Measure these landmarks (landmark 45)" was to remove 95 % of the held-out variance."""
     offset = np.full((20, 3), 1e-3)
     offset[7] = 4e-3
     offsets = SimpleNamespace(offset=offset, landmark=np.arange(20))
-    one, = _measure_landmarks(SimpleNamespace(offsets=offsets), 0.95)  # type: ignore[arg-type]
+    (one,) = _measure_landmarks(SimpleNamespace(offsets=offsets), 0.95)  # type: ignore[arg-type]
     assert one.landmarks == [7]
     assert one.what == 'measure the landmarks of the target, first those that are displaced most'
 
@@ -187,18 +208,31 @@ def test_the_worst_of_several_lenses_may_be_so_by_chance() -> None:
     assert certain is not None and certain.p_value == 1.0
 
 
-@pytest.mark.parametrize(('effect', 'values', 'words'), [
-    ('landmark_survey', {'7.x': 1e-3, '7.y': 2e-3, '9.z': 1e-3}, '2 landmarks are displaced'),
-    ('landmark_survey', {'7.x': 1e-3, '7.y': 2e-3}, '1 landmark is displaced'),
-    ('landmark_scale', {'relative': -0.0047}, 'the scale of the board is off by 0.47 %'),
-    ('landmark_scale', {'x_over_y': 0.002}, 'the board is stretched by 0.2 %'),
-    ('board_pose', {'1.x': 1e-3}, 'the relative poses of its boards are wrong'),
-])
+@pytest.mark.parametrize(
+    ('effect', 'values', 'words'),
+    [
+        ('landmark_survey', {'7.x': 1e-3, '7.y': 2e-3, '9.z': 1e-3}, '2 landmarks are displaced'),
+        ('landmark_survey', {'7.x': 1e-3, '7.y': 2e-3}, '1 landmark is displaced'),
+        ('landmark_scale', {'relative': -0.0047}, 'the scale of the board is off by 0.47 %'),
+        ('landmark_scale', {'x_over_y': 0.002}, 'the board is stretched by 0.2 %'),
+        ('board_pose', {'1.x': 1e-3}, 'the relative poses of its boards are wrong'),
+    ],
+)
 def test_the_largest_error_of_the_target_is_said(
     effect: str, values: dict[str, float], words: str
 ) -> None:
-    cause = Cause(effect, {name: {'value': value} for name, value in values.items()},
-                  1e-9, 0.2, True, 0.1, 0.3, [], '')
-    smaller = replace(cause, form='board_pose' if effect != 'board_pose' else 'landmark_survey',
-                      share=0.1)
+    cause = Cause(
+        effect,
+        {name: {'value': value} for name, value in values.items()},
+        1e-9,
+        0.2,
+        True,
+        0.1,
+        0.3,
+        [],
+        '',
+    )
+    smaller = replace(
+        cause, form='board_pose' if effect != 'board_pose' else 'landmark_survey', share=0.1
+    )
     assert _largest_error(None, [smaller, cause]) == words  # type: ignore[arg-type]

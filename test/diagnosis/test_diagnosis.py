@@ -117,7 +117,7 @@ def test_a_flat_board_is_stretched_in_whatever_plane_it_lies(axes):
     seen = observe(lens(), (), pose, views._replace(points=truth), SIGMA, rng)
     said = views.points[0][seen.landmark][:, axes]
     found = diagnose(replace(seen, xyz=said), lens())
-    cause, = found.causes
+    (cause,) = found.causes
     assert (found.verdict, cause.effect) == ('explained', 'landmark_scale')
     stretch, shear = cause.parameters['x_over_y'], cause.parameters['xy_shear']
     assert shear['value'] == pytest.approx(0.004, abs=4 * shear['stderr'])
@@ -134,7 +134,9 @@ def test_a_finely_warped_board_of_many_landmarks_has_a_name():
     seen = observe(lens(), (), pose, views, SIGMA, rng)
     found = diagnose(replace(seen, xyz=said[seen.landmark]), lens())
     assert (found.verdict, *(cause.effect for cause in found.causes)) == (
-        'explained', 'target_shape')
+        'explained',
+        'target_shape',
+    )
     assert found.figures.base.heldout_rms_px > 1.15 * found.figures.named.heldout_rms_px
     assert found.figures.named.heldout_rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.05)
 
@@ -146,7 +148,7 @@ def test_true_poses_reveal_what_free_poses_hide():
     observations = observe(lens(), [(scale, np.array([0.004]))], pose, views, SIGMA, rng)
     assert diagnose(observations, lens()).verdict == 'adequate'
     poses = {int(frame): pose.take(int(frame)) for frame in np.unique(views.frame)}
-    cause, = diagnose(observations, lens(), poses=poses).causes
+    (cause,) = diagnose(observations, lens(), poses=poses).causes
     assert cause.effect == 'landmark_scale'
     found = cause.parameters['relative']
     assert abs(found['value'] - 0.004) < 3 * found['stderr'] < 0.0004
@@ -187,9 +189,7 @@ def test_landmarks_far_from_their_place_are_no_gross_errors():
     rng = np.random.default_rng(20)
     pose, views = scene(rng)
     moves = np.array([0.15, 0.1, 0.0, 0.1, -0.15, 0.0])
-    table = observe(
-        lens(), [(LandmarkSurveyEffect((3, 44)), moves)], pose, views, SIGMA, rng
-    )
+    table = observe(lens(), [(LandmarkSurveyEffect((3, 44)), moves)], pose, views, SIGMA, rng)
     uv = table.uv.copy()
     uv[[5, 200, 700, 900]] += [15.0, -12.0]
     found = diagnose(replace(table, uv=uv), lens())
@@ -215,7 +215,7 @@ def test_near_points_that_a_cause_explains_are_no_gross_errors():
     assert {7, 11} == set(table.frame[near.rows].tolist())
     found = diagnose(table, lens())
     assert [cause.effect for cause in found.causes] == ['viewpoint_shift']
-    error, = found.causes[0].parameters.values()
+    (error,) = found.causes[0].parameters.values()
     assert abs(error['value'] - 0.004) < 3 * error['stderr'] < 0.0004
     left = [(g['frame'], g['landmark']) for g in found.gross]
     assert left == [(11, int(table.landmark[wrong]))]
@@ -248,8 +248,11 @@ def test_a_view_is_off_as_a_whole_where_most_are_not(bad, named):
     data = group_by_frame(replace(clean, uv=clean.uv + off))
     gross = find_outliers(data, initial_state(data, lens()))[1]
     assert (VIEW in gross.why) == named
-    frames = {int(clean.frame[row]) for row, why in zip(gross.rows, gross.why, strict=True)
-              if why == VIEW}
+    frames = {
+        int(clean.frame[row])
+        for row, why in zip(gross.rows, gross.why, strict=True)
+        if why == VIEW
+    }
     assert frames == (set(bad) if named else set())
 
 
@@ -275,7 +278,7 @@ def test_quantisation_is_read_off_the_numbers():
     rough = observe(lens(), (), pose, views, 0.1, rng)
     found = diagnose(replace(rough, uv=np.round(rough.uv)), lens())
     assert found.verdict == 'explained'  # that they depend on the place within a pixel, too
-    cause, = diagnose(replace(table, uv=np.round(table.uv)), lens()).causes
+    (cause,) = diagnose(replace(table, uv=np.round(table.uv)), lens()).causes
     assert cause.effect == 'quantisation' and cause.parameters['step']['value'] == 1.0
     assert cause.parameters['step']['stderr'] == 0.0
 
@@ -340,7 +343,8 @@ def test_what_the_user_knows_is_a_cause_that_the_simulation_lacked():
     table, held_out = table_of(27, terms=terms), table_of(28, terms=terms)
     found, known = (
         diagnose(table, lens(), held_out=held_out, options=DiagnosisOptions(names, quick=True))
-        for names in ((), ('skew',)))
+        for names in ((), ('skew',))
+    )
     assert [cause.effect for cause in (*found.causes, *known.causes)] == ['skew', 'skew']
     assert known.figures.base.rms_px == pytest.approx(found.figures.base.rms_px)
     assert known.figures.base.heldout_rms_px == pytest.approx(found.figures.base.heldout_rms_px)
@@ -352,8 +356,10 @@ def test_boards_are_known_by_the_landmarks_where_a_table_does_not_tell_of_them()
     model, seen = ForwardModel(lens(), ()), scene(np.random.default_rng(30))
     shape = CATALOGUE['target_shape'].candidates(model.scene(*seen, model.linearise(*seen)))[0]
     values = np.resize([0.004, -0.003, 0.005, 0.006], len(shape.parameters))
-    table, other = (observe(lens(), [(shape, values)], *seen, SIGMA, np.random.default_rng(seed))
-                    for seed in (1, 2))
+    table, other = (
+        observe(lens(), [(shape, values)], *seen, SIGMA, np.random.default_rng(seed))
+        for seed in (1, 2)
+    )
     bare = replace(other, board=np.zeros_like(other.board))
     extended = extend_lens(lens(), [(shape, values)], table)
     assert diagnose(bare, extended, options=DiagnosisOptions(quick=True)).verdict == 'adequate'
@@ -374,10 +380,14 @@ def test_true_poses_of_a_rig_are_those_of_its_right_camera(cameras):
     assert found.figures.base.rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.05)
 
 
-@pytest.mark.parametrize(('cameras', 'names', 'x'), [
-    (('left', 'right'), ('left', 'right'), -0.15), (('right', 'left'), ('left', 'right'), 0.15),
-    (('cam0', 'cam1'), ('cam0', 'cam1'), -0.15),
-])
+@pytest.mark.parametrize(
+    ('cameras', 'names', 'x'),
+    [
+        (('left', 'right'), ('left', 'right'), -0.15),
+        (('right', 'left'), ('left', 'right'), 0.15),
+        (('cam0', 'cam1'), ('cam0', 'cam1'), -0.15),
+    ],
+)
 def test_a_rig_is_the_first_camera_in_the_second(cameras, names, x):
     table = replace(table_of(29, cameras=2), cameras=cameras)
     found = diagnose(table, lens(), options=DiagnosisOptions(quick=True))
@@ -418,14 +428,18 @@ def test_a_lens_that_is_fitted_is_that_of_the_mean_session():
     assert abs(fx.after / first.fx - 1.002) < 3 * fx.after_stderr / first.fx
 
 
-@pytest.mark.parametrize('kept', [
-    lambda t: t.frame < 1,
-    lambda t: t.frame < 2,
-    lambda t: ~((t.camera == 0) & np.isin(t.frame, [0, 3, 11])),
-    lambda t: ~((t.camera == 1) & (t.frame > 1)),
-    lambda t: (t.camera == 1) == (t.frame > 5),
-    lambda t: (t.landmark % 9 == 0) | (t.frame > 6),
-], ids=['one frame', 'two frames', 'first blind', 'second seldom', 'never both', 'few points'])
+@pytest.mark.parametrize(
+    'kept',
+    [
+        lambda t: t.frame < 1,
+        lambda t: t.frame < 2,
+        lambda t: ~((t.camera == 0) & np.isin(t.frame, [0, 3, 11])),
+        lambda t: ~((t.camera == 1) & (t.frame > 1)),
+        lambda t: (t.camera == 1) == (t.frame > 5),
+        lambda t: (t.landmark % 9 == 0) | (t.frame > 6),
+    ],
+    ids=['one frame', 'two frames', 'first blind', 'second seldom', 'never both', 'few points'],
+)
 def test_rigs_and_frames_that_see_little(kept):
     table = table_of(24, 12, 2)
     found = diagnose(table.take(kept(table)), lens(), free_intrinsics=True)
@@ -453,15 +467,22 @@ def test_the_last_fit_is_the_best_under_the_last_variances():
 @pytest.mark.parametrize('spread', [1.0, 3.0])
 def test_frames_that_scatter_more_than_their_noise_widen_the_standard_error(spread):
     """One parameter, of which each frame gives an estimate of unit variance: their mean."""
+
     def information(values):
         return np.array([[len(values), values.sum()], [values.sum(), (values**2).sum()]])
 
     values = spread * np.random.default_rng(27).normal(size=40)
     null = SimpleNamespace(
-        column_count=1, included_columns=np.arange(1), terms=[], scale=np.array([2.0]),
-        information=information(values), information_without_poses=lambda at: [
-            information(np.delete(values, i)) for i in range(40)],
-        linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
+        column_count=1,
+        included_columns=np.arange(1),
+        terms=[],
+        scale=np.array([2.0]),
+        information=information(values),
+        information_without_poses=lambda at: [
+            information(np.delete(values, i)) for i in range(40)
+        ],
+        linear=SimpleNamespace(data=SimpleNamespace(frames=40)),
+    )
     expected = 1 if spread == 1 else values.std(ddof=1)
     assert standard_errors(null) == pytest.approx(expected / np.sqrt(40) / 2)
     assert standard_errors(null, jackknife=False) == pytest.approx(1 / np.sqrt(40) / 2)
@@ -473,10 +494,14 @@ def test_what_one_frame_alone_tells_is_as_sure_as_that_frame():
     rows[:, 2] = np.random.default_rng(28).normal(size=40) + 100 * rows[:, 1]
     without = [np.delete(rows, i, axis=0) for i in range(40)]
     null = SimpleNamespace(
-        column_count=2, included_columns=np.arange(2), terms=[], scale=np.ones(2),
+        column_count=2,
+        included_columns=np.arange(2),
+        terms=[],
+        scale=np.ones(2),
         information=rows.T @ rows,
         information_without_poses=lambda at: [w.T @ w for w in without],
-        linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
+        linear=SimpleNamespace(data=SimpleNamespace(frames=40)),
+    )
     assert standard_errors(null) == pytest.approx([39**-0.5, (1 + 1 / 39) ** 0.5])
 
 
@@ -489,8 +514,10 @@ def rig_table(seed, right_terms=(), frames=16):
         pose, views = scene(rng, 2, frames)
         table = observe(one, terms, pose, views, SIGMA, rng)
         seen.append(table.take(table.camera == camera))
-    both = {name: np.concatenate([getattr(part, name) for part in seen])
-            for name in ('frame', 'landmark', 'board', 'camera', 'uv', 'xyz', 't', 'sigma')}
+    both = {
+        name: np.concatenate([getattr(part, name) for part in seen])
+        for name in ('frame', 'landmark', 'board', 'camera', 'uv', 'xyz', 't', 'sigma')
+    }
     return replace(seen[0], cameras=('left', 'right'), **both), lenses
 
 
@@ -514,10 +541,17 @@ def test_each_camera_of_a_rig_has_causes_of_its_own():
 def test_a_frame_of_a_rig_from_another_moment_is_named():
     table, lenses = rig_table(27)
     uv = table.uv.copy()
-    place = {key: i for i, key in enumerate(
-        zip(table.frame.tolist(), table.camera.tolist(), table.landmark.tolist(), strict=True))}
-    moved = [(i, place[9, 1, n]) for (f, c, n), i in place.items()
-             if (f, c) == (4, 1) and (9, 1, n) in place]
+    place = {
+        key: i
+        for i, key in enumerate(
+            zip(table.frame.tolist(), table.camera.tolist(), table.landmark.tolist(), strict=True)
+        )
+    }
+    moved = [
+        (i, place[9, 1, n])
+        for (f, c, n), i in place.items()
+        if (f, c) == (4, 1) and (9, 1, n) in place
+    ]
     here, there = np.array(moved).T
     uv[here] = table.uv[there]
     wrong = (table.frame == 4) & (table.camera == 1)
@@ -541,8 +575,16 @@ def test_a_quick_diagnosis_takes_a_part_of_many_points() -> None:
     frame = np.repeat([0, 1, 2], [2400, 2100, 30])
     landmark = np.concatenate([np.arange(2400), np.arange(2100), np.arange(30)])
     none = np.full(len(frame), np.nan)
-    table = Observations(frame, landmark, np.zeros((len(frame), 2)), np.zeros((len(frame), 3)),
-                         np.zeros_like(frame), np.zeros_like(frame), none, none)
+    table = Observations(
+        frame,
+        landmark,
+        np.zeros((len(frame), 2)),
+        np.zeros((len(frame), 3)),
+        np.zeros_like(frame),
+        np.zeros_like(frame),
+        none,
+        none,
+    )
     kept = thin_out(table)
     assert np.bincount(kept.frame).tolist() == [800, 700, 30]
     assert set(kept.landmark[kept.frame == 1]) == set(range(0, 2100, 3))

@@ -22,7 +22,8 @@ def test_distances_are_those_of_the_dense_covariance(monkeypatch, rank):
 
     monkeypatch.setattr(lens_evidence, 'solve_lower', solve_lower)
     distance, drawn = lens_evidence._distances(
-        off.reshape(-1, 3), samples.reshape(-1, 3, 200), floor)
+        off.reshape(-1, 3), samples.reshape(-1, 3, 200), floor
+    )
     assert distance == pytest.approx(expected[0], rel=1e-6)
     assert drawn == pytest.approx(expected[1:], rel=1e-6)
     assert sizes == [64 if rank < 64 else 360]

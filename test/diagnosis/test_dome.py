@@ -26,7 +26,7 @@ def seen():
 
 
 def test_a_dome_is_in_the_class_of_what_it_looks_like(seen):
-    cause, = diagnose(*seen).causes
+    (cause,) = diagnose(*seen).causes
     assert cause.effect in ('decentering', 'sensor_tilt')
     assert 'dome_port' in cause.indistinguishable_from
     assert '--port dome:' in cause.to_separate and 'a ray error of 0.0' in cause.to_separate
@@ -35,7 +35,7 @@ def test_a_dome_is_in_the_class_of_what_it_looks_like(seen):
 def test_a_stated_dome_is_named_and_its_place_measured(seen):
     table, lens = seen
     found = diagnose(table, lens, options=DiagnosisOptions(stated=(STATED,)))
-    cause, = found.causes
+    (cause,) = found.causes
     assert cause.effect == 'dome_port' and cause.p_value < 1e-6 and cause.gain > 0
     assert {'decentering', 'sensor_tilt'} & set(cause.indistinguishable_from)
     for name, entry in cause.parameters.items():
@@ -51,6 +51,6 @@ def test_a_look_alike_is_no_effect_to_be_tested(seen):
     table, lens = seen
     data = group_by_frame(table)
     linear = Linearization(data, initial_state(data, lens), ())
-    (effect, _), = effect_forms(linear).look_alikes
+    ((effect, _),) = effect_forms(linear).look_alikes
     assert effect.name == 'dome_port'
     assert not effect_forms(linear, ('dome_port',)).look_alikes

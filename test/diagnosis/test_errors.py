@@ -44,7 +44,7 @@ def test_standard_errors_hold_with_local_errors_in_the_background():
         state = adjust(data, replace(begin, terms=((ViewpointShiftEffect(1), np.zeros(1)),)), ())
         null = NullModel.estimate(data, state, ())
         fitted = refit(data, state, (), null.variances)
-        error, = standard_errors(null)
+        (error,) = standard_errors(null)
         off.append((float(fitted.terms[0][1][0]) - SHIFT) / error)
     # Of a t distribution with a dozen draws: wide of this less than once in a thousand runs.
     assert 0.45 < np.sqrt(np.mean(np.square(off))) < 1.75, off
@@ -94,8 +94,9 @@ def test_an_effect_that_may_be_there_is_hardly_larger_than_large(monkeypatch):
     rng = np.random.default_rng(31)
     pose, views = scene(rng, frames=16)
     tilt = CATALOGUE['sensor_tilt']
-    data = group_by_frame(observe(lens(), [(tilt(), np.array([0.01, 0.0]))], pose, views,
-                           12 * SIGMA, rng))
+    data = group_by_frame(
+        observe(lens(), [(tilt(), np.array([0.01, 0.0]))], pose, views, 12 * SIGMA, rng)
+    )
     state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
     others = {*CATALOGUE} - {tilt.name}
     null = NullModel.estimate(data, state, ('cx', 'cy'), left_out=[*others])
@@ -126,8 +127,9 @@ def test_an_effect_that_may_be_another_one_widens_the_errors_of_what_that_would_
     rng = np.random.default_rng(31)
     pose, views = scene(rng, frames=16)
     tilt, decentering = CATALOGUE['sensor_tilt'](), CATALOGUE['decentering']()
-    data = group_by_frame(observe(
-        lens(), [(decentering, np.array([8e-4, 0.0]))], pose, views, 3 * SIGMA, rng))
+    data = group_by_frame(
+        observe(lens(), [(decentering, np.array([8e-4, 0.0]))], pose, views, 3 * SIGMA, rng)
+    )
     begin = replace(initial_state(data, lens()), terms=((tilt, np.zeros(2)),))
     state = adjust(data, begin, ('cx', 'cy'))
     null = NullModel.estimate(data, state, ('cx', 'cy'))
@@ -141,10 +143,14 @@ def test_an_effect_that_may_be_another_one_widens_the_errors_of_what_that_would_
 def test_what_no_frame_tells_of_has_no_error():
     information = np.diag([0.0, 4.0, 1.0])
     null = SimpleNamespace(
-        column_count=2, included_columns=np.arange(2), terms=[], scale=np.ones(2),
+        column_count=2,
+        included_columns=np.arange(2),
+        terms=[],
+        scale=np.ones(2),
         information=information,
         information_without_poses=lambda at: np.stack([0.9 * information] * 3),
-        linear=SimpleNamespace(data=SimpleNamespace(frames=3)))
+        linear=SimpleNamespace(data=SimpleNamespace(frames=3)),
+    )
     np.testing.assert_allclose(standard_errors(null), [np.nan, 0.5])
 
 
@@ -152,8 +158,10 @@ def test_two_effects_that_hide_each_other_widen_the_errors():
     """What tilt and decentering do to residuals cancels; what they do to the centre does not."""
     rng = np.random.default_rng(31)
     pose, views = scene(rng, frames=16)
-    terms = [(CATALOGUE['decentering'](), np.array([1e-3, 0.0])),
-             (CATALOGUE['sensor_tilt'](), np.array([-5e-3, 0.0]))]
+    terms = [
+        (CATALOGUE['decentering'](), np.array([1e-3, 0.0])),
+        (CATALOGUE['sensor_tilt'](), np.array([-5e-3, 0.0])),
+    ]
     data = group_by_frame(observe(lens(), terms, pose, views, 0.1 * SIGMA, rng))
     state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
     null = NullModel.estimate(data, state, ('cx', 'cy'))
@@ -196,8 +204,9 @@ def test_ranges_over_targets_hold_the_one_that_was_believed():
     pose, views = scene(rng, frames=16)
     table = observe(lens(), (), pose, views, SIGMA, rng)
     found = assess_lens(table, lens(), ('fx', 'fy', 'cx', 'cy'))
-    for name, value in zip(('fx', 'fy', 'cx', 'cy'), parameter_values(
-            lens(), ('fx', 'fy', 'cx', 'cy')), strict=True):
+    for name, value in zip(
+        ('fx', 'fy', 'cx', 'cy'), parameter_values(lens(), ('fx', 'fy', 'cx', 'cy')), strict=True
+    ):
         range_ = found.admissible[name]
         assert range_.low <= value - 1.9 * found.stderr[name]
         assert range_.high >= value + 1.9 * found.stderr[name]
@@ -228,8 +237,14 @@ def bursts(seed, copies):
     pose, views = scene(rng, frames=40)
     chosen = np.repeat(np.arange(0, 40, 4), copies)
     moved = pose.take(chosen).retract(2e-3 * rng.normal(size=(len(chosen), 6)))
-    table = observe(lens(), (), moved, views.take(chosen)._replace(frame=np.arange(len(chosen))),
-                    SIGMA / 2, rng)
+    table = observe(
+        lens(),
+        (),
+        moved,
+        views.take(chosen)._replace(frame=np.arange(len(chosen))),
+        SIGMA / 2,
+        rng,
+    )
     own = rng.normal(size=(10, table.landmark.max() + 1, 2)) * SIGMA
     return replace(table, uv=table.uv + own[table.frame // copies, table.landmark])
 
@@ -240,8 +255,10 @@ def test_photographs_of_one_pose_are_left_out_together(monkeypatch):
     pose = cluster_frames(null.linear).reshape(10, 4)
     assert (pose == pose[:, :1]).all() and len(np.unique(pose)) == 10
     together = standard_errors(null)
-    monkeypatch.setattr('fisheye_svp_ros.diagnosis.null_model.cluster_frames',
-                        lambda linear: np.arange(linear.data.frames))
+    monkeypatch.setattr(
+        'fisheye_svp_ros.diagnosis.null_model.cluster_frames',
+        lambda linear: np.arange(linear.data.frames),
+    )
     assert (together / standard_errors(null)).max() > 1.3
 
 

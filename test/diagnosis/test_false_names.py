@@ -28,8 +28,9 @@ SIGMA = 0.2
 def test_intrinsics_that_are_wrong_throughout_are_no_step_after_the_first_frames():
     rng = np.random.default_rng(40)
     pose, views = scene(rng)
-    true = lens().with_parameters(('fx', 'fy', 'cx'), [1.002 * lens().fx, 1.002 * lens().fy,
-                                                       lens().cx + 0.6])
+    true = lens().with_parameters(
+        ('fx', 'fy', 'cx'), [1.002 * lens().fx, 1.002 * lens().fy, lens().cx + 0.6]
+    )
     found = diagnose(observe(true, (), pose, views, SIGMA, rng), lens(), free_intrinsics=False)
     assert {cause.effect for cause in found.causes} == {'focal_length', 'principal_point'}
 
@@ -68,8 +69,9 @@ def test_large_ripples_along_the_radius_are_no_noise(monkeypatch):
 
     monkeypatch.setitem(blind_outside.OUTSIDE, 'fine', (fine, frozenset({'image'})))
     case = draw_case(Task('outside', 3.0, ('fine',), 2, 0))
-    found = diagnose(case.scene.table(case.given), case.scene.lens,
-                     free_intrinsics=case.scene.free)
+    found = diagnose(
+        case.scene.table(case.given), case.scene.lens, free_intrinsics=case.scene.free
+    )
     assert 'noise_vs_angle' not in {cause.effect for cause in found.causes}
 
 
@@ -77,8 +79,9 @@ def test_large_ripples_along_the_radius_are_no_noise(monkeypatch):
 def test_landmarks_of_two_colors_are_no_noise(seed):
     """The lens magnifies one color more: its points err by more where the image is higher."""
     case = draw_case(Task('outside', 1.0, ('colour',), seed, 0))
-    found = diagnose(case.scene.table(case.given), case.scene.lens,
-                     free_intrinsics=case.scene.free)
+    found = diagnose(
+        case.scene.table(case.given), case.scene.lens, free_intrinsics=case.scene.free
+    )
     assert 'noise_vs_angle' not in {cause.effect for cause in found.causes}
 
 
@@ -123,8 +126,9 @@ def test_an_image_that_swings_is_no_step(seed):
     pose, views = scene(rng, cameras=2)
     table = observe(lens(), (), pose, views, SIGMA, rng)
     swing = np.sin(rng.uniform(3, 8) * table.t + rng.uniform(0, 6))[:, None] * rng.normal(size=2)
-    found = diagnose(replace(table, uv=table.uv + 10 * SIGMA * swing), lens(),
-                     free_intrinsics=False)
+    found = diagnose(
+        replace(table, uv=table.uv + 10 * SIGMA * swing), lens(), free_intrinsics=False
+    )
     assert [cause.effect for cause in found.causes] == []
     assert 'frame' in [s.variable for s in found.remaining]
 
@@ -135,8 +139,11 @@ def test_a_focal_length_that_drifts_is_no_step_where_no_time_is_known(seed):
     pose, views = scene(rng)
     table = observe(lens(), (), pose, views, SIGMA, rng)
     growth = 5e-3 * (2 * table.t[:, None] / table.t.max() - 1)
-    table = replace(table, uv=table.uv + growth * (table.uv - [lens().cx, lens().cy]),
-                    t=np.full(len(table), np.nan))
+    table = replace(
+        table,
+        uv=table.uv + growth * (table.uv - [lens().cx, lens().cy]),
+        t=np.full(len(table), np.nan),
+    )
     found = diagnose(table, lens(), free_intrinsics=False)
     assert 'session_step' not in {cause.effect for cause in found.causes}
     assert found.remaining
@@ -169,8 +176,10 @@ def test_a_rig_that_bends_anew_in_every_frame_is_no_image_that_moves(alone):
     both = np.setdiff1d(np.arange(24), alone)
     parameters = found.causes[0].parameters
     assert [*parameters] == [f'{axis}_f{frame}' for frame in both for axis in 'xyz']
-    value, error = (np.array([entry[key] for entry in parameters.values()]).reshape(-1, 3)
-                    for key in ('value', 'stderr'))
+    value, error = (
+        np.array([entry[key] for entry in parameters.values()]).reshape(-1, 3)
+        for key in ('value', 'stderr')
+    )
     turns = angles[views.camera > 0][both]
     off = (value - turns + turns.mean(axis=0)) / error
     assert 0.7 < np.sqrt((off**2).mean()) < 1.3
@@ -196,7 +205,7 @@ def test_a_refit_beside_a_lens_that_is_far_off_leads_nowhere_worse():
     shifted = with_effect(state, CATALOGUE['viewpoint_shift'](), np.array([0.03]))
 
     def misfit(state):
-        return np.sqrt((Linearization(data, state, ()).residual**2).mean())
+        return np.sqrt((Linearization(data, state, ()).residual ** 2).mean())
 
     assert misfit(refit(data, shifted, (), variances)) < 1.3 * misfit(shifted)
 

@@ -53,7 +53,8 @@ def test_a_warp_is_written_and_brings_the_rays_nearer_to_the_truth(
     assert entry['rms_px'] == pytest.approx(written.image_field.rms)
     # The field's own errors are among those of the rays, which are nearer than those of `given`.
     stated, given = (
-        found.to_dict()['lens']['ray_error_mrad'][which][-1] for which in ('extended', 'given'))
+        found.to_dict()['lens']['ray_error_mrad'][which][-1] for which in ('extended', 'given')
+    )
     truth = 1e3 * off[1] / AIR.fx
     assert 0.5 * stated['low'] < truth < 1.5 * stated['high']
     assert stated['value'] < given['value']
@@ -71,8 +72,14 @@ def true_directions(uv: np.ndarray, length: float) -> np.ndarray:
 def errors_px(lens: object, directions: np.ndarray, uv: np.ndarray) -> float:
     """Return the rms, px, of image points of far points, a turn of the camera taken out."""
     off = project(lens, 1e3 * directions).uv - uv
-    turns = np.stack([project(lens, 1e3 * (directions + 1e-6 * np.cross(axis, directions))).uv
-                      - project(lens, 1e3 * directions).uv for axis in np.eye(3)], axis=-1)
+    turns = np.stack(
+        [
+            project(lens, 1e3 * (directions + 1e-6 * np.cross(axis, directions))).uv
+            - project(lens, 1e3 * directions).uv
+            for axis in np.eye(3)
+        ],
+        axis=-1,
+    )
     columns = turns.reshape(-1, 3) / 1e-6
     rest = off.ravel() - columns @ np.linalg.lstsq(columns, off.ravel(), rcond=None)[0]
     return float(np.sqrt(2 * (rest**2).mean()))

@@ -37,8 +37,10 @@ def test_effects_that_hide_each_other_move_rays_less_than_parameters():
     """A tilt, which is not named, undoes what its decentering does to the center: not to rays."""
     rng = np.random.default_rng(31)
     pose, views = scene(rng, frames=16)
-    terms = [(CATALOGUE['decentering'](), np.array([1e-3, 0.0])),
-             (CATALOGUE['sensor_tilt'](), np.array([-5e-3, 0.0]))]
+    terms = [
+        (CATALOGUE['decentering'](), np.array([1e-3, 0.0])),
+        (CATALOGUE['sensor_tilt'](), np.array([-5e-3, 0.0])),
+    ]
     table = observe(lens(), terms, pose, views, SIGMA, rng)
     data = group_by_frame(table)
     begin = replace(initial_state(data, lens()), terms=((terms[0][0], np.zeros(2)),))
@@ -51,7 +53,8 @@ def test_effects_that_hide_each_other_move_rays_less_than_parameters():
 
     errors = total_errors(null)
     parameters_alone = LensCovariance(
-        null.linear, np.diag(errors**2), np.ones(columns), np.arange(columns))
+        null.linear, np.diag(errors**2), np.ones(columns), np.arange(columns)
+    )
     known = replace(parameters_alone, covariance=np.zeros((columns, columns)))
     known = known.with_other_models(null, likely_models(null))
     stated = stated_mrad(known, lens(), table, uv)

@@ -31,8 +31,7 @@ def medium_of(found):
     return next((c for c in found.causes if c.form == 'flat_port(medium)'), None)
 
 
-@pytest.mark.parametrize(('lens', 'others'), [(AIR, 5), (CALIBRATED, 0)],
-                         ids=['fixed', 'free'])
+@pytest.mark.parametrize(('lens', 'others'), [(AIR, 5), (CALIBRATED, 0)], ids=['fixed', 'free'])
 def test_water_is_named_and_measured(lens, others):
     seen = photographs(AIR, PORT, 12)
     other = photographs(AIR, PORT, others, seed=1) if others else None
@@ -53,20 +52,26 @@ def test_water_is_named_and_measured(lens, others):
 
 def test_coarse_points_in_air_are_no_reason_to_fit_a_port(monkeypatch):
     """A free lens curve explains next to nothing of noise of 1.5 px."""
+
     def start_port(*_):
         raise AssertionError('a port was fitted')
 
     monkeypatch.setattr('fisheye_svp_ros.diagnosis.checks.medium.start_port', start_port)
-    found = diagnose(photographs(AIR, None, 8, noise=1.5), AIR,
-                     options=DiagnosisOptions(quick=True))
+    found = diagnose(
+        photographs(AIR, None, 8, noise=1.5), AIR, options=DiagnosisOptions(quick=True)
+    )
     assert medium_of(found) is None
 
 
 def test_glass_that_stood_in_for_a_cause_is_gone_with_it():
     """The lens was off in air: so many millimetres of glass, even below none, would undo that."""
     rng = np.random.default_rng(0)
-    true = replace(AIR, cx=AIR.cx + rng.normal(0, 6), cy=AIR.cy + rng.normal(0, 6),
-                   fy=AIR.fy * (1 + rng.normal(0, 0.003)))
+    true = replace(
+        AIR,
+        cx=AIR.cx + rng.normal(0, 6),
+        cy=AIR.cy + rng.normal(0, 6),
+        fy=AIR.fy * (1 + rng.normal(0, 0.003)),
+    )
     found = diagnose(photographs(true, PORT, 12, 0.05), AIR, options=DiagnosisOptions(quick=True))
     assert {c.effect for c in found.causes} >= {'flat_port', 'principal_point', 'aspect'}
     assert 'thickness' not in medium_of(found).parameters
@@ -80,8 +85,9 @@ def test_what_photographs_in_air_left_open_of_the_lens_is_found_under_water():
     result = calibrate(table, 'kannala_brandt', (AIR.width, AIR.height)).adjusted
     given = with_covariance(result.lens, assess_lens(table, result.lens, result.names))
     assert given.max_incidence < 1.1
-    found = diagnose(photographs(AIR, PORT, 4, seed=12, reach=0.9), given,
-                     options=DiagnosisOptions(quick=True))
+    found = diagnose(
+        photographs(AIR, PORT, 4, seed=12, reach=0.9), given, options=DiagnosisOptions(quick=True)
+    )
     assert [c.form for c in found.causes] == ['flat_port(medium)']
     index = medium_of(found).parameters['medium_index']
     assert abs(index['value'] - 1.34) < 3 * index['stderr'] < 0.03
@@ -93,10 +99,15 @@ def test_what_photographs_in_air_left_open_of_the_lens_is_found_under_water():
     assert 'diagnose the photographs in air first' in verdict_sentences(found)[2]
 
 
-@pytest.mark.parametrize('block', [
-    {'covariance': [[1.0]]}, {'stderr': {'fx': 1.0}, 'covariance': [[1.0, 2.0]]},
-    {'stderr': {'fx': 1.0}, 'covariance': 'x'}, {'stderr': {'fx': 1.0}, 'covariance': [[np.nan]]},
-])
+@pytest.mark.parametrize(
+    'block',
+    [
+        {'covariance': [[1.0]]},
+        {'stderr': {'fx': 1.0}, 'covariance': [[1.0, 2.0]]},
+        {'stderr': {'fx': 1.0}, 'covariance': 'x'},
+        {'stderr': {'fx': 1.0}, 'covariance': [[np.nan]]},
+    ],
+)
 def test_a_covariance_that_cannot_be_is_refused(block):
     with pytest.raises(LensError, match="'air': calibration: covariance"):
         InAir.from_lens(replace(AIR, calibration=block))
@@ -105,7 +116,8 @@ def test_a_covariance_that_cannot_be_is_refused(block):
 def test_what_a_lens_file_tells_of_its_focal_length():
     assert InAir.from_lens(replace(AIR, calibration={'stderr': {'fx': 1.0}})) is None
     known = InAir.from_lens(
-        replace(AIR, calibration={'stderr': {'f': 2.1}, 'covariance': [[4.41]]}))
+        replace(AIR, calibration={'stderr': {'f': 2.1}, 'covariance': [[4.41]]})
+    )
     assert known.focal == pytest.approx(0.005) and known.reach == np.inf
     off = replace(AIR, fx=AIR.fx + 4.2, fy=AIR.fx + 4.2)
     assert known.squared_distance(off) == pytest.approx(4.0)
@@ -129,18 +141,27 @@ def test_an_index_is_no_surer_than_the_focal_length_in_air():
     assert index[1.0]['stderr'] == pytest.approx(0.0134, rel=0.1)
 
 
-@pytest.mark.parametrize('true', [
-    replace(AIR, fx=1.33 * AIR.fx, fy=1.33 * AIR.fy),
-    replace(AIR, port=FlatGlass(0.03, 1.0, 0.02, 0.0, 0.01)),
-], ids=['focal length', 'window in air'])
+@pytest.mark.parametrize(
+    'true',
+    [
+        replace(AIR, fx=1.33 * AIR.fx, fy=1.33 * AIR.fy),
+        replace(AIR, port=FlatGlass(0.03, 1.0, 0.02, 0.0, 0.01)),
+    ],
+    ids=['focal length', 'window in air'],
+)
 def test_what_is_no_medium_is_not_called_one(true):
     found = diagnose(photographs(true, true.port, 10), AIR, options=DiagnosisOptions(quick=True))
     assert found.causes and medium_of(found) is None
 
 
-@pytest.mark.parametrize(('true', 'near'), [
-    (replace(AIR, port=PORT), True), (replace(AIR, fx=1.33 * AIR.fx, fy=1.33 * AIR.fy), False),
-], ids=['water', 'focal length'])
+@pytest.mark.parametrize(
+    ('true', 'near'),
+    [
+        (replace(AIR, port=PORT), True),
+        (replace(AIR, fx=1.33 * AIR.fx, fy=1.33 * AIR.fy), False),
+    ],
+    ids=['water', 'focal length'],
+)
 def test_a_lens_moves_as_far_as_photographs_in_air_allow(true, near):
     stderr = {'fx': 0.02 * AIR.fx, 'fy': 0.02 * AIR.fy, 'cx': 2.0, 'cy': 2.0, 'k1': 0.1}
     covariance = np.diag(np.square([*stderr.values()])).tolist()
@@ -151,8 +172,11 @@ def test_a_lens_moves_as_far_as_photographs_in_air_allow(true, near):
 
 
 def test_a_medium_can_be_ruled_out():
-    found = diagnose(photographs(AIR, PORT, 8), AIR,
-                     options=DiagnosisOptions(left_out=('flat_port',), quick=True))
+    found = diagnose(
+        photographs(AIR, PORT, 8),
+        AIR,
+        options=DiagnosisOptions(left_out=('flat_port',), quick=True),
+    )
     assert found.causes and all(c.effect != 'flat_port' for c in found.causes)
 
 
@@ -162,8 +186,11 @@ def test_a_jump_of_the_intrinsics_is_fitted_beside_a_port_where_it_is_known_alon
     first, second = photographs(AIR, PORT, 4), photographs(other, PORT, 4, seed=1)
     seen = make_observations(
         np.concatenate([first.frame, second.frame + 4]),
-        *(np.concatenate([getattr(first, name), getattr(second, name)])
-          for name in ('landmark', 'uv', 'xyz')))
+        *(
+            np.concatenate([getattr(first, name), getattr(second, name)])
+            for name in ('landmark', 'uv', 'xyz')
+        ),
+    )
     for known in ((), ('session_step',)):
         found = diagnose(seen, AIR, options=DiagnosisOptions(included=known, quick=True))
         assert medium_of(found) is not None

@@ -56,8 +56,11 @@ def smooth(uv, size, pitch, rng):
 def misfit(uv, rng):
     pitch = (HIGH - LOW).max()
     x = (uv - (LOW + HIGH) / 2) / (pitch / 2)
-    return (smooth(uv, COARSE, pitch / 6, rng) + smooth(uv, BUMPS, pitch / 4, rng)
-            + LINEAR * x @ rng.normal(size=(2, 2)))
+    return (
+        smooth(uv, COARSE, pitch / 6, rng)
+        + smooth(uv, BUMPS, pitch / 4, rng)
+        + LINEAR * x @ rng.normal(size=(2, 2))
+    )
 
 
 def seen_by(lens, pose, points, rng):
@@ -71,8 +74,9 @@ def test_poses_scatter_as_the_lens_file_says(board):
     """A board that errs itself, and landmarks in all directions that do not."""
     lens, rng = uncertain(), np.random.default_rng(1)
     pose = Pose(rotation_from_vector(np.array([0.3, -0.4, 0.2])), np.array([0.2, 0.0, -0.25]))
-    points = BOARD if board else pose.transform(
-        rng.uniform([-1, -0.7, 0.3], [1, 0.7, 1.0], (25, 3)))
+    points = (
+        BOARD if board else pose.transform(rng.uniform([-1, -0.7, 0.3], [1, 0.7, 1.0], (25, 3)))
+    )
     uv = []
     for _ in range(SAMPLES):
         true = points + (1e-3 * OFFSET * rng.normal(size=points.shape) if board else 0.0)
@@ -94,10 +98,12 @@ def test_stereo_points_scatter_as_the_lens_files_say():
     lens, rng = uncertain(), np.random.default_rng(2)
     rig = Pose(rotation_from_vector(np.array([0.0, 0.1, 0.0])), np.array([-0.15, 0.0, 0.0]))
     points = np.array([[0.1, 0.05, 0.6], [-0.5, 0.2, 0.5], [0.3, -0.3, 0.9]])
-    pairs = np.array([[seen_by(lens, pose, points, rng) for pose in (rig, identity())]
-                      for _ in range(SAMPLES)])
+    pairs = np.array(
+        [[seen_by(lens, pose, points, rng) for pose in (rig, identity())] for _ in range(SAMPLES)]
+    )
     found = triangulate_optimally(
-        ForwardModel(lens), ForwardModel(lens), rig, pairs[:, 0], pairs[:, 1], NOISE)
+        ForwardModel(lens), ForwardModel(lens), rig, pairs[:, 0], pairs[:, 1], NOISE
+    )
     parts = depth_errors(LensErrors.from_lens(lens), LensErrors.from_lens(lens), rig, points)
     off = found.points - points
     pull = np.einsum('sni,nij,snj->sn', off, np.linalg.inv(parts.total), off) / 3
@@ -129,31 +135,44 @@ def board_table(lens, rng, frames):
     seeing, tables = ForwardModel(replace(lens, viewpoint_shift=Gennery(e0=0.003))), []
     for _ in range(frames):
         turn = rotation_from_vector(0.5 * rng.normal(size=3))
-        pose = Pose(turn, np.array([0.12, 0.08, 0.0]) - turn @ rng.uniform(
-            [-0.1, -0.1, 0.2], [0.1, 0.1, 0.4]))
+        pose = Pose(
+            turn,
+            np.array([0.12, 0.08, 0.0]) - turn @ rng.uniform([-0.1, -0.1, 0.2], [0.1, 0.1, 0.4]),
+        )
         uv = seeing.project(pose.into_body(bent)).uv
         tables.append(uv + 0.05 * rng.normal(size=uv.shape))
-    return make_observations(np.repeat(np.arange(frames), len(BOARD)),
-                             np.tile(np.arange(len(BOARD)), frames), np.concatenate(tables),
-                             np.tile(BOARD, (frames, 1)))
+    return make_observations(
+        np.repeat(np.arange(frames), len(BOARD)),
+        np.tile(np.arange(len(BOARD)), frames),
+        np.concatenate(tables),
+        np.tile(BOARD, (frames, 1)),
+    )
 
 
 def test_library_and_core_say_the_same_and_misfit_is_no_doubt():
     lens, rng = uncertain(), np.random.default_rng(4)
     pose = Pose(rotation_from_vector(np.array([0.2, -0.2, 0.1])), np.array([0.1, 0.1, -0.3]))
     uv = seen_by(lens, pose, BOARD, rng)
-    table = make_observations(np.zeros(len(BOARD), int), np.arange(len(BOARD)), uv, BOARD,
-                              sigma=np.full(len(BOARD), NOISE))
+    table = make_observations(
+        np.zeros(len(BOARD), int),
+        np.arange(len(BOARD)),
+        uv,
+        BOARD,
+        sigma=np.full(len(BOARD), NOISE),
+    )
     plain, known = fsvp.localize(table, lens), fsvp.localize(table, lens, model_error=True)
     poses, parts = localize_with_errors(LensErrors.from_lens(lens), table)
     np.testing.assert_array_equal(known.covariance, parts.total)
     assert plain.reasons[0] and not known.reasons[0] and not poses.reasons[0]
-    bare = localize(ForwardModel(lens), poses.views._replace(
-        weight=np.full_like(poses.views.weight, 1 / NOISE)))
+    bare = localize(
+        ForwardModel(lens),
+        poses.views._replace(weight=np.full_like(poses.views.weight, 1 / NOISE)),
+    )
     np.testing.assert_allclose(parts.noise, bare.covariance, rtol=1e-3)
     # Without a sigma the noise is the lens's, not what residuals look like.
-    guessed = fsvp.localize(replace(table, sigma=np.full(len(BOARD), np.nan)), lens,
-                            model_error=True)
+    guessed = fsvp.localize(
+        replace(table, sigma=np.full(len(BOARD), np.nan)), lens, model_error=True
+    )
     np.testing.assert_allclose(guessed.covariance, known.covariance, rtol=1e-3)
 
 
@@ -166,8 +185,15 @@ def test_a_budget_of_a_lens_that_knows_its_errors():
         assert set(by) == {'position', 'axis', 'depth'}
         assert all((values > 0).all() and values.shape == (3, 3) for values in by.values())
     # Nothing but a wrong focal length: depth errs in proportion.
-    only = replace(lens, uncertainty={**lens.uncertainty, 'components': {}, 'parameters': ['fx'],
-                                      'covariance': [[9.0]]})
+    only = replace(
+        lens,
+        uncertainty={
+            **lens.uncertainty,
+            'components': {},
+            'parameters': ['fx'],
+            'covariance': [[9.0]],
+        },
+    )
     wide = make_budget(Setup(only, setup.rig, 0.1), 2, 2).own
     assert not wide['misfit']['depth'].any() and (wide['parameters']['depth'] > 0).all()
 
@@ -176,11 +202,17 @@ def test_a_lens_without_errors_or_with_half_of_them_is_refused():
     lens = uncertain()
     with pytest.raises(LensError, match='no uncertainty'):
         LensErrors.from_lens(replace(lens, uncertainty=None))
-    for name, value in (('noise_px', -1.0), ('covariance', [[1.0]]), ('extent_px', None),
-                        ('landmarks', []), ('landmarks', [[float('nan'), 0, 0, 0, 0]]),
-                        ('extent_px', [[5.0, 5.0], [5.0, 9.0]]), ('noise_px', 10**400),
-                        ('covariance', (-np.eye(6)).tolist()),
-                        ('components', {'image_coarse': float('nan')})):
+    for name, value in (
+        ('noise_px', -1.0),
+        ('covariance', [[1.0]]),
+        ('extent_px', None),
+        ('landmarks', []),
+        ('landmarks', [[float('nan'), 0, 0, 0, 0]]),
+        ('extent_px', [[5.0, 5.0], [5.0, 9.0]]),
+        ('noise_px', 10**400),
+        ('covariance', (-np.eye(6)).tolist()),
+        ('components', {'image_coarse': float('nan')}),
+    ):
         with pytest.raises(LensError, match='uncertainty'):
             LensErrors.from_lens(replace(lens, uncertainty={**lens.uncertainty, name: value}))
 
@@ -189,16 +221,28 @@ def test_what_the_target_is_uncertain_by_needs_no_boards_to_be_told():
     """Topics tell of none: the localizer's covariance is that of the command."""
     points = np.column_stack([*np.mgrid[-3:4, -2:3].reshape(2, -1) * 0.04, np.zeros(35)])
     rows = [[i, 4, *map(float, point)] for i, point in enumerate(points)]
-    bow = {'degree': 2, 'boards': [[4.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0, 0, 0.1]],
-           'parameters': {f'board4.z{name}': 0.001 for name in ('20', '11', '02')}}
+    bow = {
+        'degree': 2,
+        'boards': [[4.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0, 0, 0.1]],
+        'parameters': {f'board4.z{name}': 0.001 for name in ('20', '11', '02')},
+    }
     base = uncertain()
-    lens = replace(base, target={'landmarks': rows, 'target_shape': bow}, uncertainty={
-        **base.uncertainty, 'parameters': ['target_shape.board4.z20'], 'covariance': [[1e-8]],
-        'components': {}})
+    lens = replace(
+        base,
+        target={'landmarks': rows, 'target_shape': bow},
+        uncertainty={
+            **base.uncertainty,
+            'parameters': ['target_shape.board4.z20'],
+            'covariance': [[1e-8]],
+            'components': {},
+        },
+    )
     pose = Pose(rotation_from_vector(np.array([[0.3, -0.2, 0.1]])), np.array([[0.05, 0.0, -0.3]]))
     views = views_of(points, np.zeros((1, 35, 2)))
     errors = LensErrors.from_lens(lens)
-    told, untold = (errors.of_poses(views._replace(board=board), pose).parameters
-                    for board in (np.full_like(views.board, 4), views.board))
+    told, untold = (
+        errors.of_poses(views._replace(board=board), pose).parameters
+        for board in (np.full_like(views.board, 4), views.board)
+    )
     assert np.sqrt(told[0, 2, 2]) > 1e-5
     np.testing.assert_allclose(untold, told, rtol=1e-12)

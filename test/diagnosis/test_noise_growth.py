@@ -25,19 +25,26 @@ def find_growth(
     theta = np.linalg.norm(uv, axis=-1)
     radial = ripple * np.cos(40 * theta) * (theta < 0.8)
     side = np.stack([-uv[..., 1], uv[..., 0]], axis=-1)
-    noise = np.exp(np.array([growth, growth if across is None else across])
-                   * theta[..., None] ** 2) * rng.normal(size=uv.shape)
-    errors = ((noise[..., :1] + radial[..., None]) * uv + noise[..., 1:] * side
-              ) / theta[..., None]
-    data = RigViews.of_one_camera(SimpleNamespace(  # type: ignore[arg-type]
-        landmark=np.tile(np.arange(points), (frames, 1)), frame=np.arange(frames)))
+    noise = np.exp(
+        np.array([growth, growth if across is None else across]) * theta[..., None] ** 2
+    ) * rng.normal(size=uv.shape)
+    errors = ((noise[..., :1] + radial[..., None]) * uv + noise[..., 1:] * side) / theta[..., None]
+    data = RigViews.of_one_camera(
+        SimpleNamespace(  # type: ignore[arg-type]
+            landmark=np.tile(np.arange(points), (frames, 1)), frame=np.arange(frames)
+        )
+    )
     fitted = SimpleNamespace(
         standardized_residuals=errors.reshape(frames, -1),
         linear=SimpleNamespace(
-            data=data, row_mask=np.ones((frames, 2 * points), dtype=bool),
-            weight=np.ones((frames, points)), scene=SimpleNamespace(theta=theta),
+            data=data,
+            row_mask=np.ones((frames, 2 * points), dtype=bool),
+            weight=np.ones((frames, points)),
+            scene=SimpleNamespace(theta=theta),
             linear=SimpleNamespace(uv=uv),
-            state=SimpleNamespace(lenses=[SimpleNamespace(cx=0.0, cy=0.0)])))
+            state=SimpleNamespace(lenses=[SimpleNamespace(cx=0.0, cy=0.0)]),
+        ),
+    )
     fitted.point_pairs = lambda: FittedModel.point_pairs(fitted)  # type: ignore[arg-type]
     return noise_growth(fitted)  # type: ignore[arg-type]
 

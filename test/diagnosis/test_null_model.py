@@ -63,13 +63,17 @@ def dense_columns(linear, random):
     place = np.zeros((frames, height // 2, 2, len(random.unit_label), 3))
     f, n = np.nonzero(random.unit >= 0)
     place[f, n, :, random.unit[f, n]] = random.offset[f, n]
-    columns = np.concatenate([
-        blocks.reshape(frames * height, -1), place.reshape(frames * height, -1),
-        random.shared_columns.toarray(),
-    ], axis=1)
-    label = np.concatenate([
-        np.tile(random.group_label, frames), random.unit_label.ravel(), random.shared_label
-    ])
+    columns = np.concatenate(
+        [
+            blocks.reshape(frames * height, -1),
+            place.reshape(frames * height, -1),
+            random.shared_columns.toarray(),
+        ],
+        axis=1,
+    )
+    label = np.concatenate(
+        [np.tile(random.group_label, frames), random.unit_label.ravel(), random.shared_label]
+    )
     return columns[linear.row_mask.ravel()], label
 
 
@@ -101,18 +105,27 @@ def test_equations_are_those_of_the_dense_matrices(cameras, frames):
     now = some_variances(eq)
     f = factor_equations(eq.select(now.alive), now.lam, now.weight)
     z, label = dense_columns(linear, random)
-    weight = np.concatenate([
-        np.ones(random.group.shape[-1] * frames), np.repeat(now.weight, 3),
-        np.ones(len(random.shared_label)),
-    ])
+    weight = np.concatenate(
+        [
+            np.ones(random.group.shape[-1] * frames),
+            np.repeat(now.weight, 3),
+            np.ones(len(random.shared_label)),
+        ]
+    )
     v = np.eye(len(z)) + (z / (now.lam[label] * weight)) @ z.T
     tested = probe.reshape(-1, 1)[linear.row_mask.ravel()]
     x = np.concatenate([dense_poses(linear), tested], axis=1)
     y = linear.residual[linear.row_mask]
     poses = x[:, :-1]
     whitened = np.linalg.solve(v, np.column_stack([x, y]))
-    inside = poses @ np.linalg.lstsq(poses.T @ whitened[:, : poses.shape[1]],
-                                     poses.T @ whitened[:, poses.shape[1] :], rcond=None)[0]
+    inside = (
+        poses
+        @ np.linalg.lstsq(
+            poses.T @ whitened[:, : poses.shape[1]],
+            poses.T @ whitened[:, poses.shape[1] :],
+            rcond=None,
+        )[0]
+    )
     left = np.column_stack([x[:, -1], y]) - inside
     np.testing.assert_allclose(f.information, left.T @ np.linalg.solve(v, left), rtol=1e-5)
     solution = solve_equations(f)
@@ -120,13 +133,15 @@ def test_equations_are_those_of_the_dense_matrices(cameras, frames):
 
 
 @pytest.mark.parametrize('frames', [4, 24])
-@pytest.mark.parametrize('name', [
-    'landmark_normal', 'image_coarse', 'frame_linear', 'frame_bumps', 'board_in_plane'])
+@pytest.mark.parametrize(
+    'name', ['landmark_normal', 'image_coarse', 'frame_linear', 'frame_bumps', 'board_in_plane']
+)
 def test_without_a_component_is_what_the_equations_say_that_never_had_it(frames, name):
     linear = linearised(frames=frames, offsets=2e-3)
     random = make_random_effects(linear).columns
     border = np.concatenate(
-        [linear.effect_columns(CATALOGUE['skew']()), linear.residual[..., None]], axis=-1)
+        [linear.effect_columns(CATALOGUE['skew']()), linear.residual[..., None]], axis=-1
+    )
     eq, kind = make_equations(random, linear.frame_columns, border), NAMES.index(name)
     now = some_variances(eq)
     f = factor_equations(eq.select(now.alive), now.lam, now.weight)
@@ -154,13 +169,15 @@ def test_variances_are_those_of_the_whole_covariance(frames, worth, monkeypatch)
     monkeypatch.setattr('fisheye_svp_ros.mixed_model.equations._WORTH_THREADS', worth)
     linear = linearised(frames=frames, offsets=2e-3)
     border = np.concatenate(
-        [linear.effect_columns(CATALOGUE['skew']()), linear.residual[..., None]], axis=-1)
+        [linear.effect_columns(CATALOGUE['skew']()), linear.residual[..., None]], axis=-1
+    )
     eq = make_equations(make_random_effects(linear).columns, linear.frame_columns, border)
     now = some_variances(eq)
     for alive in (now.alive, np.zeros_like(now.alive)):
         f = factor_equations(eq.select(alive), now.lam, now.weight)
         for ours, whole in zip(
-                posterior_variances(f), posterior_covariance(f).variances, strict=True):
+            posterior_variances(f), posterior_covariance(f).variances, strict=True
+        ):
             np.testing.assert_allclose(ours, whole, rtol=1e-9)
 
 
@@ -170,15 +187,20 @@ def test_score_tests_are_those_of_the_dense_matrices(frames, there):
     linear = linearised(frames=frames, offsets=2e-3)
     random = make_random_effects(linear).columns
     probe = linear.effect_columns(CATALOGUE['skew']())
-    eq = make_equations(random, linear.frame_columns,
-                   np.concatenate([probe, linear.residual[..., None]], axis=-1))
+    eq = make_equations(
+        random, linear.frame_columns, np.concatenate([probe, linear.residual[..., None]], axis=-1)
+    )
     assert eq.by_group == (frames > 4)
     now = some_variances(eq)
     now = replace(now, lam=np.where([name in there for name in NAMES], now.lam, LAMBDA_ABSENT))
     z, label = dense_columns(linear, random)
-    weight = np.concatenate([
-        np.ones(random.group.shape[-1] * frames), np.repeat(now.weight, 3),
-        np.ones(len(random.shared_label))])
+    weight = np.concatenate(
+        [
+            np.ones(random.group.shape[-1] * frames),
+            np.repeat(now.weight, 3),
+            np.ones(len(random.shared_label)),
+        ]
+    )
     v = np.eye(len(z)) + (z / (now.lam[label] * weight)) @ z.T
     fixed = np.column_stack([dense_poses(linear), probe.reshape(-1, 1)[linear.row_mask.ravel()]])
     inverse = np.linalg.inv(v)
@@ -195,14 +217,16 @@ def test_score_tests_are_those_of_the_dense_matrices(frames, there):
         variance = y @ p @ y / (len(y) - np.linalg.matrix_rank(fixed))
         size = pull @ pull / variance
         assert p_value == pytest.approx(
-            special.gammaincc(mean**2 / spread, size * mean / spread), rel=1e-3, abs=1e-12), name
+            special.gammaincc(mean**2 / spread, size * mean / spread), rel=1e-3, abs=1e-12
+        ), name
 
 
 def test_many_frames_need_no_matrix_of_all_that_they_have_of_their_own():
     """A recording of 340 frames took 15 GB."""
     linear, kind = linearised(frames=150), NAMES.index('frame_bumps')
     eq = make_equations(
-        make_random_effects(linear).columns, linear.frame_columns, linear.residual[..., None])
+        make_random_effects(linear).columns, linear.frame_columns, linear.residual[..., None]
+    )
     count = (eq.blocks.e_label == kind).sum()
     now = some_variances(eq)
     f = factor_equations(eq, now.lam, now.weight)
@@ -219,7 +243,8 @@ def test_many_frames_need_no_matrix_of_all_that_they_have_of_their_own():
 def test_a_direction_that_random_parts_have_taken_up_stays_where_it_is():
     linear = linearised(frames=1)
     eq = make_equations(
-        make_random_effects(linear).columns, linear.frame_columns, linear.residual[..., None])
+        make_random_effects(linear).columns, linear.frame_columns, linear.residual[..., None]
+    )
     f = factor_equations(eq, some_variances(eq).lam, np.ones(len(eq.units)))
     root = replace(f, information=np.ones((3, 3))).root
     np.testing.assert_allclose(root @ root.T, np.ones((2, 2)), atol=1e-4)
@@ -236,10 +261,13 @@ def test_what_the_data_determine_is_the_trace_of_the_dense_matrix():
     f = factor_equations(eq.select(now.alive), now.lam, now.weight)
     solution = solve_equations(f, posterior_variances(f))
     z, label = dense_columns(linear, random)
-    precision = np.where(label >= 0, now.lam[label], 0.0) * np.concatenate([
-        np.ones(5 * random.group.shape[-1]), np.repeat(now.weight, 3),
-        np.ones(len(random.shared_label)),
-    ])
+    precision = np.where(label >= 0, now.lam[label], 0.0) * np.concatenate(
+        [
+            np.ones(5 * random.group.shape[-1]),
+            np.repeat(now.weight, 3),
+            np.ones(len(random.shared_label)),
+        ]
+    )
     probe = border[..., :1].reshape(-1, 1)[linear.row_mask.ravel()]
     x = np.concatenate([dense_poses(linear), probe], axis=1)
     full = np.concatenate([x, z], axis=1)
@@ -269,7 +297,8 @@ def test_a_frame_left_out_is_as_if_it_had_never_been(by_group):
     keep = np.arange(len(pose)) != 3
     rows = np.repeat(keep, linear.residual.shape[1])[:, None]
     gone = random._replace(
-        group=random.group * keep[:, None, None], offset=random.offset * keep[:, None, None, None],
+        group=random.group * keep[:, None, None],
+        offset=random.offset * keep[:, None, None, None],
         shared=random.shared.multiply(rows).tocsr(),
         unit=np.where(keep[:, None], random.unit, -1),
     )
@@ -348,8 +377,9 @@ def test_a_step_that_takes_points_out_of_sight_is_cut_short():
     assert not np.isfinite(Linearization(linear.data, after(1.0), ()).residual).all()
     state, residual = shorten_step(linear.data, (), after)
     assert np.isfinite(residual).all() and state.terms[0][1] < 10.0
-    refitted = refit(linear.data, after(0.0), (), NullModel.estimate(
-        linear.data, linear.state, ()).variances)
+    refitted = refit(
+        linear.data, after(0.0), (), NullModel.estimate(linear.data, linear.state, ()).variances
+    )
     assert np.isfinite(Linearization(linear.data, refitted, ()).residual).all()
 
 
@@ -364,9 +394,14 @@ def test_score_is_the_f_test_of_nested_models_where_nothing_is_random():
     columns = null.form_columns(form)
     found = EffectTests(bare).score(eliminate(bare.information, own), columns)
     used = linear.row_mask.ravel()
-    wide = np.concatenate([dense_poses(linear), linear.shared_columns.reshape(len(used), -1)[used],
-                           linear.effect_columns(null.fixed.forms.effects[form])
-                           .reshape(len(used), -1)[used]], axis=1)
+    wide = np.concatenate(
+        [
+            dense_poses(linear),
+            linear.shared_columns.reshape(len(used), -1)[used],
+            linear.effect_columns(null.fixed.forms.effects[form]).reshape(len(used), -1)[used],
+        ],
+        axis=1,
+    )
     y = linear.residual[linear.row_mask]
     small, large = (
         float(((y - m @ np.linalg.lstsq(m, y, rcond=None)[0]) ** 2).sum())
@@ -386,7 +421,8 @@ def test_doubt_about_variances_has_its_degrees_of_freedom():
     score = tests.score(eliminate(null.information, own), columns)
     sure = tests.adjust_p_value(score, own, columns)
     assert sure.p_value == pytest.approx(
-        stats.f.sf(score.statistic / score.rank, score.rank, sure.freedom))
+        stats.f.sf(score.statistic / score.rank, score.rank, sure.freedom)
+    )
     assert sure.p_value > 1.5 * score.p_value
 
     # Satterthwaite: two over the variance of the logarithm of what the columns tell.
@@ -447,7 +483,9 @@ def test_a_scale_for_each_landmark_does_not_make_more_of_chance(seed):
     null = NullModel.estimate(linear.data, linear.state, ())
     fitted, eq = null.variances, null.equations_of(null.included_columns)
     assert fitted.weight.min() < 0.8
-    p, without = (component_p_values(eq, now)[NAMES.index('landmark_in_plane')]
-                  for now in (fitted, fitted.with_equal_weights(OF_LANDMARKS)))
+    p, without = (
+        component_p_values(eq, now)[NAMES.index('landmark_in_plane')]
+        for now in (fitted, fitted.with_equal_weights(OF_LANDMARKS))
+    )
     assert p > 0.1
     assert without == pytest.approx(p, rel=1e-6)

@@ -53,15 +53,18 @@ def diagnosed(results: dict[str, Path], name: str) -> tuple[Path, dict[str, Any]
         more = ['--held-out', str(folder / 'test.csv')] if held_out else []
         if folder.parent == DATA:
             more.append('--quick')  # with all rounds it takes minutes
-        assert cli.main(['diagnose', str(folder / file), '--lens', str(lens), *more,
-                         '-o', str(out)]) == 0
+        assert (
+            cli.main(['diagnose', str(folder / file), '--lens', str(lens), *more, '-o', str(out)])
+            == 0
+        )
     return out, json.loads((out / 'diagnosis.json').read_text())
 
 
 def calibrated(file: Path) -> Lens:
     """Return the lens of observations, without its standard errors, which take longer than all."""
     found, _, _ = calibrate_without_outliers(
-        read_observations(file), lambda rows: calibrate(rows, 'kannala_brandt', (1280, 800)))
+        read_observations(file), lambda rows: calibrate(rows, 'kannala_brandt', (1280, 800))
+    )
     return found.adjusted.lens
 
 
@@ -86,9 +89,14 @@ def test_decision_verdict_and_report_agree(results: dict[str, Path], name: str) 
     effects = {cause['effect'] for cause in found['causes']}
     assert not effects & {one['effect'] for one in found['candidates']}
     assert (found['verdict'] in ('explained', 'partly_explained')) == (
-        bool(effects) or lens['say'] == 'recalibrate')
-    words = {'keep': 'Keep the lens', 'use_extended': 'Use extended_lens.yaml',
-             'recalibrate': 'Do not use the lens', 'undecided': 'Undecided'}
+        bool(effects) or lens['say'] == 'recalibrate'
+    )
+    words = {
+        'keep': 'Keep the lens',
+        'use_extended': 'Use extended_lens.yaml',
+        'recalibrate': 'Do not use the lens',
+        'undecided': 'Undecided',
+    }
     title = (out / 'report.html').read_text().partition('<h1>')[2].partition('</h1>')[0]
     assert words[lens['say']] in title
     if lens['say'] == 'use_extended':
@@ -113,15 +121,15 @@ def test_a_better_lens_shows_as_such(results: dict[str, Path]) -> None:
 
 
 def test_a_lens_that_half_a_diagnosis_would_make_worse_is_not_recommended(
-    results: dict[str, Path]
+    results: dict[str, Path],
 ) -> None:
     """A shift of 4.7 mm is not named; the bend that is makes the lens three times worse."""
     _, found = diagnosed(results, 'half_diagnosis')
     lens = found['decision']['lens']
     assert lens['say'] == 'undecided'
-    bound, = (one for one in lens['bound'] if one['effect'] == 'viewpoint_shift')
+    (bound,) = (one for one in lens['bound'] if one['effect'] == 'viewpoint_shift')
     assert bound['value'] > 0.0047
-    shift, = found['lens']['averaged_shift']
+    (shift,) = found['lens']['averaged_shift']
     assert shift['weight'] > 0.9 and abs(shift['e0'] - 0.0047) < shift['stderr']
 
 

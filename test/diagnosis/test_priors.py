@@ -72,8 +72,13 @@ def test_higher_orders_are_known_by_what_they_do_at_the_edge_of_the_field() -> N
     view = Linearization(data, state, FREE).scene
     sizes = EFFECT.prior_sigma(view) * view.lens.max_incidence ** (2 * np.arange(ORDER))
     assert sizes == pytest.approx(LARGE)
-    each = combine_cameras([*by_camera(0, 'left', [ViewpointShiftEffect(1)]),
-                     *by_camera(1, 'right', [ViewpointShiftEffect(2)])])
+    each = combine_cameras(
+        [
+            *by_camera(0, 'left', [ViewpointShiftEffect(1)]),
+            *by_camera(1, 'right', [ViewpointShiftEffect(2)]),
+        ]
+    )
     rig = replace(view, cameras=((np.arange(1), 0, view), (np.arange(1), 1, view)))
     assert each.prior_sigma(rig) == pytest.approx(
-        [LARGE, LARGE, LARGE / view.lens.max_incidence**2])
+        [LARGE, LARGE, LARGE / view.lens.max_incidence**2]
+    )

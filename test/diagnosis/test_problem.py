@@ -16,8 +16,9 @@ pytestmark = pytest.mark.usefixtures('undrawn')
 
 QUICK = DiagnosisOptions(quick=True)
 # Poses that a hand-eye calibration made those of the camera, all but.
-NEAR = Transforms(Pose(rotation_from_vector(np.full(3, 1e-3)), np.full(3, 4e-4)), identity(),
-                  1.0005)
+NEAR = Transforms(
+    Pose(rotation_from_vector(np.full(3, 1e-3)), np.full(3, 4e-4)), identity(), 1.0005
+)
 
 
 @pytest.mark.parametrize('truth', [TRUTH, NEAR], ids=['flange', 'nearly the camera'])

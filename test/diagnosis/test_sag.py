@@ -36,8 +36,11 @@ def photographs(seed, sag, bend=0.0, frames=16, noise=0.05):
         off = (bend + sag * turn[1, 2]) * middle  # gravity is along y
         bent = board + np.outer(off, [0.0, 0.0, 1.0])
         image = project(AIR, bent @ turn.T + np.exp(rng.uniform(-0.7, 0.4)) * np.array(way))
-        seen = np.flatnonzero(image.valid & (image.uv > 0).all(axis=1)
-                              & (image.uv < [AIR.width, AIR.height]).all(axis=1))
+        seen = np.flatnonzero(
+            image.valid
+            & (image.uv > 0).all(axis=1)
+            & (image.uv < [AIR.width, AIR.height]).all(axis=1)
+        )
         if len(seen) > 0.8 * len(board):
             uv = image.uv[seen] + noise * rng.normal(size=(len(seen), 2))
             shown.append((np.full(len(seen), len(shown)), seen, uv, board[seen]))
@@ -58,9 +61,9 @@ def test_a_sagging_board_does_not_move_the_center(seed):
 def test_a_board_that_sags_is_to_be_supported():
     found = diagnose(photographs(9, 1e-3, frames=12), AIR, free_intrinsics=True)
     assert [c.effect for c in found.causes if c.effect != 'target_shape'] == []
-    sag, = (one for one in found.components if one.name == 'frame_sag')
+    (sag,) = (one for one in found.components if one.name == 'frame_sag')
     assert sag.p_value < 1e-9
-    advice, = (one for one in found.advice if 'support the board' in one.what)
+    (advice,) = (one for one in found.advice if 'support the board' in one.what)
     assert 0.8 < float(advice.what.split(' mm')[0].split()[-1]) < 1.2 and advice.boards == [0]
 
 

@@ -83,20 +83,28 @@ def test_each_view_is_predicted_from_the_others_of_its_landmark():
     known = process.known
     view = known.row // linear.data.views.used.shape[1]
     view = np.where(known.mask, view, -1)
-    kernel = np.exp(-((known.seen[:, :, None] - known.seen[:, None]) ** 2).sum(axis=-1)
-                    / (2 * process.reach**2)
-                    - np.abs(known.t[:, :, None] - known.t[:, None]) / process.lasting)
+    kernel = np.exp(
+        -((known.seen[:, :, None] - known.seen[:, None]) ** 2).sum(axis=-1)
+        / (2 * process.reach**2)
+        - np.abs(known.t[:, :, None] - known.t[:, None]) / process.lasting
+    )
     rows = linear.residual.reshape(*linear.data.views.used.shape, 2)
     for landmark in (0, 11, 40):
         mine = view[landmark] == left
         others = known.mask[landmark] & ~mine
         covariance = process.variance * kernel[landmark] + np.eye(len(mine))
         told = rows[view[landmark][others], int(known.key[landmark, 1])]
-        expected = process.variance * kernel[landmark][np.ix_(mine, others)] @ np.linalg.solve(
-            covariance[np.ix_(others, others)], told)
+        expected = (
+            process.variance
+            * kernel[landmark][np.ix_(mine, others)]
+            @ np.linalg.solve(covariance[np.ix_(others, others)], told)
+        )
         np.testing.assert_allclose(
-            process.cross_predictions[left, int(known.key[landmark, 1])], expected[0],
-            rtol=1e-6, atol=1e-9)
+            process.cross_predictions[left, int(known.key[landmark, 1])],
+            expected[0],
+            rtol=1e-6,
+            atol=1e-9,
+        )
 
 
 def test_what_was_fitted_is_predicted_at_the_same_views():
@@ -124,8 +132,11 @@ def test_a_table_that_does_not_state_sigma_is_predicted_by_one_that_does():
     process = similar_views(linear, linear.residual)
     np.testing.assert_allclose(process.predict(plain), process.predict(linear), atol=1e-6)
     np.testing.assert_allclose(
-        process.predict(plain), similar_views(plain, plain.residual).predict(plain),
-        rtol=0.02, atol=2e-3)
+        process.predict(plain),
+        similar_views(plain, plain.residual).predict(plain),
+        rtol=0.02,
+        atol=2e-3,
+    )
 
 
 def test_landmarks_that_were_never_seen_are_left_alone():

@@ -35,8 +35,14 @@ def bursts(rng, frames):
     count = burst[-1] + 1
     angle = rng.normal(size=(count, 3)) * [0.3, 0.6, 0.4]
     incidence, azimuth = rng.uniform(0, 0.9, count), rng.uniform(0, 2 * np.pi, count)
-    way = np.stack([np.sin(incidence) * np.cos(azimuth), np.sin(incidence) * np.sin(azimuth),
-                    np.cos(incidence)], axis=-1)
+    way = np.stack(
+        [
+            np.sin(incidence) * np.cos(azimuth),
+            np.sin(incidence) * np.sin(azimuth),
+            np.cos(incidence),
+        ],
+        axis=-1,
+    )
     away = np.exp(rng.uniform(np.log(0.25), np.log(0.9), count))[:, None]
     place = -(rotation_from_vector(angle) @ (away * way)[..., None])[..., 0]
     speed = rng.normal(size=(count, 6)) * [0.2, 0.2, 0.2, 0.5, 0.5, 0.5]
@@ -56,12 +62,14 @@ def test_a_rolling_shutter_in_bursts_is_no_tilt_of_the_sensor(seed):
     """What happens in the pauses says nothing of how the camera moves."""
     rng = np.random.default_rng(seed)
     pose, speed, views = bursts(rng, 17)
-    table, later = (observe(AIR, (), where, views, 0.0, rng)
-                    for where in (pose, pose.retract(1e-4 * speed)))
+    table, later = (
+        observe(AIR, (), where, views, 0.0, rng) for where in (pose, pose.retract(1e-4 * speed))
+    )
     exposed = 0.03 * (table.uv[:, 1:] / AIR.height - 0.5)
     uv = table.uv + exposed * (later.uv - table.uv) / 1e-4
-    found = diagnose(replace(table, uv=uv + rng.normal(size=uv.shape) * SIGMA), AIR,
-                     free_intrinsics=True)
+    found = diagnose(
+        replace(table, uv=uv + rng.normal(size=uv.shape) * SIGMA), AIR, free_intrinsics=True
+    )
     assert names(found) == {'rolling_shutter'}
     readout = found.causes[0].parameters['readout']
     assert abs(readout['value'] - 0.03) < 3 * readout['stderr'] < 0.03
@@ -70,12 +78,14 @@ def test_a_rolling_shutter_in_bursts_is_no_tilt_of_the_sensor(seed):
 def test_a_tilt_beside_a_jump_stays_confirmed():
     rng = np.random.default_rng(1)
     pose, _, views = bursts(rng, 24)
-    terms = [(SessionStepEffect((float(views.t[12, 0]),)), np.array([0.01, 6.0, -5.0])),
-             (CATALOGUE['sensor_tilt'](), np.array([0.008, -0.008]))]
+    terms = [
+        (SessionStepEffect((float(views.t[12, 0]),)), np.array([0.01, 6.0, -5.0])),
+        (CATALOGUE['sensor_tilt'](), np.array([0.008, -0.008])),
+    ]
     found = diagnose(observe(AIR, terms, pose, views, SIGMA, rng), AIR, free_intrinsics=True)
     assert len(names(found)) == 2
-    step, = (cause for cause in found.causes if cause.effect == 'session_step')
-    tilt, = (cause for cause in found.causes if cause.effect != 'session_step')
+    (step,) = (cause for cause in found.causes if cause.effect == 'session_step')
+    (tilt,) = (cause for cause in found.causes if cause.effect != 'session_step')
     assert 'sensor_tilt' in (tilt.effect, *tilt.indistinguishable_from)
     jump = step.parameters['step1.cx']
     assert abs(jump['value'] - 6.0) < 4 * jump['stderr']
@@ -103,7 +113,8 @@ def test_an_effect_with_more_parameters_takes_the_place_of_another_cause(false_t
 
 
 def test_a_cause_must_predict_better_beside_what_takes_the_place_of_another(
-        false_tilt, monkeypatch):
+    false_tilt, monkeypatch
+):
     """Significant it is here at any p-value."""
     module = 'fisheye_svp_ros.diagnosis.stages'
     monkeypatch.setattr(f'{module}.SIGNIFICANCE', 1e9)
@@ -111,8 +122,9 @@ def test_a_cause_must_predict_better_beside_what_takes_the_place_of_another(
     monkeypatch.setattr(EffectTests, 'held_out_gain', lambda *_: gain)
     assert not confounder(false_tilt)
     gain = HeldOutGain(1.0, 2.0)
-    assert confounder(false_tilt) == ('no significant gain on held-out frames if session_step '
-                                      'replaces focal_drift')
+    assert confounder(false_tilt) == (
+        'no significant gain on held-out frames if session_step replaces focal_drift'
+    )
 
 
 def test_one_frame_confirms_nothing_and_is_not_adequate():

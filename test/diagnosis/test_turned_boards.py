@@ -33,14 +33,16 @@ def photographs(seed: int, offset_mm: float, hidden: tuple[int, ...] = ()) -> Ob
     pose = poses_around(landmarks, frames, rng, widest=0.9, distance=(0.25, 0.5))
     shape = frames, len(real), 2
     image = ForwardModel(load_lens(lens_path('fish180')).svp()).predict(
-        pose, views_of(real, np.zeros(shape)))
+        pose, views_of(real, np.zeros(shape))
+    )
     uv = image.uv + rng.normal(scale=0.05, size=shape)
     frame, point = np.nonzero(image.valid)
     names = tuple((i, '', f'left{i:02d}.png') for i in range(frames))
     table = replace(
         make_observations(frame, point, uv[frame, point], landmarks.points[point]),
-        photographs=names)
-    turn, = board_turns(landmarks, np.zeros(len(real), dtype=np.int64))
+        photographs=names,
+    )
+    (turn,) = board_turns(landmarks, np.zeros(len(real), dtype=np.int64))
     for one in hidden:
         table = turn.apply(table, table.frame == one)
     return table
@@ -48,8 +50,12 @@ def photographs(seed: int, offset_mm: float, hidden: tuple[int, ...] = ()) -> Ob
 
 def diagnosed(table: Observations) -> Diagnosis:
     """Return a quick diagnosis with the intrinsics free."""
-    return diagnose(table, load_lens(lens_path('fish180')).svp(), free_intrinsics=True,
-                    options=DiagnosisOptions(quick=True))
+    return diagnose(
+        table,
+        load_lens(lens_path('fish180')).svp(),
+        free_intrinsics=True,
+        options=DiagnosisOptions(quick=True),
+    )
 
 
 def test_reversed_photographs_are_named_and_put_in_order() -> None:
@@ -60,13 +66,17 @@ def test_reversed_photographs_are_named_and_put_in_order() -> None:
         assert one['corrected'] and one['degrees'] == 180 and one['odds'] > 1e3
     assert not right.record.turned
     assert found.figures.extended.rms_px == pytest.approx(right.figures.extended.rms_px, rel=1e-6)
-    advice, = (one for one in found.advice if one.kind == TURNED)
+    (advice,) = (one for one in found.advice if one.kind == TURNED)
     assert 'left03.png' in advice.photographs
     assert 'left03.png' in verdict_sentences(found)[2]
-    told, = (line for line in terminal_lines(first_screen(found, 'x'), '')
-             if line.startswith('Photographs: '))
-    assert ('numbered from another end of the board: left03.png, left08.png, left09.png, '
-            'left14.png') in told
+    (told,) = (
+        line
+        for line in terminal_lines(first_screen(found, 'x'), '')
+        if line.startswith('Photographs: ')
+    )
+    assert (
+        'numbered from another end of the board: left03.png, left08.png, left09.png, left14.png'
+    ) in told
 
 
 @pytest.mark.parametrize('seed', [2, 3])
@@ -84,14 +94,18 @@ def test_frames_that_show_several_boards_are_left_alone() -> None:
 def test_turns_carry_a_board_onto_itself() -> None:
     """A board of 9 x 7 has one other order; with half of it missing it has none."""
     board = plane()
-    turn, = board_turns(board, np.zeros(63, dtype=np.int64))
+    (turn,) = board_turns(board, np.zeros(63, dtype=np.int64))
     assert turn.degrees == 180
     assert np.array_equal(turn.partner, np.arange(63)[::-1])
     partial = replace(board, ids=board.ids[1:], points=board.points[1:])
-    turn, = board_turns(partial, np.zeros(62, dtype=np.int64))
+    (turn,) = board_turns(partial, np.zeros(62, dtype=np.int64))
     assert turn.landmark.tolist() == [*range(1, 62)] and turn.alone.tolist() == [62]
-    table = make_observations(np.repeat([0, 1], 62), np.tile(partial.ids, 2),
-                              np.zeros((124, 2)), np.tile(partial.points, (2, 1)))
+    table = make_observations(
+        np.repeat([0, 1], 62),
+        np.tile(partial.ids, 2),
+        np.zeros((124, 2)),
+        np.tile(partial.points, (2, 1)),
+    )
     turned = turn.apply(table, table.frame == 1)
     assert turned.landmark.tolist() == [*range(1, 63), *range(61, 0, -1)]
     half = replace(board, ids=board.ids[:30], points=board.points[:30])
@@ -112,8 +126,9 @@ def test_photographs_of_a_real_board_are_found_by_where_its_clip_is(tmp_path: Pa
     if not folder.exists():
         pytest.skip(f'{folder} is not there')
     table, lens, out = tmp_path / 'corners.csv', tmp_path / 'lens.yaml', tmp_path / 'diagnosis'
-    assert cli.main(['detect', str(folder), '--board', 'chessboard:4x6:30mm', '-o',
-                     str(table)]) == 0
+    assert (
+        cli.main(['detect', str(folder), '--board', 'chessboard:4x6:30mm', '-o', str(table)]) == 0
+    )
     assert cli.main(['calibrate', str(table), '--image-size', '640x720', '-o', str(lens)]) == 0
     assert cli.main(['diagnose', str(table), '--lens', str(lens), '--quick', '-o', str(out)]) == 0
     turned = json.loads((out / 'diagnosis.json').read_text())['turned']

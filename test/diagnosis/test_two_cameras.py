@@ -64,7 +64,8 @@ def test_reversed_views_are_put_in_the_order_of_the_other_camera():
     assert [one['frame'] for one in found.to_dict()['turned']] == seen.reversed_frames
     assert all(one.corrected and one.degrees == 180 for one in found.record.turned)
     assert [one.photograph for one in found.record.turned] == [
-        f'frame {frame}' for frame in seen.reversed_frames]
+        f'frame {frame}' for frame in seen.reversed_frames
+    ]
     assert not torn_frames(found) and found.figures.extended.rms_px < 0.11
     assert 'numbered from another end of the board' in verdict_sentences(found)[2]
 
@@ -92,8 +93,11 @@ def test_reversed_frames_are_found_among_cameras_that_fit_badly():
     data = group_by_frame(seen.table)
     first, *others = seen.lenses.values()
     _, gross = find_outliers(data, initial_state(data, first, others))
-    torn = {int(data.observations.frame[row]) for row, why in
-            zip(gross.rows, gross.why, strict=True) if why == FRAME}
+    torn = {
+        int(data.observations.frame[row])
+        for row, why in zip(gross.rows, gross.why, strict=True)
+        if why == FRAME
+    }
     assert torn == set(seen.reversed_frames) and len(torn) == 2
 
 
@@ -122,8 +126,10 @@ def test_a_calibrated_rig_leaves_out_frames_that_contradict_it(tmp_path, capsys)
     both = np.intersect1d(*(seen.table.frame[seen.table.camera == i] for i in (0, 1)))
     one, other = both[:2]
     swapped = {one: other, other: one}
-    frame = [swapped.get(f, f) if camera else f for f, camera in
-             zip(seen.table.frame, seen.table.camera, strict=True)]
+    frame = [
+        swapped.get(f, f) if camera else f
+        for f, camera in zip(seen.table.frame, seen.table.camera, strict=True)
+    ]
     write_observations(tmp_path / 'rig.csv', replace(seen.table, frame=np.array(frame)))
     words = ['calibrate', str(tmp_path / 'rig.csv'), '--image-size']
     assert cli.main([*words, 'left=1280x960']) == 2
@@ -132,7 +138,9 @@ def test_a_calibrated_rig_leaves_out_frames_that_contradict_it(tmp_path, capsys)
     said = capsys.readouterr().err
     assert f'frames {one} and {other}: its cameras contradict each other' in said
     assert [load_lens(tmp_path / 'rig' / f'{name}.yaml').width for name in ('left', 'right')] == [
-        1280, 1024]
+        1280,
+        1024,
+    ]
     place = load_rig(tmp_path / 'rig' / 'rig.yaml').position
     assert np.abs(np.linalg.norm(place) - 0.1205) < 0.003
 
@@ -155,8 +163,19 @@ def reversed_in(table, frames):
 
 def calibrated_rig(folder, table):
     write_observations(folder / 'rig.csv', table)
-    assert cli.main(['calibrate', str(folder / 'rig.csv'), '--image-size',
-                     'left=1280x960,right=1024x768', '-o', str(folder / 'rig')]) == 0
+    assert (
+        cli.main(
+            [
+                'calibrate',
+                str(folder / 'rig.csv'),
+                '--image-size',
+                'left=1280x960,right=1024x768',
+                '-o',
+                str(folder / 'rig'),
+            ]
+        )
+        == 0
+    )
     return folder / 'rig' / 'rig.yaml'
 
 
@@ -172,8 +191,10 @@ def test_a_calibrated_rig_says_what_it_rests_on(tmp_path, capsys):
     seen = pair(replace(SMALL, reversed_frames=0), 1)
     assert calibrated_rig(tmp_path, few_shared(seen, 3)[0]).exists()
     said = capsys.readouterr()
-    assert ('rig: only 3 frames are shared, and it is assumed that all cameras saw one target'
-            in said.err)
+    assert (
+        'rig: only 3 frames are shared, and it is assumed that all cameras saw one target'
+        in said.err
+    )
     assert 'mm, from 3 frames, rms 0.' in said.out
     table = seen.table
     turned = replace(table, uv=table.uv + 2 * (np.sin(table.frame) * table.camera)[:, None])
@@ -185,8 +206,7 @@ def test_a_calibrated_rig_says_what_it_rests_on(tmp_path, capsys):
 def test_cameras_that_were_not_photographed_together(late):
     seen = pair(replace(SMALL, reversed_frames=0, late=late), 1)
     # Of another moment altogether: with the next frame's number.
-    table = seen.table if late else replace(
-        seen.table, frame=seen.table.frame + seen.table.camera)
+    table = seen.table if late else replace(seen.table, frame=seen.table.frame + seen.table.camera)
     found = diagnose(table, seen.lenses, options=DiagnosisOptions(quick=True))
     (said,) = found.cameras
     assert said.posed_alone and said.verdict == 'agree' and said.maps.correlation > 0.95
@@ -199,8 +219,9 @@ def test_views_of_cameras_without_a_rig_are_counted_as_views():
     """A pair of four frames was told to be eight frames."""
     few, shared = few_shared(pair(replace(SMALL, reversed_frames=0), 1), 4)
     lenses = pair(replace(SMALL, reversed_frames=0), 1).lenses
-    found = diagnose(few.take(np.isin(few.frame, shared)), lenses,
-                     options=DiagnosisOptions(quick=True))
+    found = diagnose(
+        few.take(np.isin(few.frame, shared)), lenses, options=DiagnosisOptions(quick=True)
+    )
     said = 'in 8 views of 4 frames (each view with its own pose)'
     assert said in first_screen(found, 'table').facts
     assert found.decision['photographs'].why.startswith('8 views')
@@ -211,8 +232,9 @@ def test_a_center_that_the_rig_absorbs_is_no_gain_of_the_extended_lens():
     seen = pair(replace(SMALL, reversed_frames=0), 1)
     right = seen.lenses['right']
     lenses = seen.lenses | {'right': replace(right, cx=right.cx + 2.0)}
-    found = diagnose(seen.table, lenses, free_intrinsics=True,
-                     options=DiagnosisOptions(quick=True))
+    found = diagnose(
+        seen.table, lenses, free_intrinsics=True, options=DiagnosisOptions(quick=True)
+    )
     assert found.file.given_px < 0.25
 
 
@@ -220,9 +242,10 @@ def test_maps_along_the_board_alone_are_compared_along_it():
     """Without a height the maps of cameras that agree were told to "correlate by 0.00"."""
     maps = TargetMaps(88, 0.0, 0.57, (1e-21, 1e-21))
     carried = (Transfer('left', 'right', 0.3, 0.2, Comparison(0.3, 0.2, 0.1, 0.05, 0.15)),) * 2
-    found = SimpleNamespace(cameras=[TwoCameras(('left', 'right'), carried, maps, {})],
-                            hand_eye=None, against=None)
-    section, = sections(found)
+    found = SimpleNamespace(
+        cameras=[TwoCameras(('left', 'right'), carried, maps, {})], hand_eye=None, against=None
+    )
+    (section,) = sections(found)
     assert 'their maps correlate by 0.57 along the board' in section.sentence
     assert not any(row[0].startswith('height') for row in section.rows)
 
@@ -258,8 +281,9 @@ def test_one_of_three_shared_frames_is_reversed(seed, which):
     # In seed 2 the pose of one view is far less certain than the others'.
     seen = pair(replace(SMALL, bend=1e-3, columns=9, rows=6, frames=24, reversed_frames=0), seed)
     table, shared = few_shared(seen, 3)
-    found = diagnose(reversed_in(table, shared[which]), seen.lenses,
-                     options=DiagnosisOptions(quick=True))
+    found = diagnose(
+        reversed_in(table, shared[which]), seen.lenses, options=DiagnosisOptions(quick=True)
+    )
     assert torn_frames(found) == [shared[which]]
     # Two frames say too little of the rig for one to predict the other.
     assert found.figures.named.heldout_rms_px < 0.13 < found.figures.base.heldout_rms_px < 0.21
@@ -282,8 +306,12 @@ def longer():
 def test_reversed_frames_among_those_held_out_are_named(longer):
     train, test = halves(longer)
     shared = np.intersect1d(*(test.frame[test.camera == i] for i in (0, 1)))[:2].tolist()
-    found = diagnose(train, longer.lenses, held_out=reversed_in(test, shared),
-                     options=DiagnosisOptions(quick=True))
+    found = diagnose(
+        train,
+        longer.lenses,
+        held_out=reversed_in(test, shared),
+        options=DiagnosisOptions(quick=True),
+    )
     assert torn_frames(found, 'held out: ') == shared
     assert found.figures.named.heldout_rms_px < 0.16
     assert f'(frames {shared[0]} and {shared[1]})' in verdict_sentences(found)[2]
@@ -338,9 +366,14 @@ def test_the_same_photographs_twice_are_no_witness(longer):
     with pytest.raises(ObservationError, match='image points are those of pair'):
         diagnose_against(left, replace(left, frame=left.frame + 100), longer.lenses['left'])
     right = replace(left, camera=np.ones_like(left.camera))
-    both = replace(left, **{one.name: np.concatenate([getattr(left, one.name),
-                                                      getattr(right, one.name)])
-                            for one in fields(left) if one.name not in ('cameras', 'source')})
+    both = replace(
+        left,
+        **{
+            one.name: np.concatenate([getattr(left, one.name), getattr(right, one.name)])
+            for one in fields(left)
+            if one.name not in ('cameras', 'source')
+        },
+    )
     with pytest.raises(ObservationError, match='camera right: these image points are those of'):
         diagnose(both, longer.lenses)
 

@@ -37,13 +37,14 @@ def table(seed, *terms, bend=0.0, frames=8):
         off = points[mine] - points[mine].mean(axis=0)
         points[mine] += np.outer(bend * (off**2).sum(axis=1) / 0.04, [0.0, 0.0, 1.0])
     seen = observe(lens(), terms, pose, views._replace(points=points), 0.1, rng)
-    return replace(seen, xyz=views.points[0][seen.landmark], cameras=('',),
-                   source=f'set {seed}')
+    return replace(seen, xyz=views.points[0][seen.landmark], cameras=('',), source=f'set {seed}')
 
 
 def test_what_moves_with_the_lens_holds_in_the_other_set():
-    one, other = (table(seed, (SHIFT, np.array([0.02])), bend=0.002 * k, frames=14)
-                  for k, seed in enumerate((31, 32)))
+    one, other = (
+        table(seed, (SHIFT, np.array([0.02])), bend=0.002 * k, frames=14)
+        for k, seed in enumerate((31, 32))
+    )
     found = diagnose_against(one, other, lens(), free_intrinsics=True, options=QUICK)
     said = found.against
     assert said.verdict == 'agree' and not said.withdrawn
@@ -57,10 +58,17 @@ def test_what_moves_with_the_lens_holds_in_the_other_set():
 
 
 def test_nothing_of_the_target_is_predicted_of_another_one():
-    one, other = (table(seed, (SHIFT, np.array([0.02])), bend=0.004 * k, frames=14)
-                  for k, seed in ((1, 31), (0, 32)))
-    found = diagnose(one, lens(), free_intrinsics=True, held_out=other,
-                     options=DiagnosisOptions(included=('viewpoint_shift',)))
+    one, other = (
+        table(seed, (SHIFT, np.array([0.02])), bend=0.004 * k, frames=14)
+        for k, seed in ((1, 31), (0, 32))
+    )
+    found = diagnose(
+        one,
+        lens(),
+        free_intrinsics=True,
+        held_out=other,
+        options=DiagnosisOptions(included=('viewpoint_shift',)),
+    )
     assert {'viewpoint_shift', 'target_shape'} <= {cause.effect for cause in found.causes}
     # The first board's offsets would make the prediction of the other one worse.
     assert max(found.figures.extended.heldout_rms_px, found.figures.named.heldout_rms_px) < 0.18
@@ -71,12 +79,18 @@ def test_nothing_of_the_target_is_predicted_of_another_one():
 def test_what_the_other_set_refutes_is_withdrawn():
     one, other = table(33, (SKEW, np.array([0.003]))), table(34)
     shares = []
-    found = diagnose_against(one, other, lens(), free_intrinsics=True, options=QUICK,
-                             progress=lambda _, share: shares.append(share))
+    found = diagnose_against(
+        one,
+        other,
+        lens(),
+        free_intrinsics=True,
+        options=QUICK,
+        progress=lambda _, share: shares.append(share),
+    )
     assert shares == sorted(shares) and shares[-1] < 0.88
     assert found.against.withdrawn == ('skew',) and found.against.verdict == 'contradict'
     assert 'skew' not in [cause.effect for cause in found.causes]
-    shear, = (said for name, said in found.against.parameters.items() if 'skew' in name)
+    (shear,) = (said for name, said in found.against.parameters.items() if 'skew' in name)
     assert shear.value == pytest.approx(0.003, abs=4 * shear.stderr)
     assert shear.other_value == pytest.approx(0.0, abs=4 * shear.other_stderr)
     assert shear.standardized_difference > 5
@@ -90,9 +104,14 @@ def test_parameters_that_do_not_agree_are_named():
     assert said.parameters['e0'].standardized_difference == pytest.approx(-5.8, abs=0.1)
 
 
-@pytest.mark.parametrize(('low', 'high', 'better', 'worse'), [
-    (0.01, 0.05, True, False), (-0.01, 0.05, False, False), (-0.05, -0.01, False, True),
-])
+@pytest.mark.parametrize(
+    ('low', 'high', 'better', 'worse'),
+    [
+        (0.01, 0.05, True, False),
+        (-0.01, 0.05, False, False),
+        (-0.05, -0.01, False, True),
+    ],
+)
 def test_better_and_worse_are_beyond_chance(low, high, better, worse):
     tried = Transfer('a', 'b', 0.2, 0.18, Comparison(0.2, 0.18, (low + high) / 2, low, high))
     assert (tried.improves, tried.worsens) == (better, worse)
@@ -108,15 +127,25 @@ def test_the_intervals_of_predictions_hold_95_percent():
     found, _ = gain_and_confidence(HeldOut(before, count), HeldOut(after, count), 0.0)
     ratio = after.mean() / before.mean()
     assert (found.high - found.low) / 2 == pytest.approx(
-        1.96 * ratio * np.hypot(*spread), rel=0.15)
+        1.96 * ratio * np.hypot(*spread), rel=0.15
+    )
 
 
 def test_command(tmp_path, capsys):
     for name, seed in (('a', 35), ('b', 36)):
         write_observations(tmp_path / f'{name}.csv', table(seed, (SKEW, np.array([0.003]))))
     save_lens(lens(), tmp_path / 'lens.yaml')
-    arguments = ['diagnose', str(tmp_path / 'a.csv'), '--lens', str(tmp_path / 'lens.yaml'),
-                 '--free', 'intrinsics', '--quick', '--against', str(tmp_path / 'b.csv')]
+    arguments = [
+        'diagnose',
+        str(tmp_path / 'a.csv'),
+        '--lens',
+        str(tmp_path / 'lens.yaml'),
+        '--free',
+        'intrinsics',
+        '--quick',
+        '--against',
+        str(tmp_path / 'b.csv'),
+    ]
     assert main(arguments) == 0
     printed = capsys.readouterr().out
     assert 'The causes in the lens hold in both sets' in printed

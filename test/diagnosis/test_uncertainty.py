@@ -52,8 +52,9 @@ def test_noise_alone_is_the_covariance_of_localization():
     solved = localize(ForwardModel(AIR), linear.data.views)
     parts = errors.of_poses(linear)
     # Localization takes sigma as stated, the null model as it is.
-    np.testing.assert_allclose(parts.noise, errors.variances.sigma**2 * solved.covariance,
-                               rtol=1e-4, atol=1e-16)
+    np.testing.assert_allclose(
+        parts.noise, errors.variances.sigma**2 * solved.covariance, rtol=1e-4, atol=1e-16
+    )
     assert not parts.parameters.any()
 
 
@@ -104,7 +105,7 @@ def test_what_the_data_know_of_this_target_is_in_its_poses_errors():
     remove = np.eye(len(motions)) - motions @ motions.T
     dense = remove @ dense_square(null, sigma) @ remove
     whole = modes.reshape(len(dense), -1)
-    whole = whole @ whole.T + np.diag(alone.ravel()**2)
+    whole = whole @ whole.T + np.diag(alone.ravel() ** 2)
     np.testing.assert_allclose(np.diag(whole), np.diag(dense), rtol=1e-5, atol=1e-15)
     assert np.linalg.norm(whole - dense) < 0.05 * np.linalg.norm(dense)
 
@@ -112,8 +113,7 @@ def test_what_the_data_know_of_this_target_is_in_its_poses_errors():
 def target_motions(data, fitted):
     """Return an orthonormal basis (3 L, 6) of what a motion of the target does to its points."""
     points = data.observations.landmarks().points
-    along = [axes @ rigid_motions(at)
-             for axes, at in zip(fitted.random.axes, points, strict=True)]
+    along = [axes @ rigid_motions(at) for axes, at in zip(fitted.random.axes, points, strict=True)]
     return np.linalg.qr(np.concatenate(along))[0]
 
 
@@ -134,8 +134,10 @@ def test_cameras_without_a_common_frame_have_poses_of_their_own():
     seen = observe(lens(), (), *scene(rng, cameras=2, frames=12), 0.1, rng)
     apart = replace(seen, frame=seen.frame + 100 * seen.camera)
     lenses, quick = {'left': lens(), 'right': lens()}, DiagnosisOptions(quick=True)
-    rig, own = (diagnose(one, lenses, options=quick, free_intrinsics=True).to_dict()['uncertainty']
-                for one in (seen, apart))
+    rig, own = (
+        diagnose(one, lenses, options=quick, free_intrinsics=True).to_dict()['uncertainty']
+        for one in (seen, apart)
+    )
     for name in ('position_m', 'rotation_rad'):
         assert 0 < own[name]['parameters'] < 3 * rig[name]['parameters']
 
@@ -145,23 +147,32 @@ def dense_square(null, sigma):
     linear, variances = null.linear, null.variances
     random = null.random.select(variances.alive).columns
     frames = linear.frame_columns
-    fixed = np.concatenate([linalg.block_diag(*frames),
-                            linear.shared_columns.reshape(frames.shape[0] * frames.shape[1], -1)],
-                           axis=1)
-    blocks = [linalg.block_diag(*random.group), random.unit_columns.toarray(),
-              random.shared_columns.toarray()]
+    fixed = np.concatenate(
+        [
+            linalg.block_diag(*frames),
+            linear.shared_columns.reshape(frames.shape[0] * frames.shape[1], -1),
+        ],
+        axis=1,
+    )
+    blocks = [
+        linalg.block_diag(*random.group),
+        random.unit_columns.toarray(),
+        random.shared_columns.toarray(),
+    ]
     lam = np.append(variances.lam, 1e12)
-    prior = [np.tile(lam[random.group_label], len(frames)),
-             (lam[random.unit_label] * variances.weight[:, None]).ravel(),
-             lam[random.shared_label]]
+    prior = [
+        np.tile(lam[random.group_label], len(frames)),
+        (lam[random.unit_label] * variances.weight[:, None]).ravel(),
+        lam[random.shared_label],
+    ]
     columns = np.concatenate([fixed, *blocks], axis=1)
     ridge = np.concatenate([np.zeros(fixed.shape[1]), *prior])
     inverse = np.linalg.inv(columns.T @ columns + np.diag(ridge))
     mean = inverse @ (columns.T @ linear.residual.ravel())
     way = np.zeros((random.unit_columns.shape[1], len(inverse)))
     start_of = fixed.shape[1] + blocks[0].shape[1]
-    way[:, start_of:start_of + len(way)] = np.eye(len(way))
-    way[:, len(inverse) - random.fields.shape[1]:] = random.fields.toarray()
+    way[:, start_of : start_of + len(way)] = np.eye(len(way))
+    way[:, len(inverse) - random.fields.shape[1] :] = random.fields.toarray()
     mean = way @ mean
     return 1e-6 * (sigma**2 * way @ inverse @ way.T + np.outer(mean, mean))
 
@@ -171,7 +182,7 @@ def test_the_chosen_model_is_there_however_many_are_likelier(monkeypatch):
     monkeypatch.setattr('fisheye_svp_ros.diagnosis.uncertainty._MAX_MODELS', 0)
     data = group_by_frame(photographs(AIR, None, 4))
     null = NullModel.estimate(data, adjust(data, initial_state(data, AIR), ()), ())
-    chosen, = likely_models(null)
+    (chosen,) = likely_models(null)
     np.testing.assert_array_equal(chosen.included, null.included_columns)
 
 

@@ -47,8 +47,9 @@ def test_the_mean_is_that_of_two_models_weighed_by_their_evidence() -> None:
     """Against the marginal likelihoods of whole models, e0 integrated over its prior."""
     found = diagnosed(0.004, 0.1)
     null = found.evaluation.null
-    form = next(i for i, effect in enumerate(null.fixed.forms.effects)
-                if effect.name == 'viewpoint_shift')
+    form = next(
+        i for i, effect in enumerate(null.fixed.forms.effects) if effect.name == 'viewpoint_shift'
+    )
     both = np.append(null.included_columns, null.form_columns(form))
     information = null.information[np.ix_(both, both)].copy()
     score = null.information[both, -1]
@@ -56,7 +57,8 @@ def test_the_mean_is_that_of_two_models_weighed_by_their_evidence() -> None:
     information[-1, -1] += size**-2
     alone = information[:-1, :-1]
     gain = score @ np.linalg.solve(information, score) - score[:-1] @ np.linalg.solve(
-        alone, score[:-1])
+        alone, score[:-1]
+    )
     logs = np.linalg.slogdet(information)[1] - np.linalg.slogdet(alone)[1] + 2 * np.log(size)
     odds = PRIOR_ODDS * np.exp((gain - logs) / 2)
     (shift,) = found.averaged_model.shifts

@@ -1,6 +1,5 @@
 """Every effect: its columns, its YAML, its physics where an exact answer is at hand."""
 
-
 from dataclasses import replace
 
 import numpy as np
@@ -21,10 +20,28 @@ from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.observations import views_of
 
 DESIGN_NAMES = {
-    'viewpoint_shift', 'radial_profile', 'focal_length', 'principal_point', 'aspect', 'skew',
-    'decentering', 'sensor_tilt', 'flat_port', 'focal_drift', 'session_step', 'landmark_survey',
-    'landmark_scale', 'target_shape', 'board_pose', 'dot_centroid', 'detector_bias',
-    'rolling_shutter', 'stereo_time_offset', 'rig_flex', 'wrong_ids', 'quantisation',
+    'viewpoint_shift',
+    'radial_profile',
+    'focal_length',
+    'principal_point',
+    'aspect',
+    'skew',
+    'decentering',
+    'sensor_tilt',
+    'flat_port',
+    'focal_drift',
+    'session_step',
+    'landmark_survey',
+    'landmark_scale',
+    'target_shape',
+    'board_pose',
+    'dot_centroid',
+    'detector_bias',
+    'rolling_shutter',
+    'stereo_time_offset',
+    'rig_flex',
+    'wrong_ids',
+    'quantisation',
     'noise_vs_angle',
 }
 
@@ -90,7 +107,8 @@ def test_lens_file_keeps_effects(name, linearised, tmp_path):
         np.testing.assert_allclose(
             ForwardModel(extended).predict(pose, views, False).uv,
             ForwardModel(model.lens, [(effect, values)]).predict(pose, views, False).uv,
-            rtol=0, atol=1e-9,
+            rtol=0,
+            atol=1e-9,
         )
 
 
@@ -103,8 +121,9 @@ def test_a_flat_target_is_stretched_within_its_plane(normal, linearised, tmp_pat
     arm = views.points[0] - np.array(plane.centre)
     stretch = np.linalg.lstsq(arm, moved[0], rcond=None)[0]
     assert np.abs(stretch[normal]).max() < 1e-12 and np.abs(moved[..., normal]).max() < 1e-12
-    np.testing.assert_allclose(np.linalg.eigvalsh(stretch), np.hypot(0.005, 0.002) * np.array(
-        [-1, 0, 1]), atol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(stretch), np.hypot(0.005, 0.002) * np.array([-1, 0, 1]), atol=1e-12
+    )
     assert whole.key == 'landmark_scale(axes=1)' and plane.key == 'landmark_scale(axes=2)'
     extended = extend_lens(model.lens, [(plane, np.array([0.01, 0.004]))])
     save_lens(extended, tmp_path / 'lens.yaml')
@@ -113,7 +132,7 @@ def test_a_flat_target_is_stretched_within_its_plane(normal, linearised, tmp_pat
 
 def test_a_stretch_of_an_older_lens_file_is_read():
     entry = {'axes': 2, 'centre': [0.0, 0.0, 0.0], 'parameters': {'x_over_y': 0.01}}
-    (effect, values), = load_effects({'landmark_scale': entry}, 'lens.yaml')
+    ((effect, values),) = load_effects({'landmark_scale': entry}, 'lens.yaml')
     assert effect.axes == 2 and not effect.plane and values.tolist() == [0.01]
 
 
@@ -217,8 +236,10 @@ def test_a_drift_stays_as_it_was_where_the_recording_ends(linearised):
     last = np.nanargmax(scene_.times)
     later = replace(scene_, views=scene_.views._replace(t=scene_.views.t + 1000.0))
     for effect in CATALOGUE['focal_drift'].candidates(scene_):
-        known, after = (np.nanmean(effect.plane_columns(one) / one.normalized_uv()[..., None],
-                                   axis=(1, 2)) for one in (scene_, later))
+        known, after = (
+            np.nanmean(effect.plane_columns(one) / one.normalized_uv()[..., None], axis=(1, 2))
+            for one in (scene_, later)
+        )
         np.testing.assert_allclose(after, np.broadcast_to(known[last], after.shape))
 
 
@@ -235,12 +256,25 @@ def test_steps_are_asked_for_after_pauses_and_every_few_frames_of_a_long_recordi
 def test_every_effect_says_where_it_stands_in_the_budget_and_what_it_is():
     stages = {name: kind.budget_stage() for name, kind in CATALOGUE.items()}
     assert {name for name, stage in stages.items() if stage == 'frame'} == {
-        'focal_drift', 'session_step', 'rolling_shutter', 'stereo_time_offset', 'rig_flex',
-        'dot_centroid', 'detector_bias'}
+        'focal_drift',
+        'session_step',
+        'rolling_shutter',
+        'stereo_time_offset',
+        'rig_flex',
+        'dot_centroid',
+        'detector_bias',
+    }
     assert {name for name, stage in stages.items() if stage == 'target'} == {
-        'landmark_survey', 'landmark_scale', 'target_shape', 'board_pose'}
+        'landmark_survey',
+        'landmark_scale',
+        'target_shape',
+        'board_pose',
+    }
     assert {name for name, stage in stages.items() if stage == 'noise'} == {
-        'wrong_ids', 'quantisation', 'noise_vs_angle'}
+        'wrong_ids',
+        'quantisation',
+        'noise_vs_angle',
+    }
     for name, kind in CATALOGUE.items():
         assert of_cameras(kind).budget_stage() == stages[name]
         assert kind.summary().endswith('.') and kind.to_separate and kind.signature
@@ -267,9 +301,14 @@ def test_a_dome_turns_rays_as_its_glass_does(distance):
     points *= distance / np.linalg.norm(points, axis=1, keepdims=True)
     plain = lens('fish180')
     glass = DomeGlass(0.05, 1.0, 0.004, -0.003, 0.0, 0.004, 1.5)
-    exact, air, found = (ForwardModel(one, terms).project(points) for one, terms in (
-        (replace(plain, port=glass), ()), (plain, ()),
-        (plain, [(CATALOGUE['dome_port'](0.05, 0.004, 1.5), np.array([0.004, -0.003]))])))
+    exact, air, found = (
+        ForwardModel(one, terms).project(points)
+        for one, terms in (
+            (replace(plain, port=glass), ()),
+            (plain, ()),
+            (plain, [(CATALOGUE['dome_port'](0.05, 0.004, 1.5), np.array([0.004, -0.003]))]),
+        )
+    )
     seen = exact.valid & found.valid
     moved = (exact.uv - air.uv)[seen]
     assert seen.sum() > 50 and np.abs(moved).max() > 0.3

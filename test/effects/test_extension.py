@@ -36,10 +36,18 @@ FISH214 = load_lens(lens_path('fish214'))
 KB = replace(lens(), image_height=KannalaBrandt(-0.01, 0.002, 0.0, 0.0))
 SEEN = scene(np.random.default_rng(5), frames=4)
 SHAPES = {
-    'viewpoint_shift': {'order': 2}, 'flat_port': {}, 'radial_profile': {'terms': 4},
-    'focal_length': {}, 'aspect': {}, 'principal_point': {}, 'decentering': {},
-    'sensor_tilt': {}, 'skew': {}, 'session_step': {'starts': (0.2,)},
-    'focal_drift': {'duration': 0.3}, 'detector_bias': {},
+    'viewpoint_shift': {'order': 2},
+    'flat_port': {},
+    'radial_profile': {'terms': 4},
+    'focal_length': {},
+    'aspect': {},
+    'principal_point': {},
+    'decentering': {},
+    'sensor_tilt': {},
+    'skew': {},
+    'session_step': {'starts': (0.2,)},
+    'focal_drift': {'duration': 0.3},
+    'detector_bias': {},
 }
 
 
@@ -55,14 +63,18 @@ def some(*names, size=0.3):
 
 def bowed(seen, height=0.01):
     """Return the table of a bowed target, and the bow."""
-    shape = CATALOGUE['target_shape'].candidates(ForwardModel(KB, ()).scene(
-        *seen, ForwardModel(KB, ()).linearise(*seen)))[0]
+    shape = CATALOGUE['target_shape'].candidates(
+        ForwardModel(KB, ()).scene(*seen, ForwardModel(KB, ()).linearise(*seen))
+    )[0]
     values = np.full(len(shape.parameters), height)
     return observe(KB, [(shape, values)], *seen, 0.0, np.random.default_rng(1)), (shape, values)
 
 
-@pytest.mark.parametrize('base', [KB, lens(), replace(lens(), image_height=Equisolid()), FISH214],
-                         ids=['kannala_brandt', 'equidistant', 'equisolid', 'shift'])
+@pytest.mark.parametrize(
+    'base',
+    [KB, lens(), replace(lens(), image_height=Equisolid()), FISH214],
+    ids=['kannala_brandt', 'equidistant', 'equisolid', 'shift'],
+)
 def test_an_extended_lens_predicts_what_its_effects_do(base):
     terms = some(*SHAPES)
     extended = extend_lens(base, terms)
@@ -73,7 +85,9 @@ def test_an_extended_lens_predicts_what_its_effects_do(base):
     without = [term for term in terms if term[0].name not in ('aspect', 'detector_bias')]
     np.testing.assert_allclose(
         ForwardModel(extend_lens(base, without)).predict(*SEEN, False).uv,
-        ForwardModel(base, without).predict(*SEEN, False).uv, rtol=0, atol=1e-9,
+        ForwardModel(base, without).predict(*SEEN, False).uv,
+        rtol=0,
+        atol=1e-9,
     )
     assert lens_from_dict(lens_to_dict(extended)) == extended
 
@@ -81,8 +95,10 @@ def test_an_extended_lens_predicts_what_its_effects_do(base):
 def test_what_the_lens_has_a_place_for_goes_there():
     extended = extend_lens(KB, some(*SHAPES))
     (_, (relative,)), (_, (cx, cy)), (_, (aspect,)) = (
-        term for name in ('focal_length', 'principal_point', 'aspect')
-        for term in some(*SHAPES) if term[0].name == name
+        term
+        for name in ('focal_length', 'principal_point', 'aspect')
+        for term in some(*SHAPES)
+        if term[0].name == name
     )
     assert extended.fx == pytest.approx(KB.fx * (1 + relative) * (1 + aspect / 2))
     assert extended.fy == pytest.approx(KB.fy * (1 + relative) * (1 - aspect / 2))
@@ -92,7 +108,12 @@ def test_what_the_lens_has_a_place_for_goes_there():
     gennery, port = extended.viewpoint_shift.parts
     assert (type(gennery), type(port)) == (Gennery, FlatPort)
     assert set(extended.corrections) == {
-        'decentering', 'sensor_tilt', 'skew', 'session_step', 'focal_drift', 'detector_bias'
+        'decentering',
+        'sensor_tilt',
+        'skew',
+        'session_step',
+        'focal_drift',
+        'detector_bias',
     }
     assert extended.max_incidence <= np.pi / 2
     other = extend_lens(replace(KB, image_height=Stereographic()), some('radial_profile'))
@@ -106,10 +127,12 @@ def test_found_coefficients_add_to_those_of_the_lens():
     assert extend_lens(KB, [SHIFT]).viewpoint_shift == Gennery(0.0, 0.004, 0.001, 0.0)
     own = FISH214.viewpoint_shift
     assert extend_lens(FISH214, [SHIFT]).viewpoint_shift == Gennery(
-        own.s0, own.e0 + 0.004, own.e1 + 0.001, own.e2)
+        own.s0, own.e0 + 0.004, own.e1 + 0.001, own.e2
+    )
     twice = extend_lens(extend_lens(KB, some('skew')), some('skew'))
     assert twice.corrections['skew']['parameters']['shear'] == pytest.approx(
-        2 * some('skew')[0][1][0])
+        2 * some('skew')[0][1][0]
+    )
     form = CATALOGUE['detector_bias']
     with pytest.raises(LensError, match=r'already holds detector_bias\(order=1\) in corrections'):
         extend_lens(extend_lens(KB, [(form(1), np.ones(1))]), [(form(2), np.ones(4))])
@@ -155,7 +178,8 @@ def test_what_an_svp_user_is_given_has_the_corrected_curve():
     assert given.corrections == {}
     theta = np.array(0.8)
     change = given.fx * given.image_height.value_and_slope(theta)[0] - (
-        plain.fx * plain.image_height.value_and_slope(theta)[0])
+        plain.fx * plain.image_height.value_and_slope(theta)[0]
+    )
     effect, values = some('radial_profile')[0]
     expected = effect.with_curves(base, values).image_height.value_and_slope(theta)[0]
     expected -= base.image_height.value_and_slope(theta)[0]
@@ -197,16 +221,19 @@ class TestTarget:
         model = ForwardModel(extend_lens(KB, [term], table))
         other = scene(np.random.default_rng(6), frames=4)
         np.testing.assert_allclose(
-            model.predict(*other).uv, ForwardModel(KB).predict(*other).uv, rtol=0, atol=1e-9)
+            model.predict(*other).uv, ForwardModel(KB).predict(*other).uv, rtol=0, atol=1e-9
+        )
         assert model.seeing(other[1]).is_lens_only and not model.seeing(SEEN[1]).is_lens_only
         assert model.terms_for(other[1]) == () and len(model.terms_for(SEEN[1])) == 1
         # One view of each: every view is judged by itself.
         both = [np.concatenate([a[:1], b[:1]]) for a, b in zip(SEEN[1], other[1], strict=True)]
-        pose = type(SEEN[0])(*(np.concatenate([a[:1], b[:1]])
-                               for a, b in zip(SEEN[0], other[0], strict=True)))
+        pose = type(SEEN[0])(
+            *(np.concatenate([a[:1], b[:1]]) for a, b in zip(SEEN[0], other[0], strict=True))
+        )
         mixed = model.predict(pose, type(SEEN[1])(*both)).uv
         np.testing.assert_allclose(
-            mixed[1], ForwardModel(KB).predict(*other).uv[0], rtol=0, atol=1e-9)
+            mixed[1], ForwardModel(KB).predict(*other).uv[0], rtol=0, atol=1e-9
+        )
         np.testing.assert_allclose(mixed[0], model.predict(*SEEN).uv[0], rtol=0, atol=1e-9)
         assert np.nanmax(np.abs(mixed[0] - ForwardModel(KB).predict(*SEEN).uv[0])) > 0.1
 
@@ -264,8 +291,10 @@ def test_corrections_that_stand_in_the_lens_follow_its_focal_length():
     extended = extend_lens(first, terms)
     both = [*load_effects(first.corrections, ''), *terms]
     np.testing.assert_allclose(
-        ForwardModel(extended).predict(*SEEN).uv, ForwardModel(KB, both).predict(*SEEN).uv,
-        rtol=0, atol=1e-9,
+        ForwardModel(extended).predict(*SEEN).uv,
+        ForwardModel(KB, both).predict(*SEEN).uv,
+        rtol=0,
+        atol=1e-9,
     )
 
 
@@ -276,7 +305,8 @@ def test_the_library_projects_with_all_of_the_lens():
     image = fsvp.project(extended, points)
     assert image.uv.shape == (2, 5, 2) and image.valid.all()
     linear = ForwardModel(extended).linearise(
-        identity(1), views_of(points.reshape(1, 10, 3), np.zeros((1, 10, 2))))
+        identity(1), views_of(points.reshape(1, 10, 3), np.zeros((1, 10, 2)))
+    )
     np.testing.assert_array_equal(image.uv.reshape(1, 10, 2), linear.uv)
     bare = fsvp.project(replace(extended, corrections={}), points)
     assert np.abs(image.uv - bare.uv).max() > 0.1
@@ -288,7 +318,7 @@ def test_the_library_projects_with_all_of_the_lens():
 def contrast(photograph, corner):
     """Return how much two opposite quadrants about a place are brighter than the other two."""
     u, v = np.round(corner).astype(int)
-    a, b, c, d = (photograph[y - 5:y, x - 5:x].mean() for y in (v, v + 6) for x in (u, u + 6))
+    a, b, c, d = (photograph[y - 5 : y, x - 5 : x].mean() for y in (v, v + 6) for x in (u, u + 6))
     return abs(a + d - b - c)
 
 

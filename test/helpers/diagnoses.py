@@ -10,5 +10,9 @@ def with_changes(found, **changes):
     """Return a diagnosis with other fields, those of its figures and its record among them."""
     figures = {name: changes.pop(name) for name in Figures._fields if name in changes}
     record = {name: changes.pop(name) for name in SearchRecord._fields if name in changes}
-    return replace(found, figures=found.figures._replace(**figures),
-                   record=found.record._replace(**record), **changes)
+    return replace(
+        found,
+        figures=found.figures._replace(**figures),
+        record=found.record._replace(**record),
+        **changes,
+    )

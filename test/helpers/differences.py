@@ -15,10 +15,14 @@ def derivative(function, step):
 
 def jacobian(function, step=1e-5):
     """Return the Jacobian of function(x) as a function of x, by central differences."""
+
     def at(x):
-        return np.stack([
-            (function(x + change) - function(x - change)) / (2 * step)
-            for change in step * np.eye(len(x))
-        ], axis=-1)
+        return np.stack(
+            [
+                (function(x + change) - function(x - change)) / (2 * step)
+                for change in step * np.eye(len(x))
+            ],
+            axis=-1,
+        )
 
     return at

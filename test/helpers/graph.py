@@ -80,5 +80,5 @@ class Graph:
 
 def set_parameter(node: Any, name: str, value: Any) -> Any:
     """Set a parameter as `ros2 param set` does, and return the result with its reason."""
-    result, = node.set_parameters([Parameter(name, value=value)])
+    (result,) = node.set_parameters([Parameter(name, value=value)])
     return result

@@ -12,8 +12,18 @@ from fisheye_svp_ros.planning.plan import nominal_lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.simulate.render import Print
 
-LENS = Lens('hidden', 848, 800, 270.0, 270.0, 428.0, 396.0, KannalaBrandt(-0.01, 0.003),
-            np.radians(92.0), Gennery(e0=-0.003))
+LENS = Lens(
+    'hidden',
+    848,
+    800,
+    270.0,
+    270.0,
+    428.0,
+    396.0,
+    KannalaBrandt(-0.01, 0.003),
+    np.radians(92.0),
+    Gennery(e0=-0.003),
+)
 SHEET = nominal_lens((848, 800), 3.15)
 POINTS = Print(6, 5, 0.030).corners
 
@@ -35,8 +45,9 @@ def present(lens: Lens, stand: SessionState, rng: np.random.Generator) -> Detect
     for i in range(len(stand.outline)):
         board = stand.wanted.shots.camera.take(i).inverse()
         turn = rotation_from_vector(rng.normal(scale=0.03, size=3))
-        camera = Pose(turn @ board.rotation, board.position + rng.normal(scale=0.004, size=3)
-                      ).inverse()
+        camera = Pose(
+            turn @ board.rotation, board.position + rng.normal(scale=0.004, size=3)
+        ).inverse()
         seen = seen_from(lens, camera, rng)
         if np.isfinite(seen.uv).all():
             return seen

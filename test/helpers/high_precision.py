@@ -12,8 +12,8 @@ _HEIGHTS = {
     'Equidistant': lambda k, a: a,
     'Equisolid': lambda k, a: 2 * mpmath.sin(a / 2),
     'Stereographic': lambda k, a: 2 * mpmath.tan(a / 2),
-    'KannalaBrandt': lambda k, a: a + sum(
-        mpmath.mpf(value) * a ** (2 * i + 3) for i, value in enumerate(k)
+    'KannalaBrandt': lambda k, a: (
+        a + sum(mpmath.mpf(value) * a ** (2 * i + 3) for i, value in enumerate(k))
     ),
 }
 
@@ -55,8 +55,12 @@ def incidence(lens, point):
     grid, on_grid = _coarse(lens, float(r), float(z))
     crossing = np.flatnonzero((on_grid[:-1] >= 0) & (on_grid[1:] < 0))
     end = int(crossing[0]) + 1 if crossing.size else len(grid) - 1
-    for i in np.flatnonzero((on_grid[1:end] < on_grid[:end - 1])
-                            & (on_grid[1:end] < on_grid[2:end + 1])) + 1:
+    for i in (
+        np.flatnonzero(
+            (on_grid[1:end] < on_grid[: end - 1]) & (on_grid[1:end] < on_grid[2 : end + 1])
+        )
+        + 1
+    ):
         low = _minimum(equation, grid[i - 1], grid[i + 1])
         if equation(low) < 0:
             return _root(equation, grid[i - 1], low)

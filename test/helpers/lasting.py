@@ -45,7 +45,8 @@ class LastingWorker(_Worker):
 
 def _circumstances(function: Callable[[Any], Any]) -> object:
     """Return all that a process takes over: where a test captures what it writes, too."""
-    environment = {name: value for name, value in os.environ.items()
-                   if name != 'PYTEST_CURRENT_TEST'}
+    environment = {
+        name: value for name, value in os.environ.items() if name != 'PYTEST_CURRENT_TEST'
+    }
     files = [(stat.st_dev, stat.st_ino) for stat in map(os.fstat, (1, 2))]
     return function, Path.cwd(), environment, files, [*sys.path]

@@ -31,16 +31,27 @@ SHIFTS = {
     'receding': Gennery(0.003, -0.006, -0.002, 0.0004),
     'flat_port': FlatPort(0.02, 1.5),
 }
-STEPS = {'k1': 1e-2, 'k2': 1e-2, 'k3': 1e-2, 'k4': 1e-2, 's0': 1e-4, 'e0': 1e-4, 'e1': 1e-4,
-         'e2': 2e-5, 'thickness': 1e-3, 'refractive_index': 1e-2}
+STEPS = {
+    'k1': 1e-2,
+    'k2': 1e-2,
+    'k3': 1e-2,
+    'k4': 1e-2,
+    's0': 1e-4,
+    'e0': 1e-4,
+    'e1': 1e-4,
+    'e2': 2e-5,
+    'thickness': 1e-3,
+    'refractive_index': 1e-2,
+}
 
 
 def make_lens(height, shift):
     curve, degrees = HEIGHTS[height]
     if shift == 'flat_port':
         degrees = min(degrees, 90.0)
-    return Lens('lens', 1200, 1000, 381.0, 379.5, 598.3, 501.7, curve, np.radians(degrees),
-                SHIFTS[shift])
+    return Lens(
+        'lens', 1200, 1000, 381.0, 379.5, 598.3, 501.7, curve, np.radians(degrees), SHIFTS[shift]
+    )
 
 
 LENSES = [pytest.param(make_lens(h, s), id=f'{h}-{s}') for h in HEIGHTS for s in SHIFTS]
@@ -57,8 +68,10 @@ def points_on_rays(lens, rng, count, nearest=0.05, farthest=3.0, edge=1.0):
 def place(lens, theta, azimuth, distance):
     shift = np.asarray(high_precision.shift(lens, theta, np))
     across = distance * np.sin(theta)
-    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth),
-                     distance * np.cos(theta) + shift], axis=-1)
+    return np.stack(
+        [across * np.cos(azimuth), across * np.sin(azimuth), distance * np.cos(theta) + shift],
+        axis=-1,
+    )
 
 
 def points_around(rng, count, nearest, farthest, widest):

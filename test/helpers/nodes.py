@@ -40,8 +40,13 @@ class NodeProcess:
         self.lines: list[str] = []
         self._queue: queue.Queue[str | None] = queue.Queue()
         self.process = subprocess.Popen(
-            command, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            preexec_fn=hears_sigint)
+            command,
+            env=env,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            preexec_fn=hears_sigint,
+        )
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 

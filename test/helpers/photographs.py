@@ -17,8 +17,18 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.simulate.targets import board_views
 
-LENS = Lens('small', 424, 400, 142.0, 142.0, 211.3, 200.2, KannalaBrandt(-0.01, 0.004, -0.0015),
-            np.radians(92.0), Gennery(e0=0.003))
+LENS = Lens(
+    'small',
+    424,
+    400,
+    142.0,
+    142.0,
+    211.3,
+    200.2,
+    KannalaBrandt(-0.01, 0.004, -0.0015),
+    np.radians(92.0),
+    Gennery(e0=0.003),
+)
 BOARD = 'chessboard:6x5:30mm'
 PRINTED = Print(6, 5, 0.030)
 

@@ -18,11 +18,16 @@ from helpers.targets import plane, poses_around
 LENS = Lens('made', 1280, 960, 300.0, 300.0, 650.0, 470.0, KannalaBrandt(-0.03), 1.7)
 TRUTH = Transforms(
     Pose(rotation_from_vector(np.array([0.3, -0.4, 0.5])), np.array([0.05, -0.02, 0.08])),
-    Pose(rotation_from_vector(np.array([1.0, 0.3, -0.2])), np.array([0.6, -0.1, 0.4])), 1.001)
+    Pose(rotation_from_vector(np.array([1.0, 0.3, -0.2])), np.array([0.6, -0.1, 0.4])),
+    1.001,
+)
 
 
 def robot(
-    seed: int, frames: int = 18, noise: tuple[float, float] = (3e-4, 1e-3), lens: Lens = LENS,
+    seed: int,
+    frames: int = 18,
+    noise: tuple[float, float] = (3e-4, 1e-3),
+    lens: Lens = LENS,
     truth: Transforms = TRUTH,
 ) -> tuple[Observations, Pose, dict[int, Pose]]:
     """Return observations, poses of the camera (F,), and the robot's poses of its flange.
@@ -34,6 +39,10 @@ def robot(
     table = simulate(ForwardModel(lens), plane(), camera, 0.1, rng)
     stated = truth.flange(camera)
     stated = Pose(stated.rotation, stated.position / truth.scale).retract(
-        rng.normal(size=(frames, 6)) * np.repeat(noise, 3))
-    return (replace(table, sigma=np.full(len(table), np.nan)), camera,
-            {i: stated.take(i) for i in range(frames)})
+        rng.normal(size=(frames, 6)) * np.repeat(noise, 3)
+    )
+    return (
+        replace(table, sigma=np.full(len(table), np.nan)),
+        camera,
+        {i: stated.take(i) for i in range(frames)},
+    )

@@ -51,7 +51,12 @@ def observe(simulated, terms, pose, views, sigma, rng):
     uv = image.uv + rng.normal(size=image.uv.shape) * sigma
     view, point = np.nonzero(image.valid)
     return make_observations(
-        views.frame[view], views.landmark[view, point], uv[view, point],
-        views.points[view, point], camera=views.camera[view], board=views.board[view, point],
-        t=views.t[view, point], cameras=('left', 'right'),
+        views.frame[view],
+        views.landmark[view, point],
+        uv[view, point],
+        views.points[view, point],
+        camera=views.camera[view],
+        board=views.board[view, point],
+        t=views.t[view, point],
+        cameras=('left', 'right'),
     )

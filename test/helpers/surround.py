@@ -11,8 +11,18 @@ from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.scene.rigs import surround_rig
 
-LENS = Lens('around', 1280, 800, 400.0, 400.0, 639.5, 399.5, KannalaBrandt(-0.01, 0.002),
-            np.radians(95.0), Gennery(e0=0.004))
+LENS = Lens(
+    'around',
+    1280,
+    800,
+    400.0,
+    400.0,
+    639.5,
+    399.5,
+    KannalaBrandt(-0.01, 0.002),
+    np.radians(95.0),
+    Gennery(e0=0.004),
+)
 CAMERAS = tuple(f'cam{i}' for i in range(4))
 RIG = surround_rig(4, 0.1)
 _Y, _X = np.mgrid[:6, :9]
@@ -27,8 +37,7 @@ def board_pose(azimuth: float, rng: np.random.Generator) -> Pose:
     right = np.cross([0.0, 1.0, 0.0], ahead)
     right /= np.linalg.norm(right)
     turn = np.stack([right, np.cross(ahead, right), ahead], axis=1)
-    return Pose(turn @ rotation_from_vector(rng.normal(0, 0.3, 3)),
-                rng.uniform(0.4, 0.8) * ahead)
+    return Pose(turn @ rotation_from_vector(rng.normal(0, 0.3, 3)), rng.uniform(0.4, 0.8) * ahead)
 
 
 def photographs(seed: int, seams: tuple[float, ...], frames: int = 40) -> Observations:
@@ -40,9 +49,13 @@ def photographs(seed: int, seams: tuple[float, ...], frames: int = 40) -> Observ
         for camera in range(4):
             image = project(LENS, RIG.take(camera).inverse().transform(points))
             seen = image.valid & ((image.uv > 0) & (image.uv < [1279, 799])).all(axis=1)
-            rows += [(frame, i, camera, *image.uv[i], *BOARD[i]) for i in np.flatnonzero(seen)
-                     if seen.sum() >= 12]
+            rows += [
+                (frame, i, camera, *image.uv[i], *BOARD[i])
+                for i in np.flatnonzero(seen)
+                if seen.sum() >= 12
+            ]
     table = np.array(rows)
     uv = table[:, 3:5] + rng.normal(0, NOISE, (len(table), 2))
-    return make_observations(table[:, 0], table[:, 1], uv, table[:, 5:], camera=table[:, 2],
-                             cameras=CAMERAS)
+    return make_observations(
+        table[:, 0], table[:, 1], uv, table[:, 5:], camera=table[:, 2], cameras=CAMERAS
+    )

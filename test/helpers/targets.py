@@ -26,9 +26,14 @@ def poses_around(landmarks, frames, rng, *, widest, distance=(0.25, 0.8), tilt=4
     """
     incidence = widest * np.sqrt(rng.uniform(size=frames))
     azimuth = rng.uniform(0, 2 * np.pi, frames)
-    gaze = np.stack([
-        np.sin(incidence) * np.cos(azimuth), np.sin(incidence) * np.sin(azimuth), np.cos(incidence)
-    ], axis=-1)
+    gaze = np.stack(
+        [
+            np.sin(incidence) * np.cos(azimuth),
+            np.sin(incidence) * np.sin(azimuth),
+            np.cos(incidence),
+        ],
+        axis=-1,
+    )
     x = np.cross([0.1, 1.0, 0.3], gaze)
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
     facing = np.stack([x, np.cross(gaze, x), gaze], axis=-1)

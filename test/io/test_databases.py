@@ -36,7 +36,7 @@ def write(tmp_path: Path) -> Callable[..., Path]:
             topic = writer.add_connection('/text', TEXT, typestore=store)
             for when in (1, 2):
                 writer.write(topic, when, store.serialize_cdr(text(data='a'), TEXT))
-        found, = (path for path in (tmp_path / 'bag').iterdir() if path.name != 'metadata.yaml')
+        (found,) = (path for path in (tmp_path / 'bag').iterdir() if path.name != 'metadata.yaml')
         return found
 
     return record
@@ -55,8 +55,9 @@ def texts(path: Path) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize('mode', [
-    CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE])
+@pytest.mark.parametrize(
+    'mode', [CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE]
+)
 @pytest.mark.parametrize('plugin', PLUGINS)
 def test_a_recording_is_read_however_it_is_stored_and_without_its_metadata(
     write: Callable[..., Path], plugin: StoragePlugin, mode: CompressionMode
@@ -77,8 +78,9 @@ def test_a_compressed_file_is_not_unpacked_to_list_topics_that_its_metadata_list
 ) -> None:
     file, unpack = write(StoragePlugin.MCAP, CompressionMode.FILE), bags._unpack
     unpacked: list[Path] = []
-    monkeypatch.setattr(bags, '_unpack', lambda packed, whole: (
-        unpacked.append(packed), unpack(packed, whole)))
+    monkeypatch.setattr(
+        bags, '_unpack', lambda packed, whole: (unpacked.append(packed), unpack(packed, whole))
+    )
     if metadata:
         (file.parent / 'metadata.yaml').write_text(metadata)
     assert Bag(file.parent).topics() == Bag(file).topics() == {('/text', TEXT)}
@@ -86,7 +88,7 @@ def test_a_compressed_file_is_not_unpacked_to_list_topics_that_its_metadata_list
 
 
 def test_what_was_decompressed_beside_the_compressed_file_is_not_read_twice(
-    write: Callable[..., Path]
+    write: Callable[..., Path],
 ) -> None:
     file = write(StoragePlugin.MCAP, CompressionMode.FILE)
     plain = zstandard.ZstdDecompressor().stream_reader(file.read_bytes()).read()
@@ -95,7 +97,7 @@ def test_what_was_decompressed_beside_the_compressed_file_is_not_read_twice(
 
 
 def test_a_compressed_file_that_was_cut_short_yields_what_is_whole(
-    write: Callable[..., Path]
+    write: Callable[..., Path],
 ) -> None:
     file = write(StoragePlugin.MCAP, CompressionMode.FILE)
     plain = zstandard.ZstdDecompressor().stream_reader(file.read_bytes()).read()
@@ -122,12 +124,15 @@ ALTER TABLE new RENAME TO messages;
 """
 
 
-@pytest.mark.parametrize('change', [
-    COMPUTED,
-    'UPDATE messages SET data = 900000000',
-    'UPDATE topics SET name = zeroblob(9)',
-    "CREATE VIEW more AS SELECT 1; UPDATE messages SET data = 'a'",
-])
+@pytest.mark.parametrize(
+    'change',
+    [
+        COMPUTED,
+        'UPDATE messages SET data = 900000000',
+        'UPDATE topics SET name = zeroblob(9)',
+        "CREATE VIEW more AS SELECT 1; UPDATE messages SET data = 'a'",
+    ],
+)
 def test_what_a_few_bytes_stand_for_is_not_made_up(recording: Path, change: str) -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with closing(sqlite3.connect(recording)) as database:

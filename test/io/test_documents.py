@@ -14,15 +14,18 @@ from fisheye_svp_ros.io.files import dump_yaml, parse_json, parse_yaml, read_byt
 from fisheye_svp_ros.io.parameters import parameters_of, read_parameter_file
 
 BOMB = 'a: &a [1, 1]\n' + ''.join(
-    f'{n}: &{n} [*{m}, *{m}, *{m}, *{m}]\n' for m, n in zip('abcdefgh', 'bcdefghi', strict=True))
+    f'{n}: &{n} [*{m}, *{m}, *{m}, *{m}]\n' for m, n in zip('abcdefgh', 'bcdefghi', strict=True)
+)
 # libyaml from 0.2.6 on has a limit of its own.
 _DEEP = 'nested deeper than 50|exceeded maximum nesting depth'
 HOSTILE = {
     'aliases': (BOMB, 'line 2: there is an alias'),
     'merged': ('a: &a {b: 1}\nc: {<<: *a}\n', 'line 2: there is an alias'),
     'twice': ('a: 1\nb: 2\na: 3\n', "line 3: there is the key 'a' a second time"),
-    'twice within lists': ('a:\n- {b: 2}\n- - b: 2\n    b: 3\n  - c\nd: 1\n',
-                           "line 4: there is the key 'b' a second time"),
+    'twice within lists': (
+        'a:\n- {b: 2}\n- - b: 2\n    b: 3\n  - c\nd: 1\n',
+        "line 4: there is the key 'b' a second time",
+    ),
     'twice below': ('a:\n  b: 2\n  "b": 3\n', "line 3: there is the key 'b' a second time"),
     'digits': ('a: ' + '9' * 5000, 'too many digits'),
     'deep lists': ('a: ' + '[' * 100_000, _DEEP),
@@ -53,7 +56,11 @@ def test_hostile_yaml_is_refused_in_one_line_at_once(name: str, tmp_path: Path) 
 def test_plain_values_stay() -> None:
     text = 'name: 2001-99-99\nwhen: 2001-01-01\na: 1e-3\nb: [1, 2.5, yes]\n'
     assert parse_yaml(text, 'x', LensError) == {
-        'name': '2001-99-99', 'when': '2001-01-01', 'a': 1e-3, 'b': [1, 2.5, True]}
+        'name': '2001-99-99',
+        'when': '2001-01-01',
+        'a': 1e-3,
+        'b': [1, 2.5, True],
+    }
     shared = [1.0, 2.0]
     assert parse_yaml(dump_yaml({'a': shared, 'b': shared}), 'x', LensError)['b'] == shared
 
@@ -66,27 +73,41 @@ def test_numpy_scalars_are_written_as_numbers() -> None:
 def test_numbers_are_those_of_yaml_1_2() -> None:
     text = 'a: 01536\nb: 1:30:00\nc: 0x10\nd: -.inf\ne: 1_0\nf: 08.5\n'
     assert parse_yaml(text, 'x', LensError) == {
-        'a': 1536, 'b': '1:30:00', 'c': 16, 'd': -math.inf, 'e': '1_0', 'f': 8.5}
+        'a': 1536,
+        'b': '1:30:00',
+        'c': 16,
+        'd': -math.inf,
+        'e': '1_0',
+        'f': 8.5,
+    }
 
 
-@pytest.mark.parametrize(('text', 'said'), [
-    ('{"a": 1, "b": {"c": 1, "c": 2}}', "'c' is listed twice"),
-    ('[' * 100_000, 'broken JSON'), ('{"a": ' + '9' * 5000 + '}', 'broken JSON'),
-    ('[1]', 'a JSON object is expected'), ('', 'broken JSON'),
-])
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('{"a": 1, "b": {"c": 1, "c": 2}}', "'c' is listed twice"),
+        ('[' * 100_000, 'broken JSON'),
+        ('{"a": ' + '9' * 5000 + '}', 'broken JSON'),
+        ('[1]', 'a JSON object is expected'),
+        ('', 'broken JSON'),
+    ],
+)
 def test_hostile_json(text: str, said: str) -> None:
     with pytest.raises(ObservationError, match=said):
         parse_json(text, 'x', ObservationError)
 
 
-@pytest.mark.parametrize(('text', 'said'), [
-    (BOMB, 'an alias'),
-    ('localizer: {ros__parameters: {}}\nlocalizer: {ros__parameters: {}}', 'a second time'),
-    ('localizer:\n  ros__parameters:\n    a.b: 1\n    a: {b: 2}\n', "'a.b' is listed twice"),
-    ('/(*: {ros__parameters: {a: 1}}', 'names no node'),
-    ('/***: {ros__parameters: {a: 1}}', 'names no node'),
-    ('ros__parameters: {a: 1}', 'names no node'),
-])
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        (BOMB, 'an alias'),
+        ('localizer: {ros__parameters: {}}\nlocalizer: {ros__parameters: {}}', 'a second time'),
+        ('localizer:\n  ros__parameters:\n    a.b: 1\n    a: {b: 2}\n', "'a.b' is listed twice"),
+        ('/(*: {ros__parameters: {a: 1}}', 'names no node'),
+        ('/***: {ros__parameters: {a: 1}}', 'names no node'),
+        ('ros__parameters: {a: 1}', 'names no node'),
+    ],
+)
 def test_hostile_parameter_files(text: str, said: str, tmp_path: Path) -> None:
     path = tmp_path / 'a.yaml'
     path.write_text(text)
@@ -95,9 +116,19 @@ def test_hostile_parameter_files(text: str, said: str, tmp_path: Path) -> None:
     assert str(path) in str(error.value) and '\n' not in str(error.value)
 
 
-@pytest.mark.parametrize('text', ['- 1', '/**: 3', 'a: {ros__parameters: [1]}', '', 'a: [', ':',
-                                  'a: {ros__parameters: {x: [1, a]}}',
-                                  'a: {ros__parameters: {x: }}'])
+@pytest.mark.parametrize(
+    'text',
+    [
+        '- 1',
+        '/**: 3',
+        'a: {ros__parameters: [1]}',
+        '',
+        'a: [',
+        ':',
+        'a: {ros__parameters: {x: [1, a]}}',
+        'a: {ros__parameters: {x: }}',
+    ],
+)
 def test_unusable_parameter_files_are_named(tmp_path: Path, text: str) -> None:
     file = tmp_path / 'bad.yaml'
     file.write_text(text)
@@ -105,12 +136,30 @@ def test_unusable_parameter_files_are_named(tmp_path: Path, text: str) -> None:
         read_parameter_file(file)
 
 
-@pytest.mark.parametrize(('text', 'value'), [
-    ('1', 1), ('-7', -7), ('0x1F', 31), ('010', 8), ('08', 8.0), ('1e-3', 0.001), ('1.', 1.0),
-    ('.inf', math.inf), ('-.inf', -math.inf), ('on', True), ('N', False), ('"1"', '1'),
-    ("'yes'", 'yes'), ('text', 'text'), ('[1, 2]', [1, 2]), ('[a, "1"]', ['a', '1']),
-    ('1_000', '1_000'), ('99999999999999999999', 1e20), ('[true]', [True]),
-])
+@pytest.mark.parametrize(
+    ('text', 'value'),
+    [
+        ('1', 1),
+        ('-7', -7),
+        ('0x1F', 31),
+        ('010', 8),
+        ('08', 8.0),
+        ('1e-3', 0.001),
+        ('1.', 1.0),
+        ('.inf', math.inf),
+        ('-.inf', -math.inf),
+        ('on', True),
+        ('N', False),
+        ('"1"', '1'),
+        ("'yes'", 'yes'),
+        ('text', 'text'),
+        ('[1, 2]', [1, 2]),
+        ('[a, "1"]', ['a', '1']),
+        ('1_000', '1_000'),
+        ('99999999999999999999', 1e20),
+        ('[true]', [True]),
+    ],
+)
 def test_values_have_the_type_that_rcl_gives_them(
     text: str, value: object, tmp_path: Path
 ) -> None:

@@ -28,10 +28,22 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_vector
 from fisheye_svp_ros.study.settings import SolverSettings
 
-LENS = Lens('front', 848, 800, 285.2, 284.9, 424.3, 398.7,
-            KannalaBrandt(-0.011, 0.0041, -0.0012, 0.0001), np.radians(95.0))
-SHORT = replace(LENS, image_height=KannalaBrandt(-0.011, 0.0041), viewpoint_shift=Gennery(
-    0.0, 0.004, 0.001, -0.0002))
+LENS = Lens(
+    'front',
+    848,
+    800,
+    285.2,
+    284.9,
+    424.3,
+    398.7,
+    KannalaBrandt(-0.011, 0.0041, -0.0012, 0.0001),
+    np.radians(95.0),
+)
+SHORT = replace(
+    LENS,
+    image_height=KannalaBrandt(-0.011, 0.0041),
+    viewpoint_shift=Gennery(0.0, 0.004, 0.001, -0.0002),
+)
 
 # The example of Kalibr's wiki (yaml-formats), its second camera made one with fisheye lenses
 CAMCHAIN = """
@@ -68,7 +80,8 @@ def directions(lens: Lens, distance: float = 3.0) -> np.ndarray:
     azimuth = np.linspace(0, 6, 40)
     sin = np.sin(theta)
     return distance * np.stack(
-        [sin * np.cos(azimuth), sin * np.sin(azimuth), np.cos(theta)], axis=-1)
+        [sin * np.cos(azimuth), sin * np.sin(azimuth), np.cos(theta)], axis=-1
+    )
 
 
 @pytest.mark.parametrize('form', [form for form in WRITABLE if form != 'mrcal'])
@@ -108,9 +121,16 @@ def test_cahvore_of_any_linearity(linearity: str, tmp_path: Path) -> None:
     """Against the projection as Gennery writes it, solved by bisection."""
     path = tmp_path / 'x.cameramodel'
     r, e = [0.01, -0.02, 0.003], [0.004, 0.001, 0.0]
-    path.write_text(repr({
-        'lensmodel': f'LENSMODEL_CAHVORE_linearity={linearity}', 'imagersize': [800, 800],
-        'intrinsics': [300.0, 300.0, 400.0, 400.0, 0, 0, *r, *e], 'extrinsics': [0] * 6}))
+    path.write_text(
+        repr(
+            {
+                'lensmodel': f'LENSMODEL_CAHVORE_linearity={linearity}',
+                'imagersize': [800, 800],
+                'intrinsics': [300.0, 300.0, 400.0, 400.0, 0, 0, *r, *e],
+                'extrinsics': [0] * 6,
+            }
+        )
+    )
     lens, value = load_lens(path), float(linearity)
     worst = next(iter(read_lens_file(path).worst_px.values()))
     for z, radius in ((0.3, 0.1), (0.2, 0.2), (0.1, 0.3)):
@@ -143,19 +163,38 @@ def test_kalibr(tmp_path: Path) -> None:
     sphere = load_lens(f'{path}#cam2')
     unit = directions(sphere) / 3.0
     z = unit[:, 2:] - 0.2
-    depth = 0.59 * np.sqrt((unit[:, :2]**2).sum(1, keepdims=True) + z**2) + 0.41 * z
+    depth = 0.59 * np.sqrt((unit[:, :2] ** 2).sum(1, keepdims=True) + z**2) + 0.41 * z
     uv = 158.0 * unit[:, :2] / depth + [255.0, 257.0]
     assert np.abs(project(sphere, unit).uv - uv).max() < foreign.worst_px['cam2'] + 1e-6 < 0.1
     with pytest.raises(LensError, match='no camera'):
         load_lens(f'{path}#cam7')
 
 
-BASALT = json.dumps({'value0': {
-    'T_imu_cam': [{'px': place, 'py': 0, 'pz': 0, 'qx': 0, 'qy': 0, 'qz': 0, 'qw': 1}
-                  for place in (0.1, 0.3)],
-    'intrinsics': 2 * [{'camera_type': 'ds', 'intrinsics': {
-        'fx': 158.0, 'fy': 158.0, 'cx': 255.0, 'cy': 257.0, 'xi': -0.2, 'alpha': 0.59}}],
-    'resolution': [[512, 512], [512, 512]]}})
+BASALT = json.dumps(
+    {
+        'value0': {
+            'T_imu_cam': [
+                {'px': place, 'py': 0, 'pz': 0, 'qx': 0, 'qy': 0, 'qz': 0, 'qw': 1}
+                for place in (0.1, 0.3)
+            ],
+            'intrinsics': 2
+            * [
+                {
+                    'camera_type': 'ds',
+                    'intrinsics': {
+                        'fx': 158.0,
+                        'fy': 158.0,
+                        'cx': 255.0,
+                        'cy': 257.0,
+                        'xi': -0.2,
+                        'alpha': 0.59,
+                    },
+                }
+            ],
+            'resolution': [[512, 512], [512, 512]],
+        }
+    }
+)
 
 
 BOOFCV = """model: omnidirectional_universal
@@ -213,54 +252,89 @@ def test_boofcv() -> None:
     assert next(iter(read_lens_file(path).worst_px.values())) < 0.5
 
 
-@pytest.mark.parametrize(('text', 'said'), [
-    (CAMCHAIN.replace('equidistant', 'fov'), 'cam0: distortion_coeffs has 4 numbers, not 1'),
-    (CAMCHAIN.replace('resolution: [512, 512]', 'resolution: 512', 1), 'cam0: resolution'),
-    (CAMCHAIN.replace('omni', 'omega'), "cam1: camera_model is 'omega'"),
-    ('%YAML:1.0\n---\nimage_width: 3\nimage_height: 3\n', 'it has none of'),
-    ('<opencv_storage><K>' + '<a>' * 100_000, 'not a whole OpenCV file'),
-    ('<opencv_storage>' + '<a>' * 100_000 + '</a>' * 100_000 + '</opencv_storage>',
-     'it has none of'),
-    ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage></opencv_storage>',
-     'document types are not read'),
-    ('%YAML:1.0\n---\na: ' + '[' * 100_000, 'nested deeper|nesting depth'),
-    ('<opencv_storage><K>3</K><D>3</D><width>4</width><height>4.5</height></opencv_storage>',
-     'a matrix of 3 x 3'),
-    (CAMCHAIN.replace('[512, 512]', '[512, 512.5]', 1), 'whole numbers are needed'),
-    (CAMCHAIN.replace('158.0', '0', 1), 'no valid numbers'),
-    (CAMCHAIN.replace('camera_model: ds', 'camera_model: [ds]'), r'camera_model is'),
-    (CAMCHAIN.replace('0.00020293673', '1e300'), 'must be a list of 4 finite numbers'),
-    (CAMCHAIN.replace('T_cn_cnm1:\n  - [ 0.99998854, 0.00216014, 0.00427195,-0.11003785]',
-                      'T_cn_cnm1:\n  - [{}, 0.00216014, 0.00427195,-0.11003785]'),
-     'T_cn_cnm1 must be a matrix of 4 x 4'),
-    (CAMCHAIN + 'cam2: {}\n', "the key 'cam2' a second time"),
-    (CAMCHAIN + CAMCHAIN[CAMCHAIN.index('cam1'):CAMCHAIN.index('cam2')].replace('cam1', 'cam3', 1),
-     'cam2 has no T_cn_cnm1, and cam3 after it has one'),
-    ('{"camera_type": 1}', 'intrinsics is None; a list of mappings is needed'),
-    (BASALT.replace('"xi"', '"x"', 1), 'camera 0: xi is None; a finite number is needed'),
-    (BASALT.replace('"ds"', '"kb4"'), 'camera 0: k1 is None; a finite number is needed'),
-    (BASALT.replace('[512, 512], ', '', 1), 'a list of width and height of each of the 2 cameras'),
-    (BASALT.replace('[512, 512], ', '512, ', 1), 'camera 0: resolution must be a list of 2'),
-    (BASALT.replace('"qw"', '"w"', 1), 'T_imu_cam 0: qw is None'),
-    (BOOFCV.replace('mirror_offset: 1.2\n', ''), 'mirror_offset is None; a finite number'),
-    (BOOFCV.replace('fx: 300.0', ''), 'pinhole: fx is None; a finite number is needed'),
-    (BOOFCV.replace('[-0.2, 0.05]', '0.1'), 'radial_tangential: radial must be a list of 2'),
-    ('{"camera_type": ' + '[' * 100_000, 'broken JSON'),
-    ("{'lensmodel': 'LENSMODEL_CAHVORE', 'a': " + '(' * 5000, 'not a whole .cameramodel'),
-    ("'LENSMODEL_CAHVORE'" + '-1' * 120_000, 'more than 100000 values'),
-    ("{'lensmodel': 'LENSMODEL_CAHVORE_linearity=0...37', 'intrinsics': " + str([1.0] * 12)
-     + ", 'imagersize': [2, 2]}", 'can be read'),
-    ("{'lensmodel': 'LENSMODEL_CAHVORE_linearity=0', 'intrinsics': " + str([1.0] * 11)
-     + ", 'imagersize': [2, 2]}", 'has 11 values; LENSMODEL_CAHVORE_linearity=0 needs 12'),
-    ("{'lensmodel': 'LENSMODEL_OPENCV8', 'intrinsics': [1], 'imagersize': [2, 2]}",
-     'intrinsics has 1 values; LENSMODEL_OPENCV8 needs 12'),
-    ("{'lensmodel': 'LENSMODEL_STEREOGRAPHIC', 'intrinsics': [1, 1, 1, 1], 'imagersize': [2]}",
-     'size, fx, fy, cx or cy are incomplete'),
-    ("{'lensmodel': 'LENSMODEL_CAHVORE", 'not a whole .cameramodel'),
-    ('camera_matrix: {data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\ndistortion_model: scara\n'
-     'image_width: 4\nimage_height: 4\ndistortion_coefficients: {data: [0.1]}\n',
-     "distortion_model is 'scara'"),
-], ids=lambda text: text[:30])
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        (CAMCHAIN.replace('equidistant', 'fov'), 'cam0: distortion_coeffs has 4 numbers, not 1'),
+        (CAMCHAIN.replace('resolution: [512, 512]', 'resolution: 512', 1), 'cam0: resolution'),
+        (CAMCHAIN.replace('omni', 'omega'), "cam1: camera_model is 'omega'"),
+        ('%YAML:1.0\n---\nimage_width: 3\nimage_height: 3\n', 'it has none of'),
+        ('<opencv_storage><K>' + '<a>' * 100_000, 'not a whole OpenCV file'),
+        (
+            '<opencv_storage>' + '<a>' * 100_000 + '</a>' * 100_000 + '</opencv_storage>',
+            'it has none of',
+        ),
+        (
+            '<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage></opencv_storage>',
+            'document types are not read',
+        ),
+        ('%YAML:1.0\n---\na: ' + '[' * 100_000, 'nested deeper|nesting depth'),
+        (
+            '<opencv_storage><K>3</K><D>3</D><width>4</width><height>4.5</height></opencv_storage>',
+            'a matrix of 3 x 3',
+        ),
+        (CAMCHAIN.replace('[512, 512]', '[512, 512.5]', 1), 'whole numbers are needed'),
+        (CAMCHAIN.replace('158.0', '0', 1), 'no valid numbers'),
+        (CAMCHAIN.replace('camera_model: ds', 'camera_model: [ds]'), r'camera_model is'),
+        (CAMCHAIN.replace('0.00020293673', '1e300'), 'must be a list of 4 finite numbers'),
+        (
+            CAMCHAIN.replace(
+                'T_cn_cnm1:\n  - [ 0.99998854, 0.00216014, 0.00427195,-0.11003785]',
+                'T_cn_cnm1:\n  - [{}, 0.00216014, 0.00427195,-0.11003785]',
+            ),
+            'T_cn_cnm1 must be a matrix of 4 x 4',
+        ),
+        (CAMCHAIN + 'cam2: {}\n', "the key 'cam2' a second time"),
+        (
+            CAMCHAIN
+            + CAMCHAIN[CAMCHAIN.index('cam1') : CAMCHAIN.index('cam2')].replace('cam1', 'cam3', 1),
+            'cam2 has no T_cn_cnm1, and cam3 after it has one',
+        ),
+        ('{"camera_type": 1}', 'intrinsics is None; a list of mappings is needed'),
+        (BASALT.replace('"xi"', '"x"', 1), 'camera 0: xi is None; a finite number is needed'),
+        (BASALT.replace('"ds"', '"kb4"'), 'camera 0: k1 is None; a finite number is needed'),
+        (
+            BASALT.replace('[512, 512], ', '', 1),
+            'a list of width and height of each of the 2 cameras',
+        ),
+        (BASALT.replace('[512, 512], ', '512, ', 1), 'camera 0: resolution must be a list of 2'),
+        (BASALT.replace('"qw"', '"w"', 1), 'T_imu_cam 0: qw is None'),
+        (BOOFCV.replace('mirror_offset: 1.2\n', ''), 'mirror_offset is None; a finite number'),
+        (BOOFCV.replace('fx: 300.0', ''), 'pinhole: fx is None; a finite number is needed'),
+        (BOOFCV.replace('[-0.2, 0.05]', '0.1'), 'radial_tangential: radial must be a list of 2'),
+        ('{"camera_type": ' + '[' * 100_000, 'broken JSON'),
+        ("{'lensmodel': 'LENSMODEL_CAHVORE', 'a': " + '(' * 5000, 'not a whole .cameramodel'),
+        ("'LENSMODEL_CAHVORE'" + '-1' * 120_000, 'more than 100000 values'),
+        (
+            "{'lensmodel': 'LENSMODEL_CAHVORE_linearity=0...37', 'intrinsics': "
+            + str([1.0] * 12)
+            + ", 'imagersize': [2, 2]}",
+            'can be read',
+        ),
+        (
+            "{'lensmodel': 'LENSMODEL_CAHVORE_linearity=0', 'intrinsics': "
+            + str([1.0] * 11)
+            + ", 'imagersize': [2, 2]}",
+            'has 11 values; LENSMODEL_CAHVORE_linearity=0 needs 12',
+        ),
+        (
+            "{'lensmodel': 'LENSMODEL_OPENCV8', 'intrinsics': [1], 'imagersize': [2, 2]}",
+            'intrinsics has 1 values; LENSMODEL_OPENCV8 needs 12',
+        ),
+        (
+            "{'lensmodel': 'LENSMODEL_STEREOGRAPHIC', 'intrinsics': [1, 1, 1, 1], "
+            "'imagersize': [2]}",
+            'size, fx, fy, cx or cy are incomplete',
+        ),
+        ("{'lensmodel': 'LENSMODEL_CAHVORE", 'not a whole .cameramodel'),
+        (
+            'camera_matrix: {data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\ndistortion_model: scara\n'
+            'image_width: 4\nimage_height: 4\ndistortion_coefficients: {data: [0.1]}\n',
+            "distortion_model is 'scara'",
+        ),
+    ],
+    ids=lambda text: text[:30],
+)
 def test_refused_in_one_line(text: str, said: str, tmp_path: Path) -> None:
     path = tmp_path / 'lens.yaml'
     path.write_text(text)
@@ -289,7 +363,8 @@ def test_cameras_of_a_chain_are_in_the_order_of_their_numbers(
     assert cli.main(['lens', str(path), '-o', str(out)]) == 0
     assert capsys.readouterr().err == (
         f'fisheye-svp: note: {path}: it holds {", ".join(foreign.lenses)}; the first is shown; '
-        f'use {path}#cam1 for another\n')
+        f'use {path}#cam1 for another\n'
+    )
 
 
 def test_the_folder_of_a_rig_is_its_lenses(
@@ -309,7 +384,9 @@ def test_the_folder_of_a_rig_is_its_lenses(
         assert [*load_lenses([str(folder)]).names] == ['left', 'right']
         of_node = SolverSettings(lens=str(folder))
         assert [lens.name for lens in of_rig(of_node, ('left/', 'right/')).values()] == [
-            'left', 'right']
+            'left',
+            'right',
+        ]
         with pytest.raises(LensError, match="no lens of camera 'top' in it; there are left, rig"):
             load_lens(f'{folder}#top')
     monkeypatch.chdir(tmp_path)
@@ -354,12 +431,19 @@ def test_a_camera_info_as_it_is_echoed(tmp_path: Path) -> None:
         path.write_text(text)
         lens = load_lens(path)
         assert (lens.name, lens.width, lens.fx, lens.fy, lens.cy) == (
-            'fisheye', 640, 193.0, 194.0, 237.1)
+            'fisheye',
+            640,
+            193.0,
+            194.0,
+            237.1,
+        )
         assert lens.parameters['k1'] == -0.012
-    for given, wrong, said in (('k: [193.0', 'k: [0.0', 'not calibrated'),
-                               ('binning_x: 0', 'binning_x: 2', 'whole images are needed'),
-                               ('width: 640', 'size: 640', 'not a whole camera_info'),
-                               ('k: [193.0, ', 'k: [', 'k must be a list of 9')):
+    for given, wrong, said in (
+        ('k: [193.0', 'k: [0.0', 'not calibrated'),
+        ('binning_x: 0', 'binning_x: 2', 'whole images are needed'),
+        ('width: 640', 'size: 640', 'not a whole camera_info'),
+        ('k: [193.0, ', 'k: [', 'k must be a list of 9'),
+    ):
         path.write_text(ECHO.replace(given, wrong))
         with pytest.raises(LensError, match=f'info.yaml: .*{said}'):
             load_lens(path)
@@ -373,25 +457,49 @@ def test_a_camera_info_without_its_model_says_what_to_write(tmp_path: Path) -> N
     with pytest.raises(LensError, match=r'distortion_model is missing; .* equidistant$'):
         load_lens(path)
     path.write_text(yaml.safe_dump({**text, 'camera_model': 'fisheye'}))
-    with pytest.raises(LensError, match=r'info.yaml: distortion_model is missing; .* '
-                                        r'equidistant in place of camera_model: fisheye$'):
+    with pytest.raises(
+        LensError,
+        match=r'info.yaml: distortion_model is missing; .* '
+        r'equidistant in place of camera_model: fisheye$',
+    ):
         load_lens(path)
 
 
 def test_curves_that_a_form_cannot_say() -> None:
     bare = replace(LENS, image_height=Equidistant())
     assert yaml.safe_load(write_foreign(bare, 'kalibr'))['cam0']['distortion_coeffs'] == (
-        pytest.approx([0, 0, 0, 0], abs=1e-9))
+        pytest.approx([0, 0, 0, 0], abs=1e-9)
+    )
     with pytest.raises(LensError, match='px from any'):
-        write_foreign(replace(
-            bare, image_height=Stereographic(), max_incidence=2.7, width=9000, height=9000,
-            cx=4500.0, cy=4500.0), 'ros')
+        write_foreign(
+            replace(
+                bare,
+                image_height=Stereographic(),
+                max_incidence=2.7,
+                width=9000,
+                height=9000,
+                cx=4500.0,
+                cy=4500.0,
+            ),
+            'ros',
+        )
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_lens(SHORT, tmp_path / 'lens.yaml')
-    assert cli.main(['lens', str(tmp_path / 'lens.yaml'), '-o', str(tmp_path / 'ros.yaml'),
-                     '--format', 'ros']) == 0
+    assert (
+        cli.main(
+            [
+                'lens',
+                str(tmp_path / 'lens.yaml'),
+                '-o',
+                str(tmp_path / 'ros.yaml'),
+                '--format',
+                'ros',
+            ]
+        )
+        == 0
+    )
     said = capsys.readouterr().out
     assert 'left out: the viewpoint shift\n' in said
     assert '0.1 m' in said
@@ -405,12 +513,28 @@ def test_command_says_how_much_is_lost_with_corrections(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tilted = replace(
-        LENS, viewpoint_shift=None, image_height=Equidistant(), fx=400.0, fy=400.0,
+        LENS,
+        viewpoint_shift=None,
+        image_height=Equidistant(),
+        fx=400.0,
+        fy=400.0,
         corrections={'sensor_tilt': {'parameters': {'about_x': 0.002, 'about_y': 0.0}}},
-        target={'landmarks': [[0, 0, 0.0, 0.0, 0.0]]})
+        target={'landmarks': [[0, 0, 0.0, 0.0, 0.0]]},
+    )
     save_lens(tilted, tmp_path / 'lens.yaml')
-    assert cli.main(['lens', str(tmp_path / 'lens.yaml'), '-o', str(tmp_path / 'kalibr.yaml'),
-                     '--format', 'kalibr']) == 0
+    assert (
+        cli.main(
+            [
+                'lens',
+                str(tmp_path / 'lens.yaml'),
+                '-o',
+                str(tmp_path / 'kalibr.yaml'),
+                '--format',
+                'kalibr',
+            ]
+        )
+        == 0
+    )
     said = capsys.readouterr().out
     assert 'left out: sensor_tilt\n' in said
     off = f'{400 * 0.002 * np.radians(60) ** 2:.3f}'
@@ -470,8 +594,9 @@ def of_opencv(folder: Path, suffix: str, shape: tuple[int, int] = (3, 1)) -> Pat
     storage.write('image_width', 848)
     storage.write('image_height', 800)
     for number, lens in ((1, LENS), (2, SHORT)):
-        storage.write(f'K{number}', np.array(
-            [[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]]))
+        storage.write(
+            f'K{number}', np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
+        )
         storage.write(f'D{number}', np.array([lens.image_height.coefficients[:4]]).T)
     storage.write('R', RIG.rotation)
     storage.write('T', RIG.position.reshape(shape))
@@ -488,8 +613,11 @@ def of_urdf(folder: Path, suffix: str) -> Path:
     m = right.rotation
     angles = (np.arctan2(m[2, 1], m[2, 2]), -np.arcsin(m[2, 0]), np.arctan2(m[1, 0], m[0, 0]))
     path = folder / f'robot{suffix}'
-    path.write_text(URDF.format(*(' '.join(f'{value:.15g}' for value in values)
-                                  for values in (right.position, angles))))
+    path.write_text(
+        URDF.format(
+            *(' '.join(f'{value:.15g}' for value in values) for values in (right.position, angles))
+        )
+    )
     return path
 
 
@@ -498,8 +626,10 @@ def of_tf(folder: Path, suffix: str) -> Path:
     entry = {
         'header': {'frame_id': 'right_camera_optical_frame'},
         'child_frame_id': 'left_camera_optical_frame',
-        'transform': {'translation': dict(zip('xyz', RIG.position.tolist(), strict=True)),
-                      'rotation': dict(zip('xyzw', q, strict=True))},
+        'transform': {
+            'translation': dict(zip('xyz', RIG.position.tolist(), strict=True)),
+            'rotation': dict(zip('xyzw', q, strict=True)),
+        },
     }
     path = folder / f'tf_static{suffix}'
     path.write_text(yaml.safe_dump({'transforms': [entry]}) + '---\n')
@@ -511,22 +641,34 @@ def of_ours(folder: Path, suffix: str) -> Path:
     return folder / f'rig{suffix}'
 
 
-@pytest.mark.parametrize(('write', 'suffix'), [
-    (of_opencv, '.yml'), (of_opencv, '.xml'), (of_opencv, '.json'), (of_opencv_in_a_row, '.yml'),
-    (of_urdf, '.urdf'), (of_tf, '.yaml'), (of_ours, '.yaml'),
-])
+@pytest.mark.parametrize(
+    ('write', 'suffix'),
+    [
+        (of_opencv, '.yml'),
+        (of_opencv, '.xml'),
+        (of_opencv, '.json'),
+        (of_opencv_in_a_row, '.yml'),
+        (of_urdf, '.urdf'),
+        (of_tf, '.yaml'),
+        (of_ours, '.yaml'),
+    ],
+)
 def test_rigs(tmp_path: Path, write: Callable[[Path, str], Path], suffix: str) -> None:
     rig = load_rig(write(tmp_path, suffix))
     assert np.abs(rig.position - RIG.position).max() < 1e-12
     assert np.abs(rig.rotation - RIG.rotation).max() < 1e-12
 
 
-@pytest.mark.parametrize('end', ['<parent link="left_optical_frame"/>',
-                                 '<child link="right_optical_frame"/>'])
+@pytest.mark.parametrize(
+    'end', ['<parent link="left_optical_frame"/>', '<child link="right_optical_frame"/>']
+)
 def test_a_joint_without_an_end_leads_nowhere(tmp_path: Path, end: str) -> None:
     path = tmp_path / 'robot.urdf'
-    path.write_text(of_urdf(tmp_path, '.xml').read_text().replace(
-        '</robot>', '<joint name="loose" type="fixed">' + end + '</joint></robot>'))
+    path.write_text(
+        of_urdf(tmp_path, '.xml')
+        .read_text()
+        .replace('</robot>', '<joint name="loose" type="fixed">' + end + '</joint></robot>')
+    )
     assert np.abs(load_rig(path).position - RIG.position).max() < 1e-12
 
 
@@ -545,19 +687,22 @@ def test_a_robot_is_shown_and_is_no_lens(tmp_path: Path, capsys: pytest.CaptureF
         load_lens(path)
 
 
-@pytest.mark.parametrize(('text', 'said'), [
-    ('<robot name="a"></robot>', 'no fixed transforms'),
-    ('<robot', 'not a whole URDF'),
-    (URDF.format('0 0', '0 0 0'), 'finite numbers'),
-    (URDF.format('0 0 0', '0 0 0').replace('right_optical', 'rear_optical'), 'called right'),
-    ('child_frame_id: a\ntranslation: 1\n', 'not a whole transform'),
-    ('left_in_right: {position: [0, 0], quaternion: [0, 0, 0, 1]}', 'position must be'),
-    ('left_in_right: {position: [0, 0, 0], quaternion: [0, 0, 0, 0]}', 'unit length'),
-    (CAMCHAIN.replace('0.99998854', '1.99998854'), 'cam1: T_cn_cnm1: .* rotation matrix'),
-    (BASALT.replace('"qw": 1', '"qw": 0'), 'T_imu_cam: .* unit length'),
-    (BASALT.replace('"px": 0.1', '"px": NaN'), 'T_imu_cam 0: px is nan'),
-    ('name: lens', 'left_in_right'),
-])
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('<robot name="a"></robot>', 'no fixed transforms'),
+        ('<robot', 'not a whole URDF'),
+        (URDF.format('0 0', '0 0 0'), 'finite numbers'),
+        (URDF.format('0 0 0', '0 0 0').replace('right_optical', 'rear_optical'), 'called right'),
+        ('child_frame_id: a\ntranslation: 1\n', 'not a whole transform'),
+        ('left_in_right: {position: [0, 0], quaternion: [0, 0, 0, 1]}', 'position must be'),
+        ('left_in_right: {position: [0, 0, 0], quaternion: [0, 0, 0, 0]}', 'unit length'),
+        (CAMCHAIN.replace('0.99998854', '1.99998854'), 'cam1: T_cn_cnm1: .* rotation matrix'),
+        (BASALT.replace('"qw": 1', '"qw": 0'), 'T_imu_cam: .* unit length'),
+        (BASALT.replace('"px": 0.1', '"px": NaN'), 'T_imu_cam 0: px is nan'),
+        ('name: lens', 'left_in_right'),
+    ],
+)
 def test_what_is_no_rig_is_refused(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / 'rig').write_text(text)
     with pytest.raises(LensError, match=said) as error:

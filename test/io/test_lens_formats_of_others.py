@@ -28,22 +28,43 @@ OF_COLMAP = [
     ('PINHOLE', '500 510 505 395', [(622.081529, 511.262180), (112.209846, 259.325002)]),
     ('SIMPLE_RADIAL', '500 500 400 -.05', [(616.456311, 513.373861), (120.720022, 271.560390)]),
     ('RADIAL', '500 500 400 -.05 .01', [(616.469666, 513.386862), (118.861270, 270.930941)]),
-    ('SIMPLE_RADIAL_FISHEYE', '300 500 400 .03',
-     [(568.100232, 466.297705), (300.421221, 332.414517)]),
-    ('RADIAL_FISHEYE', '300 500 400 .03 -.01',
-     [(568.093473, 466.291126), (300.873468, 332.567666)]),
-    ('OPENCV', '500 505 500 400 -.1 .02 .001 -.002',
-     [(615.694719, 513.917698), (128.799501, 273.622071)]),
-    ('OPENCV_FISHEYE', '300 305 500 400 .03 -.01 .002 -.0003',
-     [(568.093606, 467.396109), (300.833222, 331.429938)]),
-    ('FULL_OPENCV', '500 505 500 400 .3 .02 .0005 -.0007 .001 .5 .03 0',
-     [(614.646595, 512.791888), (147.705941, 279.761954)]),
+    (
+        'SIMPLE_RADIAL_FISHEYE',
+        '300 500 400 .03',
+        [(568.100232, 466.297705), (300.421221, 332.414517)],
+    ),
+    (
+        'RADIAL_FISHEYE',
+        '300 500 400 .03 -.01',
+        [(568.093473, 466.291126), (300.873468, 332.567666)],
+    ),
+    (
+        'OPENCV',
+        '500 505 500 400 -.1 .02 .001 -.002',
+        [(615.694719, 513.917698), (128.799501, 273.622071)],
+    ),
+    (
+        'OPENCV_FISHEYE',
+        '300 305 500 400 .03 -.01 .002 -.0003',
+        [(568.093606, 467.396109), (300.833222, 331.429938)],
+    ),
+    (
+        'FULL_OPENCV',
+        '500 505 500 400 .3 .02 .0005 -.0007 .001 .5 .03 0',
+        [(614.646595, 512.791888), (147.705941, 279.761954)],
+    ),
     ('FOV', '400 405 500 400 .9', [(597.391152, 495.998499), (215.627805, 302.496272)]),
-    ('THIN_PRISM_FISHEYE', '300 305 500 400 .03 -.01 .001 -.0007 .002 -.0003 .0004 -.0006',
-     [(568.093034, 467.416602), (300.696817, 331.456323)]),
-    ('RAD_TAN_THIN_PRISM_FISHEYE',
-     '300 305 500 400 .03 -.01 .002 -.0003 .0001 -.00001 .0011 -.0007 .0004 -.0002 -.0006 .0001',
-     [(568.151096, 467.369434), (301.267556, 331.320906)]),
+    (
+        'THIN_PRISM_FISHEYE',
+        '300 305 500 400 .03 -.01 .001 -.0007 .002 -.0003 .0004 -.0006',
+        [(568.093034, 467.416602), (300.696817, 331.456323)],
+    ),
+    (
+        'RAD_TAN_THIN_PRISM_FISHEYE',
+        '300 305 500 400 .03 -.01 .002 -.0003 .0001 -.00001 .0011 -.0007 .0004 -.0002 '
+        '-.0006 .0001',
+        [(568.151096, 467.369434), (301.267556, 331.320906)],
+    ),
     ('SIMPLE_DIVISION', '400 500 400 -.1', [(592.685688, 490.232416), (204.839836, 300.046777)]),
     ('DIVISION', '400 405 500 400 -.1', [(592.685688, 491.360321), (204.839836, 298.797361)]),
     ('SIMPLE_FISHEYE', '300 500 400', [(567.897011, 466.099864), (303.251082, 333.372823)]),
@@ -65,7 +86,8 @@ def rays(limit: float) -> np.ndarray:
     theta, azimuth = np.meshgrid(np.linspace(0.01, limit, 20), np.linspace(0, 2 * np.pi, 20))
     sin = np.sin(theta)
     return np.stack([sin * np.cos(azimuth), sin * np.sin(azimuth), np.cos(theta)], -1).reshape(
-        -1, 3)
+        -1, 3
+    )
 
 
 def off(lens: Lens, points: np.ndarray, uv: np.ndarray) -> float:
@@ -90,9 +112,11 @@ def test_every_camera_of_colmap_as_colmap_projects_it(
 
 def test_the_cameras_of_a_file_of_colmap(tmp_path: Path) -> None:
     path = tmp_path / 'cameras.txt'
-    path.write_text('# id\n1 OPENCV_FISHEYE 1752 1168 600.12 600.5 876.2 584.1 0.031 -0.012 '
-                    '0.002 -0.0003\n7, SIMPLE_RADIAL_FISHEYE, 1752, 1168, 600.12, 876.2, 584.1, '
-                    '0.031\n')
+    path.write_text(
+        '# id\n1 OPENCV_FISHEYE 1752 1168 600.12 600.5 876.2 584.1 0.031 -0.012 '
+        '0.002 -0.0003\n7, SIMPLE_RADIAL_FISHEYE, 1752, 1168, 600.12, 876.2, 584.1, '
+        '0.031\n'
+    )
     assert [*read_lens_file(path).lenses] == ['1', '7']
     assert load_lens(f'{path}#7').parameters['k1'] == 0.031
     assert load_lens(path).cx == 875.7
@@ -103,12 +127,22 @@ def equidistant(lens: Lens, points: np.ndarray, k: tuple[float, ...]) -> np.ndar
     matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1.0]])
     front = points / points[:, 2:]
     return cv2.fisheye.projectPoints(
-        front[:, None], np.zeros(3), np.zeros(3), matrix, np.array(k))[0][:, 0]
+        front[:, None], np.zeros(3), np.zeros(3), matrix, np.array(k)
+    )[0][:, 0]
 
 
 K4 = (0.031, -0.012, 0.002, -0.0003)
-NERF = {'camera_model': 'OPENCV_FISHEYE', 'fl_x': 600.1, 'fl_y': 600.5, 'cx': 876.2, 'cy': 584.1,
-        'w': 1752, 'h': 1168, **{f'k{i}': k for i, k in enumerate(K4, start=1)}, 'frames': []}
+NERF = {
+    'camera_model': 'OPENCV_FISHEYE',
+    'fl_x': 600.1,
+    'fl_y': 600.5,
+    'cx': 876.2,
+    'cy': 584.1,
+    'w': 1752,
+    'h': 1168,
+    **{f'k{i}': k for i, k in enumerate(K4, start=1)},
+    'frames': [],
+}
 EUROC = """\
 sensor_type: camera
 T_BS: {{cols: 4, rows: 4, data: [1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0]}}
@@ -177,22 +211,58 @@ METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>
 """
 
 
-@pytest.mark.parametrize('text', [
-    json.dumps(NERF), json.dumps({**NERF, 'camera_model': None, 'is_fisheye': True}).replace(
-        '"camera_model": null, ', ''),
-    json.dumps({'camera_model': 'OPENCV_FISHEYE', 'frames': [NERF, NERF]}),
-    EUROC.format('equidistant', list(K4)), EUROC.format('equidistant', [*K4, 0.0]), ORB,
-    ORB.replace('Camera1', 'Camera'), VINS, KALIBR, '%YAML:1.0 # as OpenVINS has it\n' + KALIBR,
-    KALIBR.replace('-0.0003]', '-0.0003, 0.0]'), INFO.format('0.0'),
-    METASHAPE.format('fisheye', ''), METASHAPE.format('equidistant_fisheye', ''),
-    '<document><chunk><sensors><sensor type="fisheye">' + METASHAPE.format('fisheye', '')
-    .partition('?>')[2].replace('<calibration>', '<calibration class="initial">') + METASHAPE
-    .format('', '').partition('?>')[2].replace('<calibration>', '<calibration type="fisheye" '
-                                               'class="adjusted"><resolution width="1752" '
-                                               'height="1168"/>').replace(
-        '<projection></projection>', '') + '</sensor></sensors></chunk></document>',
-], ids=['nerfstudio', 'ngp', 'frames', 'euroc', 'euroc5', 'orb3', 'orb', 'vins', 'kalibr',
-        'openvins', 'kalibr5', 'ros5', 'metashape', 'metashape2', 'metashape_project'])
+@pytest.mark.parametrize(
+    'text',
+    [
+        json.dumps(NERF),
+        json.dumps({**NERF, 'camera_model': None, 'is_fisheye': True}).replace(
+            '"camera_model": null, ', ''
+        ),
+        json.dumps({'camera_model': 'OPENCV_FISHEYE', 'frames': [NERF, NERF]}),
+        EUROC.format('equidistant', list(K4)),
+        EUROC.format('equidistant', [*K4, 0.0]),
+        ORB,
+        ORB.replace('Camera1', 'Camera'),
+        VINS,
+        KALIBR,
+        '%YAML:1.0 # as OpenVINS has it\n' + KALIBR,
+        KALIBR.replace('-0.0003]', '-0.0003, 0.0]'),
+        INFO.format('0.0'),
+        METASHAPE.format('fisheye', ''),
+        METASHAPE.format('equidistant_fisheye', ''),
+        '<document><chunk><sensors><sensor type="fisheye">'
+        + METASHAPE.format('fisheye', '')
+        .partition('?>')[2]
+        .replace('<calibration>', '<calibration class="initial">')
+        + METASHAPE.format('', '')
+        .partition('?>')[2]
+        .replace(
+            '<calibration>',
+            '<calibration type="fisheye" '
+            'class="adjusted"><resolution width="1752" '
+            'height="1168"/>',
+        )
+        .replace('<projection></projection>', '')
+        + '</sensor></sensors></chunk></document>',
+    ],
+    ids=[
+        'nerfstudio',
+        'ngp',
+        'frames',
+        'euroc',
+        'euroc5',
+        'orb3',
+        'orb',
+        'vins',
+        'kalibr',
+        'openvins',
+        'kalibr5',
+        'ros5',
+        'metashape',
+        'metashape2',
+        'metashape_project',
+    ],
+)
 def test_one_lens_in_every_form(text: str, tmp_path: Path) -> None:
     lens, worst = loaded(tmp_path, text)
     assert worst == 0
@@ -205,8 +275,11 @@ def test_one_lens_in_every_form(text: str, tmp_path: Path) -> None:
 
 def test_the_radial_tangential_lens_of_euroc(tmp_path: Path) -> None:
     d = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
-    text = EUROC.format('radial-tangential', list(d)).replace('1752, 1168', '752, 480').replace(
-        '600.1, 600.5, 875.7, 583.6', '458.654, 457.296, 367.215, 248.375')
+    text = (
+        EUROC.format('radial-tangential', list(d))
+        .replace('1752, 1168', '752, 480')
+        .replace('600.1, 600.5, 875.7, 583.6', '458.654, 457.296, 367.215, 248.375')
+    )
     lens, worst = loaded(tmp_path, text)
     assert 0 < worst < 0.3
     points = rays(np.radians(50))
@@ -218,9 +291,13 @@ def test_the_radial_tangential_lens_of_euroc(tmp_path: Path) -> None:
 def test_omnidir_of_opencv(tmp_path: Path) -> None:
     path = tmp_path / 'omni.yml'
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, value in (('K', np.array([[830.0, 0, 373.0], [0, 831.0, 253.0], [0, 0, 1]])),
-                        ('D', np.array([[-0.1, 0.05, 0.0002, -0.0003]])),
-                        ('xi', np.array([[1.1]])), ('image_width', 752), ('image_height', 480)):
+    for name, value in (
+        ('K', np.array([[830.0, 0, 373.0], [0, 831.0, 253.0], [0, 0, 1]])),
+        ('D', np.array([[-0.1, 0.05, 0.0002, -0.0003]])),
+        ('xi', np.array([[1.1]])),
+        ('image_width', 752),
+        ('image_height', 480),
+    ):
         storage.write(name, value)
     storage.release()
     lens, worst = loaded(tmp_path, path.read_text())
@@ -230,14 +307,21 @@ def test_omnidir_of_opencv(tmp_path: Path) -> None:
     z = x * x + y * y
     p1, p2 = 0.0002, -0.0003
     stretch = 1 - 0.1 * z + 0.05 * z * z
-    uv = np.stack([830 * (x * stretch + 2 * p1 * x * y + p2 * (z + 2 * x * x)) + 373,
-                   831 * (y * stretch + p1 * (z + 2 * y * y) + 2 * p2 * x * y) + 253], axis=-1)
+    uv = np.stack(
+        [
+            830 * (x * stretch + 2 * p1 * x * y + p2 * (z + 2 * x * x)) + 373,
+            831 * (y * stretch + p1 * (z + 2 * y * y) + 2 * p2 * x * y) + 253,
+        ],
+        axis=-1,
+    )
     assert off(lens, points, uv) < 1.05 * worst < 0.2
 
 
 def test_the_fov_model_of_kalibr(tmp_path: Path) -> None:
-    lens, worst = loaded(tmp_path, KALIBR.replace('equidistant', 'fov').replace(
-        '[0.031, -0.012, 0.002, -0.0003]', '[0.92]'))
+    lens, worst = loaded(
+        tmp_path,
+        KALIBR.replace('equidistant', 'fov').replace('[0.031, -0.012, 0.002, -0.0003]', '[0.92]'),
+    )
     points = rays(np.radians(75))
     theta = np.arccos(points[:, 2:])
     h = np.arctan(2 * np.tan(theta) * np.tan(0.46)) / 0.92
@@ -246,9 +330,7 @@ def test_the_fov_model_of_kalibr(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('projection', ['fisheye', 'equisolid_fisheye', 'frame'])
-def test_metashape_moves_points_sideways_and_has_a_skew(
-    projection: str, tmp_path: Path
-) -> None:
+def test_metashape_moves_points_sideways_and_has_a_skew(projection: str, tmp_path: Path) -> None:
     """Against the projection as its manual (2.3, appendix D) has it."""
     text = METASHAPE.format(projection, '<p1>0.0005</p1><p2>-0.0003</p2><b2>1.5</b2>')
     if projection == 'frame':
@@ -256,8 +338,9 @@ def test_metashape_moves_points_sideways_and_has_a_skew(
     lens, worst = loaded(tmp_path, text)
     points = rays(np.radians(40 if projection == 'frame' else 80))
     theta = np.arccos(points[:, 2:])
-    base = {'fisheye': theta, 'equisolid_fisheye': 2 * np.sin(theta / 2),
-            'frame': np.tan(theta)}[projection]
+    base = {'fisheye': theta, 'equisolid_fisheye': 2 * np.sin(theta / 2), 'frame': np.tan(theta)}[
+        projection
+    ]
     x, y = (base * points[:, :2] / np.sin(theta)).T
     z = x * x + y * y
     f, *k = [float(re.search(f'<{tag}>(.*?)<', text)[1]) for tag in ('f', 'k1', 'k2', 'k3', 'k4')]
@@ -298,13 +381,15 @@ def test_ocamcalib_as_its_cam2world_has_it(d: float, tmp_path: Path) -> None:
     """Pixels (row, column) to rays as ocam_functions.c does it, and back by our lens."""
     lens, worst = loaded(tmp_path, OCAM.format(d))
     assert worst < 0.2
-    column, row = (grid.ravel() for grid in np.meshgrid(
-        np.arange(4.0, 640, 8), np.arange(4.0, 480, 8)))
+    column, row = (
+        grid.ravel() for grid in np.meshgrid(np.arange(4.0, 640, 8), np.arange(4.0, 480, 8))
+    )
     c, e = 0.9998, -0.0001
     down, right = np.linalg.solve([[c, d], [e, 1.0]], [row - 240.3, column - 322.8])
     rho = np.hypot(down, right)
     z = np.polynomial.polynomial.polyval(
-        rho, [-1.860750e+02, 0, 1.845950e-03, -1.680820e-06, 6.630810e-09])
+        rho, [-1.860750e02, 0, 1.845950e-03, -1.680820e-06, 6.630810e-09]
+    )
     points = np.stack([right, down, -z], axis=-1)
     # Our camera is turned about the axis so that v does not grow with x.
     angle = np.arctan2(d, c)
@@ -314,16 +399,24 @@ def test_ocamcalib_as_its_cam2world_has_it(d: float, tmp_path: Path) -> None:
 
 def test_the_rig_of_orbslam(tmp_path: Path) -> None:
     """T_c1_c2 is the right camera in the left one."""
-    right = ORB[ORB.index('Camera1.fx'):ORB.index('Camera.width')].replace('Camera1', 'Camera2')
-    (tmp_path / 'rig.yaml').write_text(ORB + right.replace('600.1', '601.1') + (
-        'Stereo.T_c1_c2: !!opencv-matrix\n  rows: 4\n  cols: 4\n  dt: f\n'
-        '  data: [1.0, 0.0, 0.0, 0.11, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.02, 0, 0, 0, 1.0]\n'))
+    right = ORB[ORB.index('Camera1.fx') : ORB.index('Camera.width')].replace('Camera1', 'Camera2')
+    (tmp_path / 'rig.yaml').write_text(
+        ORB
+        + right.replace('600.1', '601.1')
+        + (
+            'Stereo.T_c1_c2: !!opencv-matrix\n  rows: 4\n  cols: 4\n  dt: f\n'
+            '  data: [1.0, 0.0, 0.0, 0.11, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.02, 0, '
+            '0, 0, 1.0]\n'
+        )
+    )
     assert load_rig(tmp_path / 'rig.yaml').position == pytest.approx([-0.11, 0, -0.02])
     assert load_lens(f'{tmp_path / "rig.yaml"}#right').fx == 601.1
 
 
 def test_the_mei_camera_of_camodocal(tmp_path: Path) -> None:
-    lens, worst = loaded(tmp_path, """\
+    lens, worst = loaded(
+        tmp_path,
+        """\
 %YAML:1.0
 ---
 model_type: MEI
@@ -333,7 +426,8 @@ image_height: 480
 mirror_parameters: {xi: 1.9}
 distortion_parameters: {k1: -0.05, k2: 0.4, p1: 0.0005, p2: -0.0002}
 projection_parameters: {gamma1: 1162.0, gamma2: 1161.0, u0: 378.6, v0: 231.2}
-""")
+""",
+    )
     points = rays(np.radians(55))
     x, y = (points[:, :2] / (points[:, 2:] + 1.9)).T
     z = x * x + y * y
@@ -353,38 +447,69 @@ def test_the_skew_of_a_camera_matrix_is_kept(
     bare[:, 0] += 2.5 * (bare[:, 1] - 583.6) / 600.5
     assert off(lens, points, bare) < 1e-6
     for form in ('ros', 'opencv'):
-        assert cli.main(['lens', str(tmp_path / 'lens'), '-o', str(tmp_path / form), '--format',
-                         form]) == 0
+        assert (
+            cli.main(
+                ['lens', str(tmp_path / 'lens'), '-o', str(tmp_path / form), '--format', form]
+            )
+            == 0
+        )
         assert 'left out' not in capsys.readouterr().out
         assert project(load_lens(tmp_path / form), points).uv == pytest.approx(
-            project(lens, points).uv, abs=1e-6, nan_ok=True)
-    assert cli.main(['lens', str(tmp_path / 'lens'), '-o', str(tmp_path / 'out'), '--format',
-                     'kalibr']) == 0
+            project(lens, points).uv, abs=1e-6, nan_ok=True
+        )
+    assert (
+        cli.main(
+            ['lens', str(tmp_path / 'lens'), '-o', str(tmp_path / 'out'), '--format', 'kalibr']
+        )
+        == 0
+    )
     assert 'left out: skew' in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(('text', 'said'), [
-    ('1 EQUIRECTANGULAR 1000 800 1000 800\n', 'camera 1: model is EQUIRECTANGULAR; those that can '
-     'be read are OPENCV_FISHEYE, '),
-    ('1 OPENCV_FISHEYE 1000 800 300 300 500 400 0.1\n', 'OPENCV_FISHEYE has 5 parameters; needed '
-     'are fx, fy, cx, cy, k1'),
-    (json.dumps({**NERF, 'camera_model': 'EQUIRECTANGULAR'}), "camera_model is 'EQUIRECTANGULAR'"),
-    (json.dumps({**NERF, 'cx': None}), 'cx is None; a finite number is needed'),
-    (METASHAPE.format('spherical', ''), "projection is 'spherical'; those that can be read"),
-    (EUROC.format('fov', [0.9]), "distortion_model is 'fov'; equidistant and radial-tangential"),
-    (EUROC.format('equidistant', [*K4, 0.1]), 'distortion_coefficients has 5 numbers, not 4'),
-    (ORB.replace('KannalaBrandt8', 'Rectified'), "Camera.type is 'Rectified'"),
-    (ORB.replace('Camera.width: 1752\n', ''), 'Camera.width is None'),
-    (VINS.replace('KANNALA_BRANDT', 'SCARAMUZZA'), "model_type is 'SCARAMUZZA'; those that can"),
-    (OCAM.format(0.0).replace('5 -1.860750e+02', '6 -1.860750e+02'), 'the direct polynomial must'),
-    (OCAM.format(0.0).replace('480 640', ''), 'image size is missing'),
-    (KALIBR.replace('pinhole', 'omni').replace('[600.1', '[1.0, 600.1'), 'omni with equidistant '
-     'is not a form that can be read; those are pinhole with equidistant'),
-    ('{"sfm_data_version": "0.3"}', 'an OpenMVG scene cannot be read; readable are '),
-    ('<lensdatabase version="2"></lensdatabase>', 'a lensfun database cannot be read'),
-    ('p f2 w3000 h1500 v360\ni w2000 h2000 f3 v180\n', 'Hugin or PTGui'),
-    ('some words\n', 'it has no projection, and no format of ROS camera_info, Kalibr'),
-])
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        (
+            '1 EQUIRECTANGULAR 1000 800 1000 800\n',
+            'camera 1: model is EQUIRECTANGULAR; those that can be read are OPENCV_FISHEYE, ',
+        ),
+        (
+            '1 OPENCV_FISHEYE 1000 800 300 300 500 400 0.1\n',
+            'OPENCV_FISHEYE has 5 parameters; needed are fx, fy, cx, cy, k1',
+        ),
+        (
+            json.dumps({**NERF, 'camera_model': 'EQUIRECTANGULAR'}),
+            "camera_model is 'EQUIRECTANGULAR'",
+        ),
+        (json.dumps({**NERF, 'cx': None}), 'cx is None; a finite number is needed'),
+        (METASHAPE.format('spherical', ''), "projection is 'spherical'; those that can be read"),
+        (
+            EUROC.format('fov', [0.9]),
+            "distortion_model is 'fov'; equidistant and radial-tangential",
+        ),
+        (EUROC.format('equidistant', [*K4, 0.1]), 'distortion_coefficients has 5 numbers, not 4'),
+        (ORB.replace('KannalaBrandt8', 'Rectified'), "Camera.type is 'Rectified'"),
+        (ORB.replace('Camera.width: 1752\n', ''), 'Camera.width is None'),
+        (
+            VINS.replace('KANNALA_BRANDT', 'SCARAMUZZA'),
+            "model_type is 'SCARAMUZZA'; those that can",
+        ),
+        (
+            OCAM.format(0.0).replace('5 -1.860750e+02', '6 -1.860750e+02'),
+            'the direct polynomial must',
+        ),
+        (OCAM.format(0.0).replace('480 640', ''), 'image size is missing'),
+        (
+            KALIBR.replace('pinhole', 'omni').replace('[600.1', '[1.0, 600.1'),
+            'omni with equidistant '
+            'is not a form that can be read; those are pinhole with equidistant',
+        ),
+        ('{"sfm_data_version": "0.3"}', 'an OpenMVG scene cannot be read; readable are '),
+        ('<lensdatabase version="2"></lensdatabase>', 'a lensfun database cannot be read'),
+        ('p f2 w3000 h1500 v360\ni w2000 h2000 f3 v180\n', 'Hugin or PTGui'),
+        ('some words\n', 'it has no projection, and no format of ROS camera_info, Kalibr'),
+    ],
+)
 def test_a_format_is_named_and_what_can_be_read(text: str, said: str, tmp_path: Path) -> None:
     (tmp_path / 'lens').write_text(text)
     with pytest.raises(LensError, match=re.escape(said)) as error:
@@ -430,11 +555,14 @@ mirror_offset: 0.0125
     assert capsys.readouterr().err == ''
 
 
-@pytest.mark.parametrize(('changes', 'told'), [
-    ({'viewpoint_shift': Gennery(0.0, 4.0)}, r'the viewpoint shift is 2\.3 m at 90 deg; its'),
-    ({'max_incidence': np.radians(1.6)}, r'max_incidence_deg is 1\.6; it is in degrees'),
-    ({'viewpoint_shift': Gennery(0.0, 0.004)}, ''),
-])
+@pytest.mark.parametrize(
+    ('changes', 'told'),
+    [
+        ({'viewpoint_shift': Gennery(0.0, 4.0)}, r'the viewpoint shift is 2\.3 m at 90 deg; its'),
+        ({'max_incidence': np.radians(1.6)}, r'max_incidence_deg is 1\.6; it is in degrees'),
+        ({'viewpoint_shift': Gennery(0.0, 0.004)}, ''),
+    ],
+)
 def test_other_units_in_a_lens_file_are_told(
     changes: dict[str, object], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -451,23 +579,24 @@ def test_files_that_others_wrote() -> None:
         lens, foreign = load_lens(path), read_lens_file(path)
         assert lens.max_incidence > 0.5
         assert max(foreign.worst_px.values(), default=0.0) < (
-            5 if path.stem == 'center_outside' else 0.3)
+            5 if path.stem == 'center_outside' else 0.3
+        )
 
 
 _OPENCV8 = (0.2, 0.05, 0.001, -0.001, 0.01, 0.3, 0.1, 0.02)
 _SAME_LENS = {
     'mrcal': "{{'lensmodel': 'LENSMODEL_OPENCV8', 'imagersize': [640, 480], 'intrinsics': "
-             '[300, 310, 320, 240, {}]}}',
+    '[300, 310, 320, 240, {}]}}',
     'Basalt': '{{"value0": {{"resolution": [[640, 480]], "intrinsics": [{{"camera_type": '
-              '"pinhole-radtan8", "intrinsics": {{"fx": 300, "fy": 310, "cx": 320, "cy": 240, '
-              '{}}}}}]}}}}',
+    '"pinhole-radtan8", "intrinsics": {{"fx": 300, "fy": 310, "cx": 320, "cy": 240, '
+    '{}}}}}]}}}}',
     'ROS': 'image_width: 640\nimage_height: 480\ncamera_matrix: {{data: [300, 0, 320, 0, 310, '
-           '240, 0, 0, 1]}}\ndistortion_model: rational_polynomial\ndistortion_coefficients: '
-           '{{data: [{}]}}\n',
+    '240, 0, 0, 1]}}\ndistortion_model: rational_polynomial\ndistortion_coefficients: '
+    '{{data: [{}]}}\n',
     'echo of a topic': 'header: {{frame_id: front}}\nheight: 480\nwidth: 640\n'
-                       'distortion_model: rational_polynomial\nd: [{}]\nk: [300, 0, 320, 0, 310, '
-                       '240, 0, 0, 1]\nbinning_x: 0\nbinning_y: 0\nroi: {{x_offset: 0, y_offset: '
-                       '0, height: 0, width: 0, do_rectify: false}}\n',
+    'distortion_model: rational_polynomial\nd: [{}]\nk: [300, 0, 320, 0, 310, '
+    '240, 0, 0, 1]\nbinning_x: 0\nbinning_y: 0\nroi: {{x_offset: 0, y_offset: '
+    '0, height: 0, width: 0, do_rectify: false}}\n',
 }
 
 
@@ -475,8 +604,10 @@ _SAME_LENS = {
 def test_the_rational_model_is_read_alike_from_every_tool(form: str, tmp_path: Path) -> None:
     """With its deviation, however large: a file is not refused where another one is read."""
     names = ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6')
-    numbers = ', '.join(f'"{name}": {value}' if form == 'Basalt' else str(value)
-                        for name, value in zip(names, _OPENCV8, strict=True))
+    numbers = ', '.join(
+        f'"{name}": {value}' if form == 'Basalt' else str(value)
+        for name, value in zip(names, _OPENCV8, strict=True)
+    )
     lens, worst = loaded(tmp_path, _SAME_LENS[form].format(numbers))
     assert worst == pytest.approx(1.78, abs=0.05)
     matrix = np.array([[300, 0, 320], [0, 310, 240], [0, 0, 1.0]])
@@ -487,9 +618,16 @@ def test_the_rational_model_is_read_alike_from_every_tool(form: str, tmp_path: P
 @pytest.mark.parametrize('count', [0, 4, 5])
 def test_perspective_models_of_mrcal_are_those_of_opencv(count: int, tmp_path: Path) -> None:
     values = (-0.2, 0.05, 0.001, -0.001, -0.01)[:count]
-    lens, worst = loaded(tmp_path, str({
-        'lensmodel': f'LENSMODEL_OPENCV{count}' if count else 'LENSMODEL_PINHOLE',
-        'imagersize': [640, 480], 'intrinsics': [300, 310, 320, 240, *values]}))
+    lens, worst = loaded(
+        tmp_path,
+        str(
+            {
+                'lensmodel': f'LENSMODEL_OPENCV{count}' if count else 'LENSMODEL_PINHOLE',
+                'imagersize': [640, 480],
+                'intrinsics': [300, 310, 320, 240, *values],
+            }
+        ),
+    )
     matrix = np.array([[300, 0, 320], [0, 310, 240], [0, 0, 1.0]])
     right = cv2.projectPoints(SEEN, np.zeros(3), np.zeros(3), matrix, np.array(values))[0]
     assert np.abs(project(lens, SEEN).uv - right[:, 0]).max() < 1.05 * worst + 1e-6 < 1.5

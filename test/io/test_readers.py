@@ -48,7 +48,8 @@ def same(a, b):
     """Say whether two tables hold the same rows."""
     return all(
         np.array_equal(getattr(a, f.name), getattr(b, f.name), equal_nan=f.name in ('t', 'sigma'))
-        for f in fields(a) if f.name not in ('cameras', 'source')
+        for f in fields(a)
+        if f.name not in ('cameras', 'source')
     )
 
 
@@ -97,9 +98,15 @@ class TestObservationsCsv:
     def test_written_tables_read_back_to_the_same_bits(self, tmp_path):
         rng = np.random.default_rng(1)
         table = make_observations(
-            np.repeat([0, 3], 5), np.tile(np.arange(5), 2), rng.normal(size=(10, 2)) * 1e3,
-            rng.normal(size=(10, 3)), camera=np.repeat([1, 0], 5), board=np.arange(10) % 2,
-            t=rng.normal(size=10), sigma=rng.uniform(0.1, 1, 10), cameras=('left', 'right'),
+            np.repeat([0, 3], 5),
+            np.tile(np.arange(5), 2),
+            rng.normal(size=(10, 2)) * 1e3,
+            rng.normal(size=(10, 3)),
+            camera=np.repeat([1, 0], 5),
+            board=np.arange(10) % 2,
+            t=rng.normal(size=10),
+            sigma=rng.uniform(0.1, 1, 10),
+            cameras=('left', 'right'),
         )
         write_observations(tmp_path / 'all.csv', table)
         back = read_observations(tmp_path / 'all.csv')
@@ -130,21 +137,24 @@ class TestObservationsCsv:
         header[header.index(name)] = 'other'
         fails(csv(','.join(header) + '\n' + ROWS), f"column '{name}' is missing", HEADER)
 
-    @pytest.mark.parametrize(('row', 'says'), [
-        ('0,6,nan,20,0,0,0', "u is 'nan'; a finite number"),
-        ('0,6,10,20,inf,0,0', "x is 'inf'; a finite number"),
-        ('0,6,10,20,-1e308,0,0', "x is '-1e308'; a number of at most 1e+12"),
-        ('0,6,10,abc,0,0,0', "v is 'abc'; a number"),
-        ('0,6,10,,0,0,0', "v is ''; a number"),
-        ('0,1.5,10,20,0,0,0', "landmark is '1.5'; a whole number"),
-        ('0,-1,10,20,0,0,0', "landmark is '-1'; a whole number from 0"),
-        ('1e30,4,10,20,0,0,0', "frame is '1e30'; a whole number"),
-        ('0,4294967296,10,20,0,0,0', "landmark is '4294967296'; a whole number from 0"),
-        ('first,4,10,20,0,0,0', "frame is 'first'; a number"),
-        ('0,4,10,20,0,0', '6 fields where the header has 7'),
-        ('0,4,10,20,0,0,0,0', '8 fields where the header has 7'),
-        ('0,4,10,20,0,0,0', 'the same frame, camera and landmark as in line 2'),
-    ])
+    @pytest.mark.parametrize(
+        ('row', 'says'),
+        [
+            ('0,6,nan,20,0,0,0', "u is 'nan'; a finite number"),
+            ('0,6,10,20,inf,0,0', "x is 'inf'; a finite number"),
+            ('0,6,10,20,-1e308,0,0', "x is '-1e308'; a number of at most 1e+12"),
+            ('0,6,10,abc,0,0,0', "v is 'abc'; a number"),
+            ('0,6,10,,0,0,0', "v is ''; a number"),
+            ('0,1.5,10,20,0,0,0', "landmark is '1.5'; a whole number"),
+            ('0,-1,10,20,0,0,0', "landmark is '-1'; a whole number from 0"),
+            ('1e30,4,10,20,0,0,0', "frame is '1e30'; a whole number"),
+            ('0,4294967296,10,20,0,0,0', "landmark is '4294967296'; a whole number from 0"),
+            ('first,4,10,20,0,0,0', "frame is 'first'; a number"),
+            ('0,4,10,20,0,0', '6 fields where the header has 7'),
+            ('0,4,10,20,0,0,0,0', '8 fields where the header has 7'),
+            ('0,4,10,20,0,0,0', 'the same frame, camera and landmark as in line 2'),
+        ],
+    )
     def test_bad_row(self, csv, row, says):
         text = f'{HEADER}\n0,4,1,2,3,4,5\n\n0,5,1,2,3,4,5\n{row}\n'
         fails(csv(text), 'line 5', says)
@@ -155,28 +165,37 @@ class TestObservationsCsv:
         assert (table.frame[0], table.landmark[0]) == (2**53, 2**32 - 1)
         assert table.xyz[0].tolist() == [-1e12, 4.0, 1e12]
 
-    @pytest.mark.parametrize(('name', 'cell', 'says'), [
-        ('camera', '../left', "camera is '../left'; a name without .."),
-        ('camera', '/left', "camera is '/left'; a name without .."),
-        ('camera', '', "camera is ''; a name, as '1' elsewhere, is needed"),
-        ('sigma', '0', "sigma is '0'; a number above 0"),
-        ('sigma', '-0.1', "sigma is '-0.1'; a number above 0"),
-        ('sigma', '', "sigma is ''; a number"),
-        ('t', 'noon', "t is 'noon'; a number"),
-        ('t', 'nan', "t is 'nan'; a finite number"),
-        ('board', '0.5', "board is '0.5'; a whole number"),
-    ])
+    @pytest.mark.parametrize(
+        ('name', 'cell', 'says'),
+        [
+            ('camera', '../left', "camera is '../left'; a name without .."),
+            ('camera', '/left', "camera is '/left'; a name without .."),
+            ('camera', '', "camera is ''; a name, as '1' elsewhere, is needed"),
+            ('sigma', '0', "sigma is '0'; a number above 0"),
+            ('sigma', '-0.1', "sigma is '-0.1'; a number above 0"),
+            ('sigma', '', "sigma is ''; a number"),
+            ('t', 'noon', "t is 'noon'; a number"),
+            ('t', 'nan', "t is 'nan'; a finite number"),
+            ('board', '0.5', "board is '0.5'; a whole number"),
+        ],
+    )
     def test_bad_optional_cell(self, csv, name, cell, says):
         text = f'{HEADER},{name}\n0,4,1,2,3,4,5,1\n0,5,1,2,3,4,5,{cell}\n'
         fails(csv(text), 'line 3', says)
 
     @pytest.mark.parametrize('unseen', ['-1,-1', '0,0', '-9999,-9999'])
     def test_rows_of_points_that_were_not_seen(self, csv, unseen):
-        rows = [f'{i // 9},{i % 9},{unseen if i % 4 == 1 else f"{i},{i + 0.5}"},{i % 9},0,0'
-                for i in range(27)]
+        rows = [
+            f'{i // 9},{i % 9},{unseen if i % 4 == 1 else f"{i},{i + 0.5}"},{i % 9},0,0'
+            for i in range(27)
+        ]
         place = unseen.replace(',', ', ')
-        fails(csv('\n'.join([HEADER, *rows])), 'line 3', f'u, v are {place} here and in 6 more',
-              'leave out the rows of points that were not seen')
+        fails(
+            csv('\n'.join([HEADER, *rows])),
+            'line 3',
+            f'u, v are {place} here and in 6 more',
+            'leave out the rows of points that were not seen',
+        )
 
     def test_points_at_one_place_now_and_then(self, csv):
         """A static scene, and neighbours in whole pixels."""
@@ -187,22 +206,30 @@ class TestObservationsCsv:
         text = f'{HEADER},camera\n0,4,1,2,3,4,5,left\n0,4,1,2,3,4,5,right\n'
         assert len(read_observations(csv(text))) == 2
 
-    @pytest.mark.parametrize(('text', 'says'), [
-        ('', 'it is empty'),
-        ('\n\n', 'it is empty'),
-        (HEADER, 'no row below the header'),
-        (f'{HEADER}\n\n', 'no row below the header'),
-        (f'{HEADER},u\n{ROWS}', "its header has 'u' twice"),
-        (HEADER.replace(',', ';'), 'no row below the header'),
-        (HEADER.replace(',', ' '),
-         "columns 'frame', 'landmark', 'u', 'v', 'x', 'y', 'z' are missing from its header, "
-         "'frame landmark u v x y z'"),
-        (ROWS, f'its first line holds numbers; a header with {HEADER} is needed'),
-        (f'{HEADER}\n{ROWS}'.replace(',', ';').replace('.', ','),
-         "line 2: u is '10,5'; a number, with a decimal point, is needed"),
-        (b'\xff\xfe\x00\x01', 'not a text file'),
-        (f'{HEADER}\n0,"4,1,2,3,4,5\n', 'fields where the header has 7'),
-    ])
+    @pytest.mark.parametrize(
+        ('text', 'says'),
+        [
+            ('', 'it is empty'),
+            ('\n\n', 'it is empty'),
+            (HEADER, 'no row below the header'),
+            (f'{HEADER}\n\n', 'no row below the header'),
+            (f'{HEADER},u\n{ROWS}', "its header has 'u' twice"),
+            (HEADER.replace(',', ';'), 'no row below the header'),
+            (
+                HEADER.replace(',', ' '),
+                "columns 'frame', 'landmark', 'u', 'v', 'x', 'y', 'z' are missing from "
+                'its header, '
+                "'frame landmark u v x y z'",
+            ),
+            (ROWS, f'its first line holds numbers; a header with {HEADER} is needed'),
+            (
+                f'{HEADER}\n{ROWS}'.replace(',', ';').replace('.', ','),
+                "line 2: u is '10,5'; a number, with a decimal point, is needed",
+            ),
+            (b'\xff\xfe\x00\x01', 'not a text file'),
+            (f'{HEADER}\n0,"4,1,2,3,4,5\n', 'fields where the header has 7'),
+        ],
+    )
     def test_bad_file(self, csv, text, says):
         fails(csv(text), says)
 
@@ -231,19 +258,29 @@ class TestPosesCsv:
         header = (tmp_path / 'poses.csv').read_text().splitlines()[0]
         assert header == 'frame,x,y,z,qx,qy,qz,qw'
 
-    @pytest.mark.parametrize(('text', 'says'), [
-        ('', 'it is empty'),
-        ('frame,x,y,z,qx,qy,qz\n', "column 'qw' is missing"),
-        ('frame,x,y,z,qx,qy,qz,qw\n', 'no row below the header'),
-        ('frame,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,0\n',
-         "line 2: qw is '0'; a quaternion of norm 1"),
-        ('frame,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,2\n', 'a quaternion of norm 1'),
-        ('frame,x,y,z,qx,qy,qz,qw\n0,1,2,nan,0,0,0,1\n', "line 2: z is 'nan'; a finite number"),
-        ('frame,x,y,z,qx,qy,qz,qw\n0,1,2,?,0,0,0,1\n', "line 2: z is '?'; a number"),
-        ('frame,x,y,z,qx,qy,qz,qw\n.5,1,2,3,0,0,0,1\n', "frame is '.5'; a whole number"),
-        ('frame,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n1,0,0,0,0,0,0,1\n',
-         'line 3: the same frame as in line 2'),
-    ])
+    @pytest.mark.parametrize(
+        ('text', 'says'),
+        [
+            ('', 'it is empty'),
+            ('frame,x,y,z,qx,qy,qz\n', "column 'qw' is missing"),
+            ('frame,x,y,z,qx,qy,qz,qw\n', 'no row below the header'),
+            (
+                'frame,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,0\n',
+                "line 2: qw is '0'; a quaternion of norm 1",
+            ),
+            ('frame,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,2\n', 'a quaternion of norm 1'),
+            (
+                'frame,x,y,z,qx,qy,qz,qw\n0,1,2,nan,0,0,0,1\n',
+                "line 2: z is 'nan'; a finite number",
+            ),
+            ('frame,x,y,z,qx,qy,qz,qw\n0,1,2,?,0,0,0,1\n', "line 2: z is '?'; a number"),
+            ('frame,x,y,z,qx,qy,qz,qw\n.5,1,2,3,0,0,0,1\n', "frame is '.5'; a whole number"),
+            (
+                'frame,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n1,0,0,0,0,0,0,1\n',
+                'line 3: the same frame as in line 2',
+            ),
+        ],
+    )
     def test_bad_file(self, csv, text, says):
         fails(csv(text, 'poses.csv'), says, read=read_poses)
 
@@ -256,8 +293,10 @@ DSC = '0,3,3,10\nt25h7,2\n' + ''.join(
 )
 DSC_TWO = DSC + DSC.replace('0,3,3,10', '7,3,3,10')
 TP_TWO = '#calibrated\n0\n1 0 0 0\n0 1 0 0\n0 0 1 0\n7\n0 -0.9999999 0 500\n1 0 0 0\n0 0 1 20\n'
-ORPC = 'filename: a.png\nwidth: 9\nheight: 9\nnum_corners: 2\nencoding: ascii\n' \
+ORPC = (
+    'filename: a.png\nwidth: 9\nheight: 9\nnum_corners: 2\nencoding: ascii\n'
     '0,1,1,10.5,20.5\n0,2,1,11.5,21.5\n'
+)
 
 
 class TestOrpc:
@@ -307,42 +346,52 @@ class TestOrpc:
         (folder / 'zzz-2020-99-07-13-09-28.orpc').write_text(ORPC)
         assert np.isnan(read_observations(folder).t).all()
 
-    @pytest.mark.parametrize(('orpc', 'says'), [
-        (ORPC.replace('11.5,21.5', '11.5'), 'line 7: board, corner, 1, u, v'),
-        (ORPC.replace('11.5', 'x'), 'line 7'),
-        (ORPC.replace('11.5', 'nan'), 'line 7: finite numbers'),
-        (ORPC.replace('0,2,1', '0,4,1'), 'line 7: board 0, corner 4 is not on the target'),
-        (ORPC.replace('0,2,1', '3,2,1'), 'line 7: board 3, corner 2 is not on the target'),
-        (ORPC.replace('0,2,1', '0,1,1'), 'a corner twice'),
-        (ORPC.replace('num_corners: 2', 'num_corners: 3'), 'num_corners is 3, but 2'),
-        (ORPC[: ORPC.index('0,2,1')], 'num_corners is 2, but 1'),
-        (ORPC.replace('0,2,1', '0,1.5,1'), "line 7: '1.5' is not a whole number"),
-        (ORPC.replace('0,2,1', '0,-2,1'), "line 7: '-2' is not a whole number"),
-        (ORPC.replace('0,2,1', '1e300,2,1'), "line 7: '1e300' is not a whole number"),
-        ('', 'num_corners is None, but 0'),
-        (b'\xff\x00', 'not a text file'),
-    ])
+    @pytest.mark.parametrize(
+        ('orpc', 'says'),
+        [
+            (ORPC.replace('11.5,21.5', '11.5'), 'line 7: board, corner, 1, u, v'),
+            (ORPC.replace('11.5', 'x'), 'line 7'),
+            (ORPC.replace('11.5', 'nan'), 'line 7: finite numbers'),
+            (ORPC.replace('0,2,1', '0,4,1'), 'line 7: board 0, corner 4 is not on the target'),
+            (ORPC.replace('0,2,1', '3,2,1'), 'line 7: board 3, corner 2 is not on the target'),
+            (ORPC.replace('0,2,1', '0,1,1'), 'a corner twice'),
+            (ORPC.replace('num_corners: 2', 'num_corners: 3'), 'num_corners is 3, but 2'),
+            (ORPC[: ORPC.index('0,2,1')], 'num_corners is 2, but 1'),
+            (ORPC.replace('0,2,1', '0,1.5,1'), "line 7: '1.5' is not a whole number"),
+            (ORPC.replace('0,2,1', '0,-2,1'), "line 7: '-2' is not a whole number"),
+            (ORPC.replace('0,2,1', '1e300,2,1'), "line 7: '1e300' is not a whole number"),
+            ('', 'num_corners is None, but 0'),
+            (b'\xff\x00', 'not a text file'),
+        ],
+    )
     def test_bad_corners(self, data, orpc, says):
         with pytest.raises(ObservationError) as caught:
             read_observations(data(orpc))
         assert 'cam-2020-05-07-13-09-28.orpc' in str(caught.value)
         assert says in str(caught.value)
 
-    @pytest.mark.parametrize(('dsc', 'tp', 'says'), [
-        ('', None, 'no board in it'),
-        ('1,2,3\n', None, 'line 1: not a board'),
-        (DSC.replace('t25h7,2\n', 't25h7,2\n-1,0,0,a,0,0\n'), None, 'line 3'),
-        (DSC_TWO, None, 'target.tp: cannot be read'),
-        (DSC_TWO, '0\n1 0 0\n', 'target.tp: a board number and 3 x 4 numbers'),
-        (DSC_TWO, '0\n1 0 0 x\n', 'target.tp, line 2'),
-        (DSC_TWO, '', 'target.tp: a board number'),
-        (DSC_TWO, TP_TWO.replace('0\n1 0', '5\n1 0', 1), 'board 0, corner 1 is not on the target'),
-        (DSC_TWO, TP_TWO.replace('1 0', '1.1 0', 1), 'holds no rotation'),
-        (DSC_TWO, '0\n1 0 0 0\n0 1 0 0\n0 0 -1 0\n', 'board 0 holds no rotation'),
-        (DSC_TWO, TP_TWO + TP_TWO, 'a board is listed twice'),
-        (DSC + DSC, None, 'board 0 is listed twice'),
-        (DSC + DSC.splitlines()[-1], None, 'this corner is listed twice'),
-    ])
+    @pytest.mark.parametrize(
+        ('dsc', 'tp', 'says'),
+        [
+            ('', None, 'no board in it'),
+            ('1,2,3\n', None, 'line 1: not a board'),
+            (DSC.replace('t25h7,2\n', 't25h7,2\n-1,0,0,a,0,0\n'), None, 'line 3'),
+            (DSC_TWO, None, 'target.tp: cannot be read'),
+            (DSC_TWO, '0\n1 0 0\n', 'target.tp: a board number and 3 x 4 numbers'),
+            (DSC_TWO, '0\n1 0 0 x\n', 'target.tp, line 2'),
+            (DSC_TWO, '', 'target.tp: a board number'),
+            (
+                DSC_TWO,
+                TP_TWO.replace('0\n1 0', '5\n1 0', 1),
+                'board 0, corner 1 is not on the target',
+            ),
+            (DSC_TWO, TP_TWO.replace('1 0', '1.1 0', 1), 'holds no rotation'),
+            (DSC_TWO, '0\n1 0 0 0\n0 1 0 0\n0 0 -1 0\n', 'board 0 holds no rotation'),
+            (DSC_TWO, TP_TWO + TP_TWO, 'a board is listed twice'),
+            (DSC + DSC, None, 'board 0 is listed twice'),
+            (DSC + DSC.splitlines()[-1], None, 'this corner is listed twice'),
+        ],
+    )
     def test_bad_target(self, data, dsc, tp, says):
         with pytest.raises(ObservationError) as caught:
             read_observations(data(dsc=dsc, tp=tp))
@@ -372,16 +421,20 @@ class TestOrpc:
         assert same(rounded, table)
 
 
-@pytest.mark.parametrize(('frame', 't', 'said'), [
-    (0, 1.7e18, 'a time in seconds (these are nanoseconds: divide by 1e+09) is needed'),
-    (1_700_000_000_123_456_789, 0.5, '(stamps in nanoseconds belong in t, in seconds)'),
-])
+@pytest.mark.parametrize(
+    ('frame', 't', 'said'),
+    [
+        (0, 1.7e18, 'a time in seconds (these are nanoseconds: divide by 1e+09) is needed'),
+        (1_700_000_000_123_456_789, 0.5, '(stamps in nanoseconds belong in t, in seconds)'),
+    ],
+)
 def test_stamps_in_nanoseconds_are_told_that_seconds_are_meant(
     tmp_path: Path, frame: int, t: float, said: str
 ) -> None:
     path = tmp_path / 'o.csv'
-    path.write_text(f'frame,landmark,u,v,x,y,z,t\n{frame},1,10,20,0.1,0.2,0,{t}\n',
-                    encoding='utf-8')
+    path.write_text(
+        f'frame,landmark,u,v,x,y,z,t\n{frame},1,10,20,0.1,0.2,0,{t}\n', encoding='utf-8'
+    )
     with pytest.raises(ObservationError) as caught:
         read_observations(path)
     assert said in str(caught.value) and 'o.csv' in str(caught.value)

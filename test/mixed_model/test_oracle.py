@@ -28,7 +28,8 @@ def oracle():
     """Return the module, which takes a second to import: where these tests run alone."""
     return pytest.importorskip(
         'statsmodels.regression.mixed_linear_model',
-        reason="statsmodels is not installed (pip install 'fisheye-svp-ros[test]')")
+        reason="statsmodels is not installed (pip install 'fisheye-svp-ros[test]')",
+    )
 
 
 def growth_curves(seed):
@@ -46,10 +47,16 @@ def equations_of(y, fixed, random):
     """Return random columns and the equations of groups with two components and nothing else."""
     components = Components(np.zeros(2, dtype=bool), np.zeros(2, dtype=bool))
     columns = RandomColumns(
-        random, np.arange(2), np.zeros((GROUPS, ROWS // 2, 2, 1)),
-        np.full((GROUPS, ROWS // 2), -1), np.zeros((0, 1), dtype=np.int64),
-        sparse.csr_array((GROUPS * ROWS, 0)), sparse.csr_array((0, 0)),
-        np.zeros(0, dtype=np.int64), components)
+        random,
+        np.arange(2),
+        np.zeros((GROUPS, ROWS // 2, 2, 1)),
+        np.full((GROUPS, ROWS // 2), -1),
+        np.zeros((0, 1), dtype=np.int64),
+        sparse.csr_array((GROUPS * ROWS, 0)),
+        sparse.csr_array((0, 0)),
+        np.zeros(0, dtype=np.int64),
+        components,
+    )
     border = np.concatenate([fixed, y[..., None]], axis=-1)
     return columns, make_equations(columns, np.zeros((GROUPS, ROWS, 0)), border), border
 
@@ -79,8 +86,8 @@ def case(request, oracle):
     now = converged(eq)
     f = factor_equations(eq, now.lam, now.weight)
     model = oracle.MixedLM(
-        y.ravel(), fixed.reshape(-1, 2), np.repeat(np.arange(GROUPS), ROWS),
-        random.reshape(-1, 2))
+        y.ravel(), fixed.reshape(-1, 2), np.repeat(np.arange(GROUPS), ROWS), random.reshape(-1, 2)
+    )
     free = oracle.MixedLMParams.from_components(fe_params=np.ones(2), cov_re=np.eye(2))
     result = model.fit(reml=True, free=free, method='bfgs')
     return (y, columns, border), eq, now, f, model, result
@@ -97,8 +104,7 @@ def test_estimates_predictions_and_their_errors_agree(case):
     solution = solve_equations(f)
     np.testing.assert_allclose(solution.values, result.fe_params, rtol=1e-3)
     covariance = now.sigma**2 * np.linalg.inv(f.information[:-1, :-1])
-    np.testing.assert_allclose(
-        covariance, fixed_covariance(model, result), rtol=5e-3, atol=1e-6)
+    np.testing.assert_allclose(covariance, fixed_covariance(model, result), rtol=5e-3, atol=1e-6)
     own, _, _ = eq.split(solution.e, solution.r)
     expected = np.array([result.random_effects[g] for g in range(GROUPS)])
     np.testing.assert_allclose(own, expected, atol=2e-3 * np.abs(expected).max())
@@ -112,7 +118,8 @@ def test_the_deviance_is_twice_the_log_likelihood(case, oracle):
         lam = now.lam * factor
         ours.append(solve_equations(factor_equations(eq, lam, now.weight)).deviance)
         relative = oracle.MixedLMParams.from_components(
-            fe_params=np.zeros(2), cov_re=np.diag(1 / lam))
+            fe_params=np.zeros(2), cov_re=np.diag(1 / lam)
+        )
         theirs.append(-2 * model.loglike(relative, profile_fe=True))
     np.testing.assert_allclose(np.diff(ours), np.diff(theirs), rtol=1e-6, atol=1e-7)
 
@@ -124,7 +131,7 @@ def test_a_score_test_is_a_wald_test_where_the_variances_are_held(case):
     inverse = pseudo_inverse(information[np.ix_(inside, inside)])
     remaining = information - information[:, inside] @ inverse @ information[inside]
     score = score_columns(remaining, np.array([1]), np.ones(2), now.sigma**2)
-    wald = result.fe_params[1]**2 / fixed_covariance(model, result)[1, 1]
+    wald = result.fe_params[1] ** 2 / fixed_covariance(model, result)[1, 1]
     assert score.rank == 1 and score.estimate[0] == pytest.approx(result.fe_params[1], rel=1e-3)
     assert score.statistic == pytest.approx(wald, rel=5e-3)
 
@@ -137,7 +144,8 @@ def test_a_group_left_out_is_predicted_as_by_a_fit_without_it(case):
     rest = make_equations(gone, np.zeros((GROUPS, ROWS, 0)), border * keep[:, None, None])
     direct = factor_equations(rest, now.lam, now.weight)
     np.testing.assert_allclose(
-        f.information - left_out.information[4], direct.information, rtol=1e-6, atol=1e-8)
+        f.information - left_out.information[4], direct.information, rtol=1e-6, atol=1e-8
+    )
     # Nothing is shared but fixed columns: the others predict nothing more of the group.
     np.testing.assert_allclose(left_out.rows[4], border[4], atol=1e-9)
 
@@ -150,8 +158,9 @@ def test_units_that_are_exact_leave_all_as_it_is(case):
         offset=rng.normal(size=(GROUPS, ROWS // 2, 2, 1)),
         unit=np.tile(np.arange(ROWS // 2), (GROUPS, 1)),
         fields=sparse.csr_array((ROWS // 2, 0)),
-        unit_label=np.full((ROWS // 2, 1), 2), components=Components(
-            np.array([False, False, True]), np.zeros(3, dtype=bool)))
+        unit_label=np.full((ROWS // 2, 1), 2),
+        components=Components(np.array([False, False, True]), np.zeros(3, dtype=bool)),
+    )
     eq = make_equations(crossed, np.zeros((GROUPS, ROWS, 0)), border)
     lam = np.append(now.lam, 1e12)
     alive = replace(now, lam=lam, weight=np.ones(ROWS // 2))

@@ -51,8 +51,7 @@ class Attack:
 
     def tell_points(self, stamp: int) -> None:
         seen = self.seen
-        self.points.publish(
-            messages.image_points_message(seen.landmark, seen.uv, stamp, 'camera'))
+        self.points.publish(messages.image_points_message(seen.landmark, seen.uv, stamp, 'camera'))
 
     def solves(self, stamp: int) -> None:
         """Assert that a good set is still answered well."""
@@ -75,14 +74,20 @@ def tags(**values: object) -> Any:
     return messages.key_values_message('scenario', values, 7)
 
 
-@pytest.mark.parametrize(('values', 'reason'), [
-    ({'lens': 'fish214', 'shift_scale': 'abc'}, "shift_scale is 'abc'; a number is needed"),
-    ({'lens': 'fish214', 'shift_scale': '1e308'}, 'shift_scale is 1e+308; allowed is 0 to 100'),
-    ({'lens': 'a\0b'}, ''),  # rclpy ends a string there
-    ({'lens': 'a' * 5000}, 'is a file, but a running node takes only names'),
-    ({'lens': '/dev/zero'}, 'is a file, but a running node takes only names'),
-    ({'lens': 'nothere'}, "'nothere' is neither"),
-])
+@pytest.mark.parametrize(
+    ('values', 'reason'),
+    [
+        ({'lens': 'fish214', 'shift_scale': 'abc'}, "shift_scale is 'abc'; a number is needed"),
+        (
+            {'lens': 'fish214', 'shift_scale': '1e308'},
+            'shift_scale is 1e+308; allowed is 0 to 100',
+        ),
+        ({'lens': 'a\0b'}, ''),  # rclpy ends a string there
+        ({'lens': 'a' * 5000}, 'is a file, but a running node takes only names'),
+        ({'lens': '/dev/zero'}, 'is a file, but a running node takes only names'),
+        ({'lens': 'nothere'}, "'nothere' is neither"),
+    ],
+)
 def test_a_scenario_that_cannot_be_used_is_a_set_that_cannot_be_solved(
     graph: Callable[..., Graph], values: dict[str, object], reason: str
 ) -> None:
@@ -101,7 +106,8 @@ def test_a_scenario_that_cannot_be_used_is_a_set_that_cannot_be_solved(
 def huge(values: float) -> Any:
     points = environment('whole', 2.0)
     return messages.landmarks_message(
-        type(points)(points.ids, np.full_like(points.points, values)), 0, 'world')
+        type(points)(points.ids, np.full_like(points.points, values)), 0, 'world'
+    )
 
 
 def stamped(message: Any, sec: int, nanosec: int) -> Any:
@@ -114,17 +120,23 @@ def many_fields(count: int) -> Any:
     return PointCloud2(width=1, height=1, point_step=8, fields=fields, data=bytes(8))
 
 
-@pytest.mark.parametrize(('topic', 'message', 'reason'), [
-    ('landmarks', lambda: huge(1e308), 'is 1e+308'),
-    ('landmarks', lambda: huge(-1e200), 'is -1e+200'),
-    ('points', lambda: PointCloud2(point_step=2**32 - 1), '4294967295 bytes'),
-    ('points', lambda: many_fields(1000), '1000 fields'),
-    ('points', lambda: stamped(PointCloud2(), 2**31 - 1, 2**32 - 1), 'is not a time'),
-    ('points', lambda: stamped(PointCloud2(), -1, 0), 'is not a time'),
-    ('truth', lambda: stamped(messages.pose_message(paper_pose(), 7, 'w'), 0, 10**9),
-     'is not a time'),
-    ('scenario', lambda: DiagnosticArray(), '0 statuses'),
-])
+@pytest.mark.parametrize(
+    ('topic', 'message', 'reason'),
+    [
+        ('landmarks', lambda: huge(1e308), 'is 1e+308'),
+        ('landmarks', lambda: huge(-1e200), 'is -1e+200'),
+        ('points', lambda: PointCloud2(point_step=2**32 - 1), '4294967295 bytes'),
+        ('points', lambda: many_fields(1000), '1000 fields'),
+        ('points', lambda: stamped(PointCloud2(), 2**31 - 1, 2**32 - 1), 'is not a time'),
+        ('points', lambda: stamped(PointCloud2(), -1, 0), 'is not a time'),
+        (
+            'truth',
+            lambda: stamped(messages.pose_message(paper_pose(), 7, 'w'), 0, 10**9),
+            'is not a time',
+        ),
+        ('scenario', lambda: DiagnosticArray(), '0 statuses'),
+    ],
+)
 def test_a_hostile_message_is_refused_with_a_reason_and_counted(
     graph: Callable[..., Graph], topic: str, message: Callable[[], Any], reason: str
 ) -> None:
@@ -150,7 +162,8 @@ def test_a_board_file_is_named_below_the_folder_alone(
     graph: Callable[..., Graph], tmp_path: Path
 ) -> None:
     (tmp_path / 'target.yaml').write_text(
-        'target_type: aprilgrid\ntagCols: 3\ntagRows: 2\ntagSize: 0.1\ntagSpacing: 0.3\n')
+        'target_type: aprilgrid\ntagCols: 3\ntagRows: 2\ntagSize: 0.1\ntagSpacing: 0.3\n'
+    )
     node = graph(f'folder:={tmp_path}').start(Detector)
     assert set_parameter(node, 'board', f'aprilgrid:{tmp_path}/target.yaml').successful
     result = set_parameter(node, 'board', 'aprilgrid:/etc/passwd')
@@ -158,8 +171,7 @@ def test_a_board_file_is_named_below_the_folder_alone(
 
 
 def test_what_nobody_thought_of_is_told_once_counted_and_survived(
-    graph: Callable[..., Graph], monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str]
+    graph: Callable[..., Graph], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     def fail(*_: Any) -> None:
         raise np.linalg.LinAlgError('SVD did not converge')
@@ -177,7 +189,10 @@ def test_what_nobody_thought_of_is_told_once_counted_and_survived(
     status = attack.diagnostics[-1].status[0]
     assert counts['internal errors'] == '3' and status.level == status.ERROR
     assert (counts['sets: taken'], counts['sets: solved'], counts['sets: not solved']) == (
-        '4', '1', '3')
+        '4',
+        '1',
+        '3',
+    )
     said = capfd.readouterr().err
     assert said.count('Traceback') == 1 and 'SVD did not converge' in said
 
@@ -198,8 +213,10 @@ def test_a_timer_and_a_service_that_fail_do_not_end_the_node(
 
 def sums(counts: dict[str, str]) -> tuple[int, int]:
     """Return the sets that were taken, and all that became of them."""
-    return int(counts['sets: taken']), sum(int(counts[f'sets: {name}']) for name in (
-        'solved', 'not solved', 'dropped', 'incomplete', 'waiting'))
+    return int(counts['sets: taken']), sum(
+        int(counts[f'sets: {name}'])
+        for name in ('solved', 'not solved', 'dropped', 'incomplete', 'waiting')
+    )
 
 
 def test_overload_drops_whole_sets_keeps_the_newest_and_says_so(
@@ -232,7 +249,7 @@ def test_overload_drops_whole_sets_keeps_the_newest_and_says_so(
 
 
 def test_what_nobody_listens_to_yet_is_held_back_no_further_than_the_backlog(
-    graph: Callable[..., Graph]
+    graph: Callable[..., Graph],
 ) -> None:
     parameters = ('patience:=0.3', 'lens:=fish214', 'svp:=true', 'backlog:=5')
     attack = Attack(graph(*parameters, 'wait_for_subscribers:=2'))
@@ -307,10 +324,15 @@ def test_files_are_named_below_the_folder_alone(
         file.truncate(declaration.MAX_FILE_BYTES + 1)
     node = graph(f'folder:={inside.parent}').start(Localizer)
     assert set_parameter(node, 'lens', str(inside)).successful
-    for name, reason in ((outside, 'is not below'), (inside.parent / 'link.yaml', 'is not below'),
-                         (inside.parent / 'fifo.yaml', 'is no file'), ('/dev/zero', 'not below'),
-                         (inside.parent / 'huge.yaml', 'above 64 MB'), ('plain', 'not below'),
-                         ('rig', 'is a folder, and not one of')):
+    for name, reason in (
+        (outside, 'is not below'),
+        (inside.parent / 'link.yaml', 'is not below'),
+        (inside.parent / 'fifo.yaml', 'is no file'),
+        ('/dev/zero', 'not below'),
+        (inside.parent / 'huge.yaml', 'above 64 MB'),
+        ('plain', 'not below'),
+        ('rig', 'is a folder, and not one of'),
+    ):
         result = set_parameter(node, 'lens', str(name))
         assert not result.successful and reason in result.reason, name
     assert node.settings.lens == str(inside)
@@ -348,8 +370,11 @@ def test_stamps_follow_a_clock_that_is_set_back(
 def test_quality_of_service_is_overridden(
     graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    g = graph('qos_overrides./image_points.publisher.reliability:=best_effort',
-              'qos_overrides./image_points.publisher.depth:=7', 'rate:=100.0')
+    g = graph(
+        'qos_overrides./image_points.publisher.reliability:=best_effort',
+        'qos_overrides./image_points.publisher.depth:=7',
+        'rate:=100.0',
+    )
     points = g.hear(PointCloud2, 'image_points')
     node = g.start(SyntheticCamera)
     name = 'qos_overrides./image_points.publisher.reliability'
@@ -362,10 +387,13 @@ def test_quality_of_service_is_overridden(
     assert 'is unknown to this node' not in capfd.readouterr().err
 
 
-@pytest.mark.parametrize('given', [
-    'qos_overrides./image_points.publisher.reliability:=sometimes',
-    'qos_overrides./image_points.publisher.depth:=deep',
-])
+@pytest.mark.parametrize(
+    'given',
+    [
+        'qos_overrides./image_points.publisher.reliability:=sometimes',
+        'qos_overrides./image_points.publisher.depth:=deep',
+    ],
+)
 def test_an_override_that_makes_no_sense_is_refused(
     graph: Callable[..., Graph], given: str
 ) -> None:

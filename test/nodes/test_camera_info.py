@@ -64,10 +64,18 @@ def test_a_lens_without_a_shift_is_wholly_told_by_camera_info(graphs: list[Graph
 
 
 def test_each_camera_of_a_rig_has_its_own(graphs: list[Graph]) -> None:
-    g = start(graphs, 'synthetic_camera:lens:=fish214', 'shift_scale:=0.0', 'style:=parallel',
-              'poses_file:=calibration', 'repeat:=false', 'wait_for_subscribers:=2',
-              'stereo_calibrator:wait_for_subscribers:=0', 'stereo_depth:wait_for_subscribers:=0',
-              'lock_step:=stereo_calibrator/result stereo_depth/result')
+    g = start(
+        graphs,
+        'synthetic_camera:lens:=fish214',
+        'shift_scale:=0.0',
+        'style:=parallel',
+        'poses_file:=calibration',
+        'repeat:=false',
+        'wait_for_subscribers:=2',
+        'stereo_calibrator:wait_for_subscribers:=0',
+        'stereo_depth:wait_for_subscribers:=0',
+        'lock_step:=stereo_calibrator/result stereo_depth/result',
+    )
     calibrated = g.hear(DiagnosticArray, 'stereo_calibrator/result')
     measured = g.hear(DiagnosticArray, 'stereo_depth/result')
     nodes = [g.start(StereoCalibrator), g.start(StereoDepth)]
@@ -81,7 +89,7 @@ def test_each_camera_of_a_rig_has_its_own(graphs: list[Graph]) -> None:
 
 
 def test_an_ordinary_driver_is_heard_and_the_set_has_the_camera_info_of_its_stamp(
-    graphs: list[Graph]
+    graphs: list[Graph],
 ) -> None:
     g = start(graphs, 'patience:=0.3')
     results = g.hear(DiagnosticArray, 'localizer/result')
@@ -97,14 +105,20 @@ def test_an_ordinary_driver_is_heard_and_the_set_has_the_camera_info_of_its_stam
 
     def tell(stamp: int, one: Any) -> None:
         image = project(one, paper_pose().into_body(landmarks.points))
-        points.publish(messages.image_points_message(
-            landmarks.ids[image.valid], image.uv[image.valid], stamp, 'camera'))
+        points.publish(
+            messages.image_points_message(
+                landmarks.ids[image.valid], image.uv[image.valid], stamp, 'camera'
+            )
+        )
 
     # Best effort: what comes before the two know of each other, or in a crowd, is lost.
     for count, (stamp, one) in enumerate(stamps.items(), start=1):
-        g.until(lambda stamp=stamp, one=one, count=count: (
-            driver.publish(messages.camera_info_message(one, stamp, 'camera')),
-            len(node._infos._heard.get('camera_info', ())) == count)[1])
+        g.until(
+            lambda stamp=stamp, one=one, count=count: (
+                driver.publish(messages.camera_info_message(one, stamp, 'camera')),
+                len(node._infos._heard.get('camera_info', ())) == count,
+            )[1]
+        )
     for stamp, one in stamps.items():
         tell(stamp, one)
     tell(7, longer)  # of another stamp than any camera_info: the latest holds
@@ -120,8 +134,9 @@ def test_a_set_without_one_says_so(graphs: list[Graph]) -> None:
     told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
     landmarks = environment('whole', 2.0)
     told.publish(messages.landmarks_message(landmarks, 0, 'world'))
-    points.publish(messages.image_points_message(
-        landmarks.ids, landmarks.points[:, :2] + 9, 3, 'camera'))
+    points.publish(
+        messages.image_points_message(landmarks.ids, landmarks.points[:, :2] + 9, 3, 'camera')
+    )
     g.until(lambda: results)
     assert 'camera_info: no message received' in results[0].status[0].message
 
@@ -147,34 +162,46 @@ def test_what_a_camera_info_says() -> None:
     assert read_camera_info(info(roi=RegionOfInterest(width=640, height=480))) == model
 
 
-@pytest.mark.parametrize(('changes', 'reason'), [
-    ({'k': [0.0] * 9}, 'not calibrated'), ({'d': [np.nan] * 4}, 'not a finite number'),
-    ({'k': [1e300, 0.0, 320.0, 0.0, 1e300, 240.0, 0.0, 0.0, 1.0]}, r'beyond 1e\+12'),
-    ({'binning_x': 2}, 'binned'), ({'roi': RegionOfInterest(x_offset=4)}, 'a part of the image'),
-])
+@pytest.mark.parametrize(
+    ('changes', 'reason'),
+    [
+        ({'k': [0.0] * 9}, 'not calibrated'),
+        ({'d': [np.nan] * 4}, 'not a finite number'),
+        ({'k': [1e300, 0.0, 320.0, 0.0, 1e300, 240.0, 0.0, 0.0, 1.0]}, r'beyond 1e\+12'),
+        ({'binning_x': 2}, 'binned'),
+        ({'roi': RegionOfInterest(x_offset=4)}, 'a part of the image'),
+    ],
+)
 def test_a_camera_info_of_no_use(changes: dict[str, Any], reason: str) -> None:
     with pytest.raises(ObservationError, match=reason):
         read_camera_info(info(**changes))
 
 
-@pytest.mark.parametrize(('model', 'd', 'reason'), [
-    ('thin_prism', (0.1,), "'thin_prism'; known are equidistant"),
-    ('equidistant', (0.1,), 'has 1 coefficients'), ('plumb_bob', (0.1,), 'has 1 coefficients'),
-    ('plumb_bob', (-0.9, 0.9, 0.01, 0.02, 0.0), 'calibrate again, as equidistant'),
-    ('equidistant', (0.1, 1e300, 0.0, 5e-324), 'no real lens'),
-])
-def test_a_model_that_no_lens_comes_near_to(
-    model: str, d: tuple[float, ...], reason: str
-) -> None:
+@pytest.mark.parametrize(
+    ('model', 'd', 'reason'),
+    [
+        ('thin_prism', (0.1,), "'thin_prism'; known are equidistant"),
+        ('equidistant', (0.1,), 'has 1 coefficients'),
+        ('plumb_bob', (0.1,), 'has 1 coefficients'),
+        ('plumb_bob', (-0.9, 0.9, 0.01, 0.02, 0.0), 'calibrate again, as equidistant'),
+        ('equidistant', (0.1, 1e300, 0.0, 5e-324), 'no real lens'),
+    ],
+)
+def test_a_model_that_no_lens_comes_near_to(model: str, d: tuple[float, ...], reason: str) -> None:
     with pytest.raises(LensError, match=reason):
         lens_of(model, (640, 480), (380.0, 380.0, 320.0, 240.0), d, 'camera', 'camera_info')
 
 
-@pytest.mark.parametrize(('model', 'd'), [
-    ('equidistant', (0.02, -0.01, 0.003, -0.0005)), ('plumb_bob', ()),
-    ('plumb_bob', (0.1, -0.25, 0.001, -0.002, 0.05)), ('plumb_bob', (-0.2, 0.05, 0.001, 0.0005)),
-    ('rational_polynomial', (0.3, 0.02, 0.0, 0.0, 0.001, 0.5, 0.03, 0.0)),
-])
+@pytest.mark.parametrize(
+    ('model', 'd'),
+    [
+        ('equidistant', (0.02, -0.01, 0.003, -0.0005)),
+        ('plumb_bob', ()),
+        ('plumb_bob', (0.1, -0.25, 0.001, -0.002, 0.05)),
+        ('plumb_bob', (-0.2, 0.05, 0.001, 0.0005)),
+        ('rational_polynomial', (0.3, 0.02, 0.0, 0.0, 0.001, 0.5, 0.03, 0.0)),
+    ],
+)
 def test_every_model_as_opencv_projects_it(model: str, d: tuple[float, ...]) -> None:
     lens, worst = lens_of(model, (640, 480), K, d, 'camera', 'camera_info')
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 12), np.linspace(-0.4, 0.4, 12))
@@ -197,11 +224,11 @@ def test_a_skew_is_taken_over_from_message_and_file(
     matrix = np.array([[K[0], skew, K[2]], [0, K[1], K[3]], [0, 0, 1.0]])
     model = read_camera_info(info(k=matrix.ravel().tolist(), d=list(d)))
     file = tmp_path / 'info.yaml'
-    file.write_text(camera_info_text('camera', (640, 480), matrix, 'equidistant', d,
-                                     np.eye(3, 4)))
+    file.write_text(camera_info_text('camera', (640, 480), matrix, 'equidistant', d, np.eye(3, 4)))
     rays = np.array([[0.3, 0.4, 1.0], [-0.5, 0.2, 1.0], [0.1, -0.6, 1.0]])
     plane, _ = cv2.fisheye.projectPoints(
-        rays[:, None], np.zeros(3), np.zeros(3), np.eye(3), np.array(d[:4]))
+        rays[:, None], np.zeros(3), np.zeros(3), np.eye(3), np.array(d[:4])
+    )
     wanted = plane[:, 0] @ matrix[:2, :2].T + matrix[:2, 2]
     for lens in (lens_of(*model, 'camera', 'camera_info')[0], load_lens(file)):
         assert forward.project(lens, rays).uv == pytest.approx(wanted, abs=1e-5)

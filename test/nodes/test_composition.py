@@ -49,15 +49,29 @@ def test_nodes_are_composed_as_rclpy_nodes_are(context: Context) -> None:
     results = [hear_results(nodes[0], f'/{name}/finder/result') for name in ('front', 'rear')]
     for name, radius in (('front', 2.0), ('rear', 0.5)):
         nodes += [
-            SyntheticCamera(namespace=name, context=context, parameter_overrides=[
-                Parameter('radius', value=radius), Parameter('rate', value=50)]),
-            Localizer('finder', namespace=name, context=context, parameter_overrides=[
-                Parameter('lens', value='fish214')]),
+            SyntheticCamera(
+                namespace=name,
+                context=context,
+                parameter_overrides=[
+                    Parameter('radius', value=radius),
+                    Parameter('rate', value=50),
+                ],
+            ),
+            Localizer(
+                'finder',
+                namespace=name,
+                context=context,
+                parameter_overrides=[Parameter('lens', value='fish214')],
+            ),
         ]
     for node in nodes:
         executor.add_node(node)
     assert [node.get_fully_qualified_name() for node in nodes[1:]] == [
-        '/front/synthetic_camera', '/front/finder', '/rear/synthetic_camera', '/rear/finder']
+        '/front/synthetic_camera',
+        '/front/finder',
+        '/rear/synthetic_camera',
+        '/rear/finder',
+    ]
     assert nodes[1].settings.radius == 2.0 and nodes[3].settings.radius == 0.5
     until(lambda: executor.spin_once(0.02) or all(results))
     assert all(float(read_key_values(one[0])['position_error_m']) < 1e-6 for one in results)
@@ -72,12 +86,18 @@ def test_every_node_takes_what_rclpy_nodes_take(
 ) -> None:
     kind = executables._node_class(name)
     table = tmp_path / 'seen.csv'
-    table.write_text('frame,landmark,u,v,x,y,z\n' + ''.join(
-        f'0,{i},{10 * i},{5 * i},0,{i},1\n' for i in range(5)))
+    table.write_text(
+        'frame,landmark,u,v,x,y,z\n'
+        + ''.join(f'0,{i},{10 * i},{5 * i},0,{i},1\n' for i in range(5))
+    )
     given = {'wait_for_subscribers': 3}
     given |= {'observations': str(table)} if name == 'measured_camera' else {}
-    node = kind('mine', namespace='robot', context=context, parameter_overrides=[
-        Parameter(key, value=value) for key, value in given.items()])
+    node = kind(
+        'mine',
+        namespace='robot',
+        context=context,
+        parameter_overrides=[Parameter(key, value=value) for key, value in given.items()],
+    )
     assert node.get_fully_qualified_name() == '/robot/mine'
     assert node.settings.wait_for_subscribers == 3
     node.destroy_node()
@@ -87,13 +107,27 @@ def test_one_process_runs_several(
     ros_domain: int, start_process: Callable[..., NodeProcess], context: Context, tmp_path: Any
 ) -> None:
     params = tmp_path / 'params.yaml'
-    params.write_text('/robot/localizer: {ros__parameters: {lens: fish214}}\n'
-                      '/robot/synthetic_camera: {ros__parameters: {radius: 0.5, rate: 50}}\n')
+    params.write_text(
+        '/robot/localizer: {ros__parameters: {lens: fish214}}\n'
+        '/robot/synthetic_camera: {ros__parameters: {radius: 0.5, rate: 50}}\n'
+    )
     path = os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')])
     process = start_process(
-        [sys.executable, '-m', 'fisheye_svp_ros.cli', 'run', 'synthetic_camera', 'localizer',
-         '--ros-args', '-r', '__ns:=/robot', '--params-file', str(params)],
-        os.environ | {'PYTHONPATH': path})
+        [
+            sys.executable,
+            '-m',
+            'fisheye_svp_ros.cli',
+            'run',
+            'synthetic_camera',
+            'localizer',
+            '--ros-args',
+            '-r',
+            '__ns:=/robot',
+            '--params-file',
+            str(params),
+        ],
+        os.environ | {'PYTHONPATH': path},
+    )
     listener, executor = Node('listener', context=context), SingleThreadedExecutor(context=context)
     executor.add_node(listener)
     results = hear_results(listener, '/robot/localizer/result')

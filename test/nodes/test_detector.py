@@ -59,9 +59,12 @@ def test_images_to_points(detecting: Graph) -> None:
     images = detecting.tell(Image, 'image', SENSOR)
     for i in range(2):
         message = raw(photograph(where.take(i)), 7 + i)
-        detecting.until(lambda message=message: (
-            images.publish(message),
-            any(p.header.stamp == message.header.stamp for p in points))[1])
+        detecting.until(
+            lambda message=message: (
+                images.publish(message),
+                any(p.header.stamp == message.header.stamp for p in points),
+            )[1]
+        )
         found = read_image_points(points[-1])
         true = true_corners(where.take(i))[found.landmark]
         assert np.abs(found.uv - true).max() < 0.1
@@ -73,9 +76,12 @@ def test_it_rests_between_images(detecting: Graph) -> None:
     images = detecting.tell(Image, 'image', SENSOR)
     for stamp in (7, 8):
         message = raw(photograph(poses(1, 4).take(0)), stamp)
-        detecting.until(lambda message=message: (
-            images.publish(message),
-            any(p.header.stamp == message.header.stamp for p in points))[1])
+        detecting.until(
+            lambda message=message: (
+                images.publish(message),
+                any(p.header.stamp == message.header.stamp for p in points),
+            )[1]
+        )
         detecting.until(detecting.detector._look.is_canceled)
 
 
@@ -87,8 +93,12 @@ def test_compressed_and_bad_images(detecting: Graph) -> None:
     good = CompressedImage(header=header(5), format='png', data=data)
     images = detecting.tell(Image, 'image', SENSOR)
     # What has no board says nothing of the camera: its size is not taken for the camera's.
-    detecting.until(lambda: (images.publish(raw(np.zeros((7, 9), np.uint8), 4)),
-                             detecting.detector._counts['images without board'])[1])
+    detecting.until(
+        lambda: (
+            images.publish(raw(np.zeros((7, 9), np.uint8), 4)),
+            detecting.detector._counts['images without board'],
+        )[1]
+    )
     detecting.until(lambda: (tell.publish(good), points)[1])
     heard = len(points)
     images.publish(raw(image[:-20], 6))
@@ -97,22 +107,32 @@ def test_compressed_and_bad_images(detecting: Graph) -> None:
     images.publish(short)
     detecting.idle(0.5)
     assert not any(p.header.stamp.nanosec in (6, 7) for p in points[heard:])
-    detecting.until(lambda: (images.publish(raw(image, 8)),
-                         any(p.header.stamp.nanosec == 8 for p in points))[1])
+    detecting.until(
+        lambda: (images.publish(raw(image, 8)), any(p.header.stamp.nanosec == 8 for p in points))[
+            1
+        ]
+    )
 
 
 def test_a_camera_info_of_another_size_is_told_of(detecting: Graph) -> None:
     image = photograph(poses(1, 4).take(0))
     detecting.hear(PointCloud2, 'image_points')
     reports = detecting.hear(DiagnosticArray, '/diagnostics')
-    images, told = detecting.tell(Image, 'image', SENSOR), detecting.tell(
-        CameraInfo, 'camera_info', SENSOR)
+    images, told = (
+        detecting.tell(Image, 'image', SENSOR),
+        detecting.tell(CameraInfo, 'camera_info', SENSOR),
+    )
 
     def says(width: int, text: str) -> Any:
         message = CameraInfo(width=width, height=image.shape[0], distortion_model='equidistant')
         message.k, message.d = [300.0, 0.0, 9.0, 0.0, 300.0, 9.0, 0.0, 0.0, 1.0], [0.0] * 4
-        detecting.until(lambda: (told.publish(message), images.publish(raw(image, 5)), next(
-            (m for m in reports if text in m.status[0].message), None))[-1])
+        detecting.until(
+            lambda: (
+                told.publish(message),
+                images.publish(raw(image, 5)),
+                next((m for m in reports if text in m.status[0].message), None),
+            )[-1]
+        )
         status = reports[-1].status[0]
         reports.clear()
         return status
@@ -134,20 +154,23 @@ def test_an_image_that_comes_raw_and_compressed_is_searched_once(detecting: Grap
     detecting.until(detecting.detector._look.is_canceled)
     detecting.idle(0.2)
     heard = len(points)
-    detecting.until(lambda: (
-        tell.publish(CompressedImage(header=header(5), format='png', data=data)),
-        detecting.detector._inputs['image/compressed'].count.received > 2)[1])
+    detecting.until(
+        lambda: (
+            tell.publish(CompressedImage(header=header(5), format='png', data=data)),
+            detecting.detector._inputs['image/compressed'].count.received > 2,
+        )[1]
+    )
     detecting.until(lambda: (images.publish(raw(image, 6)), stamp_of(points[-1]) == 6)[1])
     assert [stamp_of(one) for one in points[heard:]].count(5) == 0
 
 
-def test_a_search_is_bounded_and_the_next_image_is_searched(
-    graph: Callable[..., Graph]
-) -> None:
+def test_a_search_is_bounded_and_the_next_image_is_searched(graph: Callable[..., Graph]) -> None:
     """Noise of this size takes seconds, as everything in it may be a square."""
     g = graph(f'board:={BOARD}', 'longest_search:=0.5')
-    points, diagnostics = g.hear(PointCloud2, 'image_points'), g.hear(
-        DiagnosticArray, '/diagnostics')
+    points, diagnostics = (
+        g.hear(PointCloud2, 'image_points'),
+        g.hear(DiagnosticArray, '/diagnostics'),
+    )
     node = g.start(Detector)
     images = g.tell(Image, 'image', SENSOR)
     good = photograph(poses(1, 4).take(0))
@@ -155,12 +178,23 @@ def test_a_search_is_bounded_and_the_next_image_is_searched(
     noise = np.random.default_rng(0).integers(0, 256, good.shape, dtype=np.uint8)
     noise = np.kron(noise, np.ones((3, 3), np.uint8))
     # Nothing else is held up meanwhile: that the executor goes round shows it.
-    g.until(lambda: (setattr(node, '_size', None), images.publish(raw(noise, 6)),
-                     node._counts['searches ended'])[2])
-    g.until(lambda: (images.publish(raw(good, 7)),
-                     any(p.header.stamp.nanosec == 7 for p in points))[1])
-    g.until(lambda: any(pair.key == 'searches ended' and int(pair.value)
-                        for m in diagnostics for pair in m.status[0].values))
+    g.until(
+        lambda: (
+            setattr(node, '_size', None),
+            images.publish(raw(noise, 6)),
+            node._counts['searches ended'],
+        )[2]
+    )
+    g.until(
+        lambda: (images.publish(raw(good, 7)), any(p.header.stamp.nanosec == 7 for p in points))[1]
+    )
+    g.until(
+        lambda: any(
+            pair.key == 'searches ended' and int(pair.value)
+            for m in diagnostics
+            for pair in m.status[0].values
+        )
+    )
 
 
 def test_from_rendered_images_to_the_true_pose(
@@ -170,20 +204,35 @@ def test_from_rendered_images_to_the_true_pose(
     lens = tmp_path / 'small.yaml'
     save_lens(LENS, lens)
     where = poses(2, 4)
-    listed = [float(value) for i in range(2) for value in (
-        *where.take(i).position, *quaternion_from_rotation(where.take(i).rotation))]
-    g = graph(f'board:={BOARD}', f'photograph:={BOARD}', f'lens:={lens}', f'poses:={listed}',
-              'rate:=2.0', 'sigma_px:=0.04', 'board_frame:=world')
-    images, estimated = g.hear(Image, 'image', SENSOR), g.hear(
-        PoseWithCovarianceStamped, 'localizer/pose')
+    listed = [
+        float(value)
+        for i in range(2)
+        for value in (*where.take(i).position, *quaternion_from_rotation(where.take(i).rotation))
+    ]
+    g = graph(
+        f'board:={BOARD}',
+        f'photograph:={BOARD}',
+        f'lens:={lens}',
+        f'poses:={listed}',
+        'rate:=2.0',
+        'sigma_px:=0.04',
+        'board_frame:=world',
+    )
+    images, estimated = (
+        g.hear(Image, 'image', SENSOR),
+        g.hear(PoseWithCovarianceStamped, 'localizer/pose'),
+    )
     results = g.hear(DiagnosticArray, 'localizer/result')
     for kind in (Detector, Localizer, SyntheticCamera):
         g.start(kind)
 
     def known() -> dict[int, dict[str, float]]:
         read = {stamp_of(m): read_key_values(m) for m in results}
-        return {stamp: {k: float(v) for k, v in values.items()} for stamp, values in
-                read.items() if 'position_error_m' in values}
+        return {
+            stamp: {k: float(v) for k, v in values.items()}
+            for stamp, values in read.items()
+            if 'position_error_m' in values
+        }
 
     g.until(lambda: len(known()) > 2)
     assert images[0].encoding == 'mono8' and (images[0].width, images[0].height) == (424, 400)
@@ -193,8 +242,10 @@ def test_from_rendered_images_to_the_true_pose(
         if metrics is None:
             continue
         pose = read_pose(message.pose)
-        truth = min((where.take(i) for i in range(2)),
-                    key=lambda one: float(np.linalg.norm(one.position - pose.position)))
+        truth = min(
+            (where.take(i) for i in range(2)),
+            key=lambda one: float(np.linalg.norm(one.position - pose.position)),
+        )
         error = pose.difference(truth)
         covariance = np.reshape(message.pose.covariance, (6, 6))
         assert error @ np.linalg.solve(covariance, error) < chi2.isf(1e-4, 6)
@@ -202,7 +253,9 @@ def test_from_rendered_images_to_the_true_pose(
 
 
 def test_a_camera_that_photographs_waits_for_who_compares_with_its_truth(
-    graph: Callable[..., Graph], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    graph: Callable[..., Graph],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr('fisheye_svp_ros.nodes.camera.LIMIT', 0.0)
@@ -219,12 +272,17 @@ def test_a_camera_that_photographs_waits_for_who_compares_with_its_truth(
     g.until(lambda: images)
 
 
-@pytest.mark.parametrize(('parameters', 'reason'), [
-    ((f'board:={BOARD}', 'detections:=true'), 'must be an aprilgrid'),
-    (('detections:=true',), 'apriltag_msgs is not installed'),
-])
+@pytest.mark.parametrize(
+    ('parameters', 'reason'),
+    [
+        ((f'board:={BOARD}', 'detections:=true'), 'must be an aprilgrid'),
+        (('detections:=true',), 'apriltag_msgs is not installed'),
+    ],
+)
 def test_tags_of_others_need_their_messages_and_a_grid(
-    graph: Callable[..., Graph], parameters: tuple[str, ...], reason: str,
+    graph: Callable[..., Graph],
+    parameters: tuple[str, ...],
+    reason: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr('fisheye_svp_ros.nodes.detector.find_spec', lambda name: None)
@@ -237,8 +295,9 @@ def test_tags_of_others_need_their_messages_and_a_grid(
 
 def test_tags_that_others_found(graph: Callable[..., Graph], tmp_path: Path) -> None:
     grid = tmp_path / 'grid.yaml'
-    grid.write_text("target_type: 'aprilgrid'\ntagCols: 3\ntagRows: 2\ntagSize: 0.05\n"
-                    'tagSpacing: 0.3\n')
+    grid.write_text(
+        "target_type: 'aprilgrid'\ntagCols: 3\ntagRows: 2\ntagSize: 0.05\ntagSpacing: 0.3\n"
+    )
     g = graph(f'board:=aprilgrid:{grid}')
     node = g.start(Detector)
     corners = [SimpleNamespace(x=10.0 + i, y=20.0) for i in range(4)]

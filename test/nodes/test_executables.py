@@ -37,10 +37,14 @@ def start(
     ros_domain: int, start_process: Callable[..., NodeProcess]
 ) -> Callable[..., NodeProcess]:
     """Return a function that starts a node as its executable does."""
+
     def run(node: str, *arguments: str) -> NodeProcess:
         path = os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')])
-        env = os.environ | {'ROS_DOMAIN_ID': str(ros_domain), 'PYTHONPATH': path,
-                            'FISHEYE_SVP_ENGINE': 'numpy'}
+        env = os.environ | {
+            'ROS_DOMAIN_ID': str(ros_domain),
+            'PYTHONPATH': path,
+            'FISHEYE_SVP_ENGINE': 'numpy',
+        }
         return start_process([sys.executable, '-c', _CODE, node, *arguments], env)
 
     return run
@@ -83,19 +87,30 @@ def test_arguments_that_cannot_be_used_end_a_node_with_the_reason(
 
 @pytest.mark.parametrize('arguments', [['--nosuch'], ['-p', 'patience:=-1.0']])
 def test_a_process_that_cannot_use_its_arguments_ends_with_the_reason(
-    start, arguments: list[str]  # type: ignore[no-untyped-def]
+    start,
+    arguments: list[str],  # type: ignore[no-untyped-def]
 ) -> None:
     node = start('localizer', '--ros-args', *arguments)
     assert_refused(arguments, node.finish(), node.lines)
 
 
-@pytest.mark.parametrize(('words', 'status', 'said'), [
-    (['--help'], 0, 'localizer: parameters, as in --ros-args -p NAME:=VALUE'),
-    (['--version'], 0, f'localizer {__version__}'),
-    (['-p', 'lens:=fish180'], 2, "localizer: '-p' comes before --ros-args; ROS arguments follow"),
-])
+@pytest.mark.parametrize(
+    ('words', 'status', 'said'),
+    [
+        (['--help'], 0, 'localizer: parameters, as in --ros-args -p NAME:=VALUE'),
+        (['--version'], 0, f'localizer {__version__}'),
+        (
+            ['-p', 'lens:=fish180'],
+            2,
+            "localizer: '-p' comes before --ros-args; ROS arguments follow",
+        ),
+    ],
+)
 def test_an_executable_overlooks_no_argument(
-    words: list[str], status: int, said: str, monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+    status: int,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(sys, 'argv', ['localizer', *words])
@@ -105,7 +120,9 @@ def test_an_executable_overlooks_no_argument(
 
 
 def test_security_that_cannot_be_had_ends_a_node_with_the_reason(
-    start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch  # type: ignore[no-untyped-def]
+    start,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,  # type: ignore[no-untyped-def]
 ) -> None:
     (tmp_path / 'enclaves' / 'localizer').mkdir(parents=True)  # without a key
     for name, value in (('ENABLE', 'true'), ('STRATEGY', 'Enforce'), ('KEYSTORE', str(tmp_path))):
@@ -136,7 +153,9 @@ def test_ros_arguments_without_ros_args_are_refused(capsys: pytest.CaptureFixtur
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('after', [0.0, 0.4, 0.8, 1.2])
 def test_a_signal_while_a_node_starts_ends_it_quietly(
-    start, number: signal.Signals, after: float  # type: ignore[no-untyped-def]
+    start,
+    number: signal.Signals,
+    after: float,  # type: ignore[no-untyped-def]
 ) -> None:
     node = start('localizer', '--ros-args', '-p', 'lens:=fish214')
     node.wait_for('loading')
@@ -147,24 +166,41 @@ def test_a_signal_while_a_node_starts_ends_it_quietly(
 
 
 def test_hardly_anything_is_loaded_before_signals_end_a_node_quietly() -> None:
-    code = ('import sys; before = {*sys.modules}; import fisheye_svp_ros.nodes.executables; '
-            "print(*sorted(name for name in {*sys.modules} - before if 'fisheye' in name))")
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True,
-                          env=os.environ | {'PYTHONPATH': str(ROOT)})
+    code = (
+        'import sys; before = {*sys.modules}; import fisheye_svp_ros.nodes.executables; '
+        "print(*sorted(name for name in {*sys.modules} - before if 'fisheye' in name))"
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {'PYTHONPATH': str(ROOT)},
+    )
     assert done.stdout.split() == [
-        'fisheye_svp_ros', 'fisheye_svp_ros.nodes', 'fisheye_svp_ros.nodes.executables',
-        'fisheye_svp_ros.threads']
+        'fisheye_svp_ros',
+        'fisheye_svp_ros.nodes',
+        'fisheye_svp_ros.nodes.executables',
+        'fisheye_svp_ros.threads',
+    ]
 
 
 @pytest.mark.parametrize(('given', 'taken'), [({}, '1'), ({'OMP_NUM_THREADS': '3'}, '3')])
 def test_a_node_computes_on_one_core_unless_told_otherwise(
     given: dict[str, str], taken: str
 ) -> None:
-    code = ('import os, sys; import fisheye_svp_ros.nodes.executables; '
-            "assert 'numpy' not in sys.modules; print(os.environ['OMP_NUM_THREADS'])")
+    code = (
+        'import os, sys; import fisheye_svp_ros.nodes.executables; '
+        "assert 'numpy' not in sys.modules; print(os.environ['OMP_NUM_THREADS'])"
+    )
     env = {name: value for name, value in os.environ.items() if name != 'OMP_NUM_THREADS'}
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True,
-                          env=env | {'PYTHONPATH': str(ROOT)} | given)
+    done = subprocess.run(
+        [sys.executable, '-c', code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=env | {'PYTHONPATH': str(ROOT)} | given,
+    )
     assert done.stdout.strip() == taken
 
 
@@ -191,10 +227,14 @@ def handler_kept() -> Iterator[None]:
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_building_of_a_node_there_and_then(
-    ros_domain: int, number: signal.Signals, monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str], handler_kept: None
+    ros_domain: int,
+    number: signal.Signals,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    handler_kept: None,
 ) -> None:
     """What rclpy does on SIGTERM, to end the context, makes the rest of the start fail."""
+
     def signaled(*_: object, **__: object) -> None:
         os.kill(os.getpid(), number)
         went_on.append(True)
@@ -207,8 +247,10 @@ def test_a_signal_ends_the_building_of_a_node_there_and_then(
 
 
 def test_a_signal_before_there_is_a_node_or_that_c_code_dropped_ends_it(
-    ros_domain: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
-    handler_kept: None
+    ros_domain: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    handler_kept: None,
 ) -> None:
     def drop(*_: object, **__: object) -> None:
         signals._raises = False  # as C code does that drops what its callbacks raise

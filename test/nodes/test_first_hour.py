@@ -41,8 +41,10 @@ def rows_of_the_table() -> dict[str, str]:
     """Return what a node says, as a pattern, by symptom."""
     text = (ROOT / 'docs' / 'reference' / 'nodes.md').read_text(encoding='utf-8')
     table = text.partition('<!-- first hour -->')[2].partition('<!-- end -->')[0]
-    rows = [[cell.strip() for cell in line.strip('| ').split(' | ')]
-            for line in table.strip().splitlines()[2:]]
+    rows = [
+        [cell.strip() for cell in line.strip('| ').split(' | ')]
+        for line in table.strip().splitlines()[2:]
+    ]
     assert all(len(row) == 3 for row in rows)
     return {symptom: re.escape(told.strip('`')).replace('…', '.+') for symptom, told, _ in rows}
 
@@ -53,6 +55,7 @@ TRIED: dict[str, Callable[..., None]] = {}
 
 def tries(symptom: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Register what brings a symptom about."""
+
     def register(test: Callable[..., None]) -> Callable[..., None]:
         TRIED[symptom] = test
         return test
@@ -74,10 +77,14 @@ class Hour:
 
     def says(self, pattern: str, act: Callable[[], object] = lambda: None) -> None:
         """Assert that /diagnostics warns so while something is done again and again."""
+
         def told() -> bool:
             act()
-            return any(re.search(pattern, status.message) and status.level == status.WARN
-                       for report in self.reports for status in report.status)
+            return any(
+                re.search(pattern, status.message) and status.level == status.WARN
+                for report in self.reports
+                for status in report.status
+            )
 
         try:
             self.graph.until(told)
@@ -98,8 +105,9 @@ class Hour:
 
 
 @pytest.fixture
-def hour(graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str],
-         monkeypatch: pytest.MonkeyPatch) -> Hour:
+def hour(
+    graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Hour:
     monkeypatch.setattr('fisheye_svp_ros.nodes.base.LIMIT', 0.5)
     monkeypatch.setattr('fisheye_svp_ros.nodes.detector._MIN_FAILURES', 3)
     return Hour(graph, capfd)
@@ -108,7 +116,8 @@ def hour(graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str],
 def image_points(stamp: int = 7, ids: Any = None) -> Any:
     seen = simulate_scenario(Scenario(shift_scale=0.0)).observations
     return messages.image_points_message(
-        seen.landmark if ids is None else ids, seen.uv, stamp, 'camera')
+        seen.landmark if ids is None else ids, seen.uv, stamp, 'camera'
+    )
 
 
 def landmarks(stamp: int = 0) -> Any:
@@ -187,8 +196,10 @@ def stereo_stamps(hour: Hour, pattern: str) -> None:
     g = hour.begin(*SOLVING)
     g.start(StereoDepth)
     left, right = (g.tell(PointCloud2, f'{name}/image_points') for name in ('left', 'right'))
-    hour.says(pattern, lambda: (left.publish(image_points(1000 * MS)),
-                                right.publish(image_points(1001 * MS))))
+    hour.says(
+        pattern,
+        lambda: (left.publish(image_points(1000 * MS)), right.publish(image_points(1001 * MS))),
+    )
 
 
 @tries('All sets fail: landmarks and image points have other ids')
@@ -217,8 +228,13 @@ def not_calibrated(hour: Hour, pattern: str) -> None:
     told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
     driver = g.tell(CameraInfo, 'camera_info', SENSOR)
     told.publish(landmarks())
-    hour.says(pattern, lambda: (driver.publish(CameraInfo(width=640, height=480)),
-                                points.publish(image_points())))
+    hour.says(
+        pattern,
+        lambda: (
+            driver.publish(CameraInfo(width=640, height=480)),
+            points.publish(image_points()),
+        ),
+    )
 
 
 @tries('Some sets fail: landmarks are latched under the stamps of different sets')
@@ -238,8 +254,10 @@ def depth_images(hour: Hour, pattern: str) -> None:
     g.hear(PointCloud2, 'image_points')
     g.start(Detector)
     images = g.tell(Image, 'image', SENSOR)
-    hour.says(pattern, lambda: images.publish(
-        Image(height=1, width=1, encoding='32FC1', step=4, data=b'\0' * 4)))
+    hour.says(
+        pattern,
+        lambda: images.publish(Image(height=1, width=1, encoding='32FC1', step=4, data=b'\0' * 4)),
+    )
 
 
 @tries('No board is found: `board` describes another one')
@@ -253,8 +271,12 @@ def another_board(hour: Hour, pattern: str) -> None:
     hour.logs(pattern)
     assert set_parameter(node, 'board', BOARD).successful
     hour.reports.clear()
-    g.until(lambda: (images.publish(told), any(
-        m.status[0].message == 'all inputs usable' for m in hour.reports[1:]))[1])
+    g.until(
+        lambda: (
+            images.publish(told),
+            any(m.status[0].message == 'all inputs usable' for m in hour.reports[1:]),
+        )[1]
+    )
 
 
 @tries('Wrong poses: camera_info is for another image size')
@@ -263,8 +285,13 @@ def another_size(hour: Hour, pattern: str) -> None:
     g.hear(PointCloud2, 'image_points')
     g.start(Detector)
     images, driver = g.tell(Image, 'image', SENSOR), g.tell(CameraInfo, 'camera_info', SENSOR)
-    info = CameraInfo(width=848, height=400, distortion_model='equidistant', d=[0.0] * 4,
-                      k=[300.0, 0.0, 9.0, 0.0, 300.0, 9.0, 0.0, 0.0, 1.0])
+    info = CameraInfo(
+        width=848,
+        height=400,
+        distortion_model='equidistant',
+        d=[0.0] * 4,
+        k=[300.0, 0.0, 9.0, 0.0, 300.0, 9.0, 0.0, 0.0, 1.0],
+    )
     image = messages.image_message(np.zeros((400, 424), np.uint8), 7, 'camera')
     hour.says(pattern, lambda: (driver.publish(info), images.publish(image)))
 
@@ -310,11 +337,17 @@ def test_data_that_stop_are_missed_until_they_come_again(hour: Hour) -> None:
     g.start(Localizer)
     told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
     told.publish(landmarks())
-    for stopped in (r'no message on /image_points for \d+ s: probe is still connected',
-                    r'no message on /image_points for \d+ s: its publisher is gone'):
+    for stopped in (
+        r'no message on /image_points for \d+ s: probe is still connected',
+        r'no message on /image_points for \d+ s: its publisher is gone',
+    ):
         hour.reports.clear()
-        g.until(lambda: (points.publish(image_points()), any(
-            m.status[0].message == 'all inputs usable' for m in hour.reports))[1])
+        g.until(
+            lambda: (
+                points.publish(image_points()),
+                any(m.status[0].message == 'all inputs usable' for m in hour.reports),
+            )[1]
+        )
         if 'gone' in stopped:
             g.probe.destroy_publisher(points)
         hour.says(stopped)
@@ -325,15 +358,19 @@ def test_data_that_stop_are_missed_until_they_come_again(hour: Hour) -> None:
 
 
 def test_a_slow_publisher_is_not_missed_between_its_messages(
-    monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now = [0.0]
-    monkeypatch.setattr('fisheye_svp_ros.nodes.subscriptions.time',
-                        SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(
+        'fisheye_svp_ros.nodes.subscriptions.time', SimpleNamespace(monotonic=lambda: now[0])
+    )
     node = SimpleNamespace(resolve_topic_name=str)
     one = Input(node, PointCloud2, 'image_points', lambda _: None, SENSOR, latched=False)
-    monkeypatch.setattr(one, '_add_subscription', lambda kind, _: one._subscriptions.update(
-        {kind: SimpleNamespace()}))
+    monkeypatch.setattr(
+        one,
+        '_add_subscription',
+        lambda kind, _: one._subscriptions.update({kind: SimpleNamespace()}),
+    )
     one.subscribe()
     for time in (10.0, 20.0, 30.0):
         now[0] = time
@@ -352,8 +389,10 @@ def test_a_lens_that_is_named_needs_no_scenario(hour: Hour) -> None:
 
 def test_a_camera_listens_to_nothing(hour: Hour, tmp_path: Any) -> None:
     table = tmp_path / 'seen.csv'
-    table.write_text('frame,landmark,u,v,x,y,z\n' + ''.join(
-        f'0,{i},{10 * i},{5 * i},0,{i},1\n' for i in range(5)))
+    table.write_text(
+        'frame,landmark,u,v,x,y,z\n'
+        + ''.join(f'0,{i},{10 * i},{5 * i},0,{i},1\n' for i in range(5))
+    )
     g = hour.begin(f'observations:={table}')
     g.start(MeasuredCamera)
     g.until(lambda: hour.reports)
@@ -362,9 +401,7 @@ def test_a_camera_listens_to_nothing(hour: Hour, tmp_path: Any) -> None:
     assert hour.reports[-1].status[0].message == 'all inputs usable'
 
 
-def test_a_best_effort_publisher_is_heard_and_not_told_of_incompatible_qos(
-    hour: Hour
-) -> None:
+def test_a_best_effort_publisher_is_heard_and_not_told_of_incompatible_qos(hour: Hour) -> None:
     g = hour.begin(*SOLVING)
     results = g.hear(DiagnosticArray, 'localizer/result')
     g.start(Localizer)
@@ -384,8 +421,13 @@ def test_every_driver_is_heard_and_told_nothing(
     node = g.start(Detector)
     qos = QoSProfile(depth=1, reliability=reliability, durability=durability)
     driver = g.probe.create_publisher(CameraInfo, 'camera_info', qos)
-    info = CameraInfo(width=848, height=400, distortion_model='equidistant', d=[0.0] * 4,
-                      k=[300.0, 0.0, 9.0, 0.0, 300.0, 9.0, 0.0, 0.0, 1.0])
+    info = CameraInfo(
+        width=848,
+        height=400,
+        distortion_model='equidistant',
+        d=[0.0] * 4,
+        k=[300.0, 0.0, 9.0, 0.0, 300.0, 9.0, 0.0, 0.0, 1.0],
+    )
     count = node._inputs['camera_info'].count
     driver.publish(info)  # before anybody listens: who latches is heard nevertheless
     if durability == DurabilityPolicy.TRANSIENT_LOCAL:

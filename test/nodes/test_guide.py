@@ -58,8 +58,13 @@ def test_a_wanted_view_is_shown_and_taken(graph: Callable[..., Graph], tmp_path:
     saved = read_observations(output / 'observations.csv')
     assert len(saved.frames) == 1 and np.isfinite(saved.sigma).all()
     assert [p.name for p in (output / 'photographs').iterdir()] == ['000.png']
-    g.until(lambda: any(pair.key == 'guide: taken' and pair.value.startswith('1 photograph, e0')
-                        for m in diagnostics for pair in m.status[0].values))
+    g.until(
+        lambda: any(
+            pair.key == 'guide: taken' and pair.value.startswith('1 photograph, e0')
+            for m in diagnostics
+            for pair in m.status[0].values
+        )
+    )
 
 
 def test_an_image_that_the_lens_is_not_for_is_named(
@@ -70,18 +75,29 @@ def test_an_image_that_the_lens_is_not_for_is_named(
     node = g.start(Detector)
     images = g.tell(Image, 'image', SENSOR)
     blank = np.zeros((400, 424), np.uint8)
-    g.until(lambda: (images.publish(image_message(blank, 5, 'camera')),
-                     any('424x400 px, but lens' in m.status[0].message for m in diagnostics))[1])
+    g.until(
+        lambda: (
+            images.publish(image_message(blank, 5, 'camera')),
+            any('424x400 px, but lens' in m.status[0].message for m in diagnostics),
+        )[1]
+    )
     assert not set_parameter(node, 'board', 'chessboard:9x6:25mm').successful
 
 
-@pytest.mark.parametrize(('arguments', 'reason'), [
-    (('near:=0.5', 'far:=0.4'), 'near must be below far'),
-    (('detections:=true',), 'must be an aprilgrid|cannot be used with detections'),
-    ((), 'an empty, writable folder'), (('guide_output:=notes.txt/guided',), 'writable'),
-])
+@pytest.mark.parametrize(
+    ('arguments', 'reason'),
+    [
+        (('near:=0.5', 'far:=0.4'), 'near must be below far'),
+        (('detections:=true',), 'must be an aprilgrid|cannot be used with detections'),
+        ((), 'an empty, writable folder'),
+        (('guide_output:=notes.txt/guided',), 'writable'),
+    ],
+)
 def test_a_guide_that_cannot_work_is_refused(
-    graph: Callable[..., Graph], tmp_path: Path, arguments: tuple[str, ...], reason: str,
+    graph: Callable[..., Graph],
+    tmp_path: Path,
+    arguments: tuple[str, ...],
+    reason: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr('fisheye_svp_ros.nodes.detector._tag_array', lambda: DiagnosticArray)

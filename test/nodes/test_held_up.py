@@ -39,7 +39,8 @@ LANDMARKS = environment('whole', 2.0)
 def points_message(stamp: int, lens: Any = LENS) -> Any:
     image = project(lens, paper_pose().into_body(LANDMARKS.points))
     return messages.image_points_message(
-        LANDMARKS.ids[image.valid], image.uv[image.valid], stamp, 'camera')
+        LANDMARKS.ids[image.valid], image.uv[image.valid], stamp, 'camera'
+    )
 
 
 def many_landmarks(path: Path) -> Path:
@@ -47,22 +48,39 @@ def many_landmarks(path: Path) -> Path:
     near = np.random.default_rng(1).uniform(-0.1, 0.1, (2000, 3))
     behind = paper_pose().transform(near - [0, 0, 1])
     points = np.concatenate([LANDMARKS.points, behind])
-    path.write_text('landmark,x,y,z\n' + ''.join(
-        f'{number},{x},{y},{z}\n' for number, (x, y, z) in enumerate(points)))
+    path.write_text(
+        'landmark,x,y,z\n'
+        + ''.join(f'{number},{x},{y},{z}\n' for number, (x, y, z) in enumerate(points))
+    )
     return path
 
 
 def test_every_set_is_solved_though_the_solver_stood_still_for_a_while(
     graph: Callable[..., Graph], start_process: Callable[..., NodeProcess], tmp_path: Path
 ) -> None:
-    g = graph(f'environment:={many_landmarks(tmp_path / "many.csv")}', 'rate:=100.0',
-              'wait_for_subscribers:=1')
+    g = graph(
+        f'environment:={many_landmarks(tmp_path / "many.csv")}',
+        'rate:=100.0',
+        'wait_for_subscribers:=1',
+    )
     results = g.hear(DiagnosticArray, 'localizer/result')
     points = g.hear(PointCloud2, 'image_points')
     env = os.environ | {'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])}
-    solver = start_process([
-        sys.executable, '-m', 'fisheye_svp_ros.cli', 'run', 'localizer', '--ros-args',
-        '-p', 'backlog:=10000', '-p', 'wait_for_subscribers:=1'], env)
+    solver = start_process(
+        [
+            sys.executable,
+            '-m',
+            'fisheye_svp_ros.cli',
+            'run',
+            'localizer',
+            '--ros-args',
+            '-p',
+            'backlog:=10000',
+            '-p',
+            'wait_for_subscribers:=1',
+        ],
+        env,
+    )
     g.until(lambda: g.probe.count_publishers('localizer/result'))
     camera = g.start(SyntheticCamera)
     g.until(lambda: len(results) >= 20)
@@ -80,13 +98,15 @@ def test_every_set_is_solved_though_the_solver_stood_still_for_a_while(
 
 
 def test_each_set_has_its_camera_info_though_the_solver_was_busy(
-    graph: Callable[..., Graph]
+    graph: Callable[..., Graph],
 ) -> None:
     g = graph('lens:=camera_info')
     results = g.hear(DiagnosticArray, 'localizer/result')
     g.start(Localizer)
-    told, info = (g.tell(kind, topic, LATCHED_SETS) for kind, topic in (
-        (PointCloud2, 'landmarks'), (CameraInfo, 'camera_info')))
+    told, info = (
+        g.tell(kind, topic, LATCHED_SETS)
+        for kind, topic in ((PointCloud2, 'landmarks'), (CameraInfo, 'camera_info'))
+    )
     points = g.tell(PointCloud2, 'image_points', RELIABLE)
     told.publish(messages.landmarks_message(LANDMARKS, 0, 'world'))
     g.until(lambda: info.get_subscription_count() > 1 or not g.idle(0.1))
@@ -100,7 +120,7 @@ def test_each_set_has_its_camera_info_though_the_solver_was_busy(
 
 
 def test_who_comes_late_counts_no_set_for_the_landmarks_of_old_ones(
-    graph: Callable[..., Graph]
+    graph: Callable[..., Graph],
 ) -> None:
     g = graph('lens:=fish214', 'svp:=true')
     results = g.hear(DiagnosticArray, 'localizer/result')
@@ -125,9 +145,7 @@ def test_who_comes_late_counts_no_set_for_the_landmarks_of_old_ones(
     assert counts['landmarks: received'] == '55' and counts['landmarks: dropped'] == '0'
 
 
-def test_all_that_has_come_is_taken_in_before_a_set_is_solved(
-    graph: Callable[..., Graph]
-) -> None:
+def test_all_that_has_come_is_taken_in_before_a_set_is_solved(graph: Callable[..., Graph]) -> None:
     g = graph('lens:=fish214', 'svp:=true', 'backlog:=2')
     results = g.hear(DiagnosticArray, 'localizer/result')
     node = g.start(Localizer)
@@ -143,11 +161,15 @@ def test_all_that_has_come_is_taken_in_before_a_set_is_solved(
         g.executor.spin_once()
         counts = {**node.report()[0]}
     assert [counts[f'sets: {what}'] for what in ('taken', 'solved', 'dropped', 'waiting')] == [
-        8, 2, 5, 1]
+        8,
+        2,
+        5,
+        1,
+    ]
 
 
 def test_publishers_that_everybody_hears_cost_the_executor_nothing(
-    graph: Callable[..., Graph]
+    graph: Callable[..., Graph],
 ) -> None:
     node = graph('lens:=fish214', 'svp:=true').start(Localizer)
     entities = len(list(node.waitables))

@@ -38,7 +38,8 @@ def test_stamps_never_mix_and_come_in_the_order_of_arrival() -> None:
     for topic, stamp in (('l', 2), ('r', 1), ('l', 1), ('r', 3), ('r', 2)):
         sets.add(topic, stamp, f'{topic}{stamp}', 0.0)
     assert told(sets.pop_complete(0.0, 1.0)) == [
-        (2, {'l': 'l2', 'r': 'r2'}), (1, {'r': 'r1', 'l': 'l1'})
+        (2, {'l': 'l2', 'r': 'r2'}),
+        (1, {'r': 'r1', 'l': 'l1'}),
     ], 'a clock that is set back does not make the newest sets the oldest'
 
 
@@ -77,10 +78,12 @@ def test_a_set_between_two_items_is_given_both() -> None:
     sets.add('l', 14, 'a', 0.0)
     sets.add('l', 23, 'b', 0.0)
     assert told(sets.pop_complete(0.0, 1.0)) == [
-        (14, {'l': 'a', 't': NeighborPair('t10', 't20', 0.4)})]
+        (14, {'l': 'a', 't': NeighborPair('t10', 't20', 0.4)})
+    ]
     sets.add('t', 30, 't30', 0.1)
     assert told(sets.pop_complete(0.1, 1.0)) == [
-        (23, {'l': 'b', 't': NeighborPair('t20', 't30', 0.3)})]
+        (23, {'l': 'b', 't': NeighborPair('t20', 't30', 0.3)})
+    ]
 
 
 def test_items_too_far_apart_or_of_other_sets_are_not_given() -> None:
@@ -95,7 +98,10 @@ def test_items_too_far_apart_or_of_other_sets_are_not_given() -> None:
     for stamp in (10, 30):  # that of 20 is lost
         sets.add('t', stamp, f't{stamp}', 0.0)
     assert [(stamp, items.get('t')) for stamp, items in told(sets.pop_complete(2.0, 1.0))] == [
-        (10, 't10'), (20, None), (30, 't30')]
+        (10, 't10'),
+        (20, None),
+        (30, 't30'),
+    ]
 
 
 @pytest.mark.parametrize(('own', 'free'), [(10, 40), (40, 10)])
@@ -116,12 +122,13 @@ def test_items_of_a_recording_that_starts_over_are_not_mixed() -> None:
     assert told(sets.pop_complete(0.0, 1.0)) == []
     sets.add('t', 9, 't9', 0.0)
     assert told(sets.pop_complete(0.0, 1.0)) == [
-        (7, {'l': 'a', 't': NeighborPair('t5', 't9', 0.5)})]
+        (7, {'l': 'a', 't': NeighborPair('t5', 't9', 0.5)})
+    ]
 
 
 @pytest.mark.parametrize('order', [('l', 'r'), ('r', 'l')])
 def test_cameras_a_little_apart_are_paired_under_the_first_ones_stamp(
-    order: tuple[str, str]
+    order: tuple[str, str],
 ) -> None:
     stamps = {'l': 100, 'r': 102}
     for tolerance in (1, 2):
@@ -143,7 +150,9 @@ def test_each_is_paired_with_the_nearest() -> None:
     for topic, stamp in (('l', 100), ('l', 104), ('r', 103), ('r', 99)):
         sets.add(topic, stamp, f'{topic}{stamp}', 0.0)
     assert told(sets.pop_complete(0.0, 1.0)) == [
-        (100, {'l': 'l100', 'r': 'r99'}), (104, {'l': 'l104', 'r': 'r103'})]
+        (100, {'l': 'l100', 'r': 'r99'}),
+        (104, {'l': 'l104', 'r': 'r103'}),
+    ]
 
 
 def test_what_lacks_its_counterpart_is_given_up() -> None:

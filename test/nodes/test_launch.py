@@ -53,8 +53,9 @@ def launch(ros_domain: int) -> Iterator[Callable[..., NodeProcess]]:
     started: list[NodeProcess] = []
 
     def start(*words: str) -> NodeProcess:
-        started.append(NodeProcess(['ros2', 'launch', 'fisheye_svp_ros', *words],
-                                   dict(os.environ)))
+        started.append(
+            NodeProcess(['ros2', 'launch', 'fisheye_svp_ros', *words], dict(os.environ))
+        )
         return started[-1]
 
     yield start
@@ -100,9 +101,7 @@ def test_a_sweep_is_recorded_and_ends_by_itself(ros_domain: int, tmp_path: Path)
     assert all(error < 0.01 for error in columns['localizer.position_error_m'])
 
 
-def test_a_sweep_whose_recorder_dies_ends_with_the_reason(
-    ros_domain: int, tmp_path: Path
-) -> None:
+def test_a_sweep_whose_recorder_dies_ends_with_the_reason(ros_domain: int, tmp_path: Path) -> None:
     sweep, bag = tmp_path / 'sweep.yaml', tmp_path / 'bag'
     sweep.write_text(SWEEP)
     bag.mkdir()
@@ -115,11 +114,14 @@ def test_a_sweep_whose_recorder_dies_ends_with_the_reason(
     assert 'a recording cannot be written there' in text and 'ended with status 2' in text
 
 
-@pytest.mark.parametrize(('word', 'reason'), [
-    ('svp:=maybe', 'maybe'),
-    ('params:=nothere.yaml', "params: no file 'nothere.yaml'"),
-    ('localizer_params:=/', "localizer_params: no file '/'"),
-])
+@pytest.mark.parametrize(
+    ('word', 'reason'),
+    [
+        ('svp:=maybe', 'maybe'),
+        ('params:=nothere.yaml', "params: no file 'nothere.yaml'"),
+        ('localizer_params:=/', "localizer_params: no file '/'"),
+    ],
+)
 def test_an_argument_that_cannot_be_used_is_refused(
     launch: Callable[..., NodeProcess], word: str, reason: str
 ) -> None:
@@ -130,7 +132,7 @@ def test_an_argument_that_cannot_be_used_is_refused(
 
 
 def test_observations_without_a_measured_camera_are_refused(
-    launch: Callable[..., NodeProcess]
+    launch: Callable[..., NodeProcess],
 ) -> None:
     mono = launch('mono.launch.py', 'observations:=seen.csv')
     assert mono.finish() != 0
@@ -143,8 +145,13 @@ def test_observations_are_replayed(
     seen = simulate_scenario(Scenario(shift_scale=0.0)).observations
     write_observations(tmp_path / 'seen.csv', seen)
     results = graph.hear(DiagnosticArray, '/localizer/result')
-    launch('mono.launch.py', 'camera:=measured_camera', f'observations:={tmp_path}/seen.csv',
-           'lens:=fish214', 'svp:=true')
+    launch(
+        'mono.launch.py',
+        'camera:=measured_camera',
+        f'observations:={tmp_path}/seen.csv',
+        'lens:=fish214',
+        'svp:=true',
+    )
     graph.until(lambda: any(read_key_values(m).get('rms_px') for m in results))
 
 
@@ -152,11 +159,18 @@ def test_an_argument_wins_over_what_files_say_of_the_node(
     launch: Callable[..., NodeProcess], tmp_path: Path
 ) -> None:
     params = tmp_path / 'mine.yaml'
-    params.write_text('/**: {ros__parameters: {lens: fish214}}\n'
-                      'localizer: {ros__parameters: {lens: fish214, svp: true}}\n'
-                      '/robot/localizer: {ros__parameters: {lens: fish214}}\n')
-    mono = launch('mono.launch.py', 'namespace:=robot', 'lens:=fish180', 'svp:=false',
-                  f'localizer_params:={params}')
+    params.write_text(
+        '/**: {ros__parameters: {lens: fish214}}\n'
+        'localizer: {ros__parameters: {lens: fish214, svp: true}}\n'
+        '/robot/localizer: {ros__parameters: {lens: fish214}}\n'
+    )
+    mono = launch(
+        'mono.launch.py',
+        'namespace:=robot',
+        'lens:=fish180',
+        'svp:=false',
+        f'localizer_params:={params}',
+    )
     mono.wait_for(r'solving with the lens fish180 with its viewpoint shift \(svp: false\)')
 
 
@@ -166,14 +180,24 @@ def test_a_camera_may_be_composed_in_one_process(
 ) -> None:
     params = tmp_path / 'mine.yaml'
     params.write_text('/**: {ros__parameters: {patience: 7}}')
-    camera = launch('camera.launch.py', 'namespace:=robot', 'image:=/camera/image_raw',
-                    'board:=chessboard:5x4:30mm', f'localizer_params:={params}',
-                    f'composed:={composed}', 'world_frame:=map')
-    graph.until(lambda: {('detector', '/robot'), ('localizer', '/robot'),
-                         ('model_critic', '/robot')} <= {
-        *graph.probe.get_node_names_and_namespaces()})
-    graph.until(lambda: len(graph.probe.get_subscriptions_info_by_topic(
-        '/camera/image_raw/compressed')))
+    camera = launch(
+        'camera.launch.py',
+        'namespace:=robot',
+        'image:=/camera/image_raw',
+        'board:=chessboard:5x4:30mm',
+        f'localizer_params:={params}',
+        f'composed:={composed}',
+        'world_frame:=map',
+    )
+    graph.until(
+        lambda: (
+            {('detector', '/robot'), ('localizer', '/robot'), ('model_critic', '/robot')}
+            <= {*graph.probe.get_node_names_and_namespaces()}
+        )
+    )
+    graph.until(
+        lambda: len(graph.probe.get_subscriptions_info_by_topic('/camera/image_raw/compressed'))
+    )
     said = '\n'.join(camera.lines)
     for _ in range(3):
         camera.wait_for('listening to ')
@@ -205,7 +229,8 @@ def test_everything_goes_below_a_namespace(graph: Graph) -> None:
     results = graph.hear(DiagnosticArray, '/robot/mono/localizer/result')
     launch = NodeProcess(
         ['ros2', 'launch', 'fisheye_svp_ros', 'whole.launch.py', 'namespace:=robot'],
-        dict(os.environ))
+        dict(os.environ),
+    )
     try:
         graph.until(lambda: results)
         launch.finish(signal.SIGINT)
@@ -218,9 +243,7 @@ def test_everything_goes_below_a_namespace(graph: Graph) -> None:
 def test_a_launch_file_starts_nodes_that_give_results_and_end_cleanly(
     name: str, graph: Graph
 ) -> None:
-    results = {
-        node: graph.hear(DiagnosticArray, f'{node}/result') for node in FILES[name]
-    }
+    results = {node: graph.hear(DiagnosticArray, f'{node}/result') for node in FILES[name]}
     launch = NodeProcess(
         ['ros2', 'launch', 'fisheye_svp_ros', name, 'lens:=fish180', 'svp:=false'],
         dict(os.environ),
@@ -248,19 +271,25 @@ def test_arguments_reach_the_nodes_and_frames_resolve(
     from rclpy.time import Time
 
     params = tmp_path / 'mine.yaml'
-    params.write_text('/**: {ros__parameters: {radius: 0.5, world_frame: map, svp: false, '
-                      'publish_tf: true}}')
+    params.write_text(
+        '/**: {ros__parameters: {radius: 0.5, world_frame: map, svp: false, publish_tf: true}}'
+    )
     buffer = tf2.Buffer()
     tf2.TransformListener(buffer, graph.probe)
     scenarios = graph.hear(DiagnosticArray, '/robot/scenario')
-    mono = launch('mono.launch.py', 'namespace:=robot', f'params:={params}',
-                  'log_level:=debug', 'respawn:=True')
+    mono = launch(
+        'mono.launch.py',
+        'namespace:=robot',
+        f'params:={params}',
+        'log_level:=debug',
+        'respawn:=True',
+    )
     pid = int(mono.wait_for(r'\[localizer-\d\]: process started with pid \[(\d+)\]')[1])
     for child in ('robot_camera_optical_frame', 'robot_camera_optical_frame_true'):
         graph.until(lambda child=child: buffer.can_transform('map', child, Time()))
     between = buffer.lookup_transform(
-        'robot_camera_optical_frame_true', 'robot_camera_optical_frame',
-        Time()).transform.translation
+        'robot_camera_optical_frame_true', 'robot_camera_optical_frame', Time()
+    ).transform.translation
     assert max(abs(between.x), abs(between.y), abs(between.z)) < 1e-6
     assert read_key_values(scenarios[0])['radius'] == '0.5'
     os.kill(pid, signal.SIGKILL)
@@ -274,11 +303,23 @@ def test_arguments_reach_the_nodes_and_frames_resolve(
 def test_frames_are_launch_arguments(graph: Graph, launch: Callable[..., NodeProcess]) -> None:
     kind = pytest.importorskip('tf2_msgs.msg').TFMessage
     heard = graph.hear(kind, '/tf')
-    launch('mono.launch.py', 'namespace:=front', 'publish_tf:=true', 'world_frame:=map',
-           'camera_frame:=eye')
-    graph.until(lambda: {(one.header.frame_id, one.child_frame_id)
-                         for message in heard for one in message.transforms}
-                == {('map', 'eye'), ('map', 'eye_true')})
+    launch(
+        'mono.launch.py',
+        'namespace:=front',
+        'publish_tf:=true',
+        'world_frame:=map',
+        'camera_frame:=eye',
+    )
+    graph.until(
+        lambda: (
+            {
+                (one.header.frame_id, one.child_frame_id)
+                for message in heard
+                for one in message.transforms
+            }
+            == {('map', 'eye'), ('map', 'eye_true')}
+        )
+    )
 
 
 def test_a_sweep_that_cannot_be_used_starts_nothing(
@@ -293,9 +334,7 @@ def test_a_sweep_that_cannot_be_used_starts_nothing(
     assert not (tmp_path / 'bag').exists()
 
 
-def test_a_rig_and_its_points_resolve(
-    graph: Graph, launch: Callable[..., NodeProcess]
-) -> None:
+def test_a_rig_and_its_points_resolve(graph: Graph, launch: Callable[..., NodeProcess]) -> None:
     tf2 = pytest.importorskip('tf2_ros')
     from rclpy.time import Time
 
@@ -305,7 +344,8 @@ def test_a_rig_and_its_points_resolve(
     for child in ('right_camera_optical_frame', 'left_camera_optical_frame'):
         graph.until(lambda child=child: buffer.can_transform('world', child, Time()))
     rig = buffer.lookup_transform(
-        'right_camera_optical_frame', 'left_camera_optical_frame', Time())
+        'right_camera_optical_frame', 'left_camera_optical_frame', Time()
+    )
     assert rig.transform.translation.x == pytest.approx(-0.15, abs=1e-6)
 
 
@@ -320,9 +360,22 @@ def test_a_camera_is_localized_with_its_camera_info(
     results = graph.hear(DiagnosticArray, '/localizer/result')
     program = SHARE.parents[1] / 'lib' / 'fisheye_svp_ros' / 'synthetic_camera'
     camera = NodeProcess(
-        [str(program), '--ros-args', '-p', 'rate:=2.0',
-         '-p', f'photograph:={BOARD}', '-p', f'lens:={lens}', '-p', f'poses:={listed}',
-         '-r', '__ns:=/camera'], dict(os.environ))
+        [
+            str(program),
+            '--ros-args',
+            '-p',
+            'rate:=2.0',
+            '-p',
+            f'photograph:={BOARD}',
+            '-p',
+            f'lens:={lens}',
+            '-p',
+            f'poses:={listed}',
+            '-r',
+            '__ns:=/camera',
+        ],
+        dict(os.environ),
+    )
     patient = tmp_path / 'patient.yaml'  # a busy machine takes its time
     patient.write_text('detector: {ros__parameters: {longest_search: 60.0}}')
     launch('camera.launch.py', 'image:=/camera/image', f'board:={BOARD}', f'params:={patient}')

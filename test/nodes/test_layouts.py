@@ -20,8 +20,10 @@ from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 
-RVIZ = {'MarkerArray': 'visualization_msgs/msg/MarkerArray',
-        'PoseWithCovariance': 'geometry_msgs/msg/PoseWithCovarianceStamped'}
+RVIZ = {
+    'MarkerArray': 'visualization_msgs/msg/MarkerArray',
+    'PoseWithCovariance': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+}
 # A message path of Foxglove: the value of a key of the only status
 PATH = re.compile(r'(/[\w/]+)\.status\[0\]\.values\[:\]\{key=="(\w+)"\}\.value')
 
@@ -30,9 +32,11 @@ PATH = re.compile(r'(/[\w/]+)\.status\[0\]\.values\[:\]\{key=="(\w+)"\}\.value')
 def layouts() -> tuple[Any, Any, Any]:
     """Return the layouts of RViz, Foxglove and PlotJuggler."""
     folder = ROOT / 'config' / 'layouts'
-    return (yaml.safe_load((folder / 'fisheye_svp.rviz').read_text())['Visualization Manager'],
-            json.loads((folder / 'foxglove.json').read_text()),
-            ElementTree.parse(folder / 'plotjuggler.xml').getroot())
+    return (
+        yaml.safe_load((folder / 'fisheye_svp.rviz').read_text())['Visualization Manager'],
+        json.loads((folder / 'foxglove.json').read_text()),
+        ElementTree.parse(folder / 'plotjuggler.xml').getroot(),
+    )
 
 
 @pytest.fixture
@@ -44,27 +48,36 @@ def graph(ros_domain: int) -> Iterator[Graph]:
 
 def series(topic: str, message: Any) -> dict[str, float]:
     """Return what PlotJuggler makes of a DiagnosticArray: TOPIC/NAME OF STATUS/KEY."""
-    return {f'{topic}/{status.name}/{pair.key}': float(pair.value)
-            for status in message.status for pair in status.values}
+    return {
+        f'{topic}/{status.name}/{pair.key}': float(pair.value)
+        for status in message.status
+        for pair in status.values
+    }
 
 
-def test_layouts_show_what_the_nodes_publish(
-    layouts: tuple[Any, Any, Any], graph: Graph
-) -> None:
+def test_layouts_show_what_the_nodes_publish(layouts: tuple[Any, Any, Any], graph: Graph) -> None:
     rviz, foxglove, juggler = layouts
     panels = foxglove['configById']
-    plotted = [path for name, panel in panels.items() if name.startswith('Plot!')
-               for path in panel['paths']]
-    wanted = {display['Topic']['Value']: RVIZ[display['Class'].rpartition('/')[2]]
-              for display in rviz['Displays'] if 'Topic' in display}
+    plotted = [
+        path
+        for name, panel in panels.items()
+        if name.startswith('Plot!')
+        for path in panel['paths']
+    ]
+    wanted = {
+        display['Topic']['Value']: RVIZ[display['Class'].rpartition('/')[2]]
+        for display in rviz['Displays']
+        if 'Topic' in display
+    }
     assert set(panels['3D!scene']['topics']) <= set(wanted)
     wanted[panels['RawMessages!scenario']['topicPath']] = 'diagnostic_msgs/msg/DiagnosticArray'
     results = graph.hear(DiagnosticArray, '/localizer/result')
     points = graph.hear(DiagnosticArray, '/scenario')
     for node in (Localizer, StereoDepth, SyntheticCamera):
         graph.start(node)
-    graph.until(lambda: results and set(wanted) <= set(
-        dict(graph.probe.get_topic_names_and_types())))
+    graph.until(
+        lambda: results and set(wanted) <= set(dict(graph.probe.get_topic_names_and_types()))
+    )
     types = dict(graph.probe.get_topic_names_and_types())
     assert {topic: types[topic] for topic in wanted} == {t: [k] for t, k in wanted.items()}
     # Every metric of a set under its stamp, on one topic that both programs draw.
@@ -81,12 +94,14 @@ def test_layouts_show_what_the_nodes_publish(
 def test_layouts_are_built_as_the_programs_read_them(layouts: tuple[Any, Any, Any]) -> None:
     rviz, foxglove, juggler = layouts
     assert {display['Class'] for display in rviz['Displays']} == {
-        f'rviz_default_plugins/{name}' for name in ('Grid', 'TF', *RVIZ)}
+        f'rviz_default_plugins/{name}' for name in ('Grid', 'TF', *RVIZ)
+    }
     for display in rviz['Displays']:
         latched = display['Class'].endswith('MarkerArray')
         if 'Topic' in display:
             assert display['Topic']['Durability Policy'] == (
-                'Transient Local' if latched else 'Volatile')
+                'Transient Local' if latched else 'Volatile'
+            )
     # Foxglove: a binary tree whose leaves are the panels, each once.
     leaves, nodes = [], [foxglove['layout']]
     while nodes:

@@ -71,8 +71,16 @@ def test_a_lens_that_cannot_be_loaded_leaves_it_unconfigured(
 def test_what_is_said_of_topics_is_understood_once_they_are_there(
     ros_domain: int, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    graph = Graph('-p', 'lifecycle:=true', '-p', 'lens:=fish180', '-p', 'nosuch:=1',
-                  '-p', 'qos_overrides./image_points.subscription.depth:=7')
+    graph = Graph(
+        '-p',
+        'lifecycle:=true',
+        '-p',
+        'lens:=fish180',
+        '-p',
+        'nosuch:=1',
+        '-p',
+        'qos_overrides./image_points.subscription.depth:=7',
+    )
     try:
         node = graph.start(Localizer)
         node.trigger_configure()

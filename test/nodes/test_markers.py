@@ -24,15 +24,29 @@ from fisheye_svp_ros.scene.rigs import rig
 _PIXEL = 0.08 / 1536  # m, on the base of a camera
 
 
-@pytest.mark.parametrize(('words', 'frame'), [
-    ((), 'world'),
-    (('-r', 'stereo_depth:left/true_pose:=nowhere'), 'left_camera_optical_frame'),
-])
+@pytest.mark.parametrize(
+    ('words', 'frame'),
+    [
+        ((), 'world'),
+        (('-r', 'stereo_depth:left/true_pose:=nowhere'), 'left_camera_optical_frame'),
+    ],
+)
 def test_epipolar_curves_run_through_the_image_points(
     ros_domain: int, words: tuple[str, ...], frame: str
 ) -> None:
-    g = Graph('-p', 'svp:=false', '-p', 'style:=vergent', '-p', 'rate:=20.0',
-              '-p', 'patience:=0.2', '-p', 'rig:=topic', *words)
+    g = Graph(
+        '-p',
+        'svp:=false',
+        '-p',
+        'style:=vergent',
+        '-p',
+        'rate:=20.0',
+        '-p',
+        'patience:=0.2',
+        '-p',
+        'rig:=topic',
+        *words,
+    )
     markers = g.hear(MarkerArray, 'stereo_depth/markers', LATCHED)
     g.start(StereoDepth)
     known = g.tell(TransformStamped, 'rig', LATCHED)
@@ -40,8 +54,10 @@ def test_epipolar_curves_run_through_the_image_points(
     g.start(SyntheticCamera)
     g.until(lambda: markers)
     g.close()
-    shown = {marker.ns: np.array([[p.x, p.y, p.z] for p in marker.points])
-             for marker in markers[0].markers}
+    shown = {
+        marker.ns: np.array([[p.x, p.y, p.z] for p in marker.points])
+        for marker in markers[0].markers
+    }
     assert list(shown) == ['camera left', 'epipolar curves', 'image points', 'measured points']
     distance = np.linalg.norm(shown['measured points'], axis=-1)
     assert len(distance) == 33 and (frame != 'world' or distance == pytest.approx(2.0))
@@ -63,8 +79,9 @@ def test_a_camera_opens_along_its_viewing_axis() -> None:
     np.testing.assert_allclose(edges[:, 0, 0], 0.0, atol=1e-12)  # the tip
     corners = edges[:, 0, 1]
     np.testing.assert_allclose(corners[:, 2], 0.1)  # ahead
-    np.testing.assert_allclose(corners[:, :2], 0.04 * np.array(
-        [[-1, -1], [1, -1], [1, 1], [-1, 1]]))
+    np.testing.assert_allclose(
+        corners[:, :2], 0.04 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    )
     np.testing.assert_allclose(edges[:, 1], np.stack([corners, np.roll(corners, -1, 0)], 1))
 
 
@@ -83,14 +100,29 @@ def test_rays_lead_from_landmarks_to_their_viewpoints_on_the_axis() -> None:
 
 def test_the_left_image_is_drawn_by_the_left_lens() -> None:
     left, right = (
-        ForwardModel(Lens(name, width, width * 3 // 4, width / 3, width / 3, width / 2,
-                          width * 3 / 8, Equidistant(), 1.5))
-        for name, width in (('left', 1024), ('right', 640)))
+        ForwardModel(
+            Lens(
+                name,
+                width,
+                width * 3 // 4,
+                width / 3,
+                width / 3,
+                width / 2,
+                width * 3 / 8,
+                Equidistant(),
+                1.5,
+            )
+        )
+        for name, width in (('left', 1024), ('right', 640))
+    )
     points, place = np.array([[0.4, 0.2, 1.0], [-0.5, 0.1, 1.2]]), rig('parallel')
-    uv = [model.project(seen[None]).uv[0] for model, seen in (
-        (left, place.into_body(points)), (right, points))]
-    shown = {one.name: one.points for one in _shapes(
-        (left, right), place, identity(), *uv, points)}['image points']
+    uv = [
+        model.project(seen[None]).uv[0]
+        for model, seen in ((left, place.into_body(points)), (right, points))
+    ]
+    shown = {
+        one.name: one.points for one in _shapes((left, right), place, identity(), *uv, points)
+    }['image points']
     np.testing.assert_allclose(shown[:, 2], 0.1)
     base = (uv[0] - np.array([511.5, 383.5])) * 0.08 / 1024
     np.testing.assert_allclose(shown[:, :2], base, atol=1e-9)

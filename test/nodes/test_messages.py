@@ -35,7 +35,9 @@ def test_image_points_survive_bit_by_bit() -> None:
     message = image_points()
     assert [f.name for f in message.fields] == ['landmark', 'u', 'v']
     assert [f.datatype for f in message.fields] == [
-        PointField.UINT32, PointField.FLOAT64, PointField.FLOAT64
+        PointField.UINT32,
+        PointField.FLOAT64,
+        PointField.FLOAT64,
     ]
     back = decoding.read_image_points(message)
     assert back.landmark.tolist() == [7, 4_294_967_295, 0]
@@ -54,9 +56,7 @@ def test_residuals_have_the_fields_of_the_design() -> None:
     message = messages.cloud_message(
         structured_array(RESIDUALS, np.array([3]), *np.arange(6.0)[:, None]), STAMP, 'camera'
     )
-    assert [f.name for f in message.fields] == [
-        'landmark', 'u', 'v', 'du', 'dv', 'theta', 'range'
-    ]
+    assert [f.name for f in message.fields] == ['landmark', 'u', 'v', 'du', 'dv', 'theta', 'range']
     assert unpack(message, RESIDUALS, 'residuals').tolist() == [(3, 0, 1, 2, 3, 4, 5)]
 
 
@@ -65,8 +65,12 @@ def test_other_field_order_width_and_endianness_are_read() -> None:
     message = PointCloud2(height=1, width=1, is_bigendian=True, point_step=18, row_step=18)
     message.fields = [
         PointField(name=name, offset=offset, datatype=kind, count=1)
-        for name, offset, kind in (('v', 0, 7), ('intensity', 4, 4), ('u', 6, 7),
-                                   ('landmark', 10, 5))
+        for name, offset, kind in (
+            ('v', 0, 7),
+            ('intensity', 4, 4),
+            ('u', 6, 7),
+            ('landmark', 10, 5),
+        )
     ]
     message.data = array('B', raw.tobytes())
     back = decoding.read_image_points(message)
@@ -151,21 +155,24 @@ def landmark_twice(_: Any) -> Any:
     return messages.image_points_message(np.array([5, 5]), np.ones((2, 2)), STAMP, '')
 
 
-@pytest.mark.parametrize(('spoil', 'reason'), [
-    (without_field, "field 'v' is missing; needed are landmark, u, v"),
-    (wrong_kind, "field 'u' is uint32; a floating-point number is needed"),
-    (float_landmark, "field 'landmark' is float32; a whole number is needed"),
-    (unknown_datatype, "field 'u' has an impossible type"),
-    (field_past_the_end, "field 'v' has an impossible type, count or offset"),
-    (several_values, "field 'v' has an impossible type, count or offset"),
-    (field_twice, "field 'u' has an impossible type"),
-    (too_few_bytes, '59 bytes of data do not hold 3 points of 20 bytes'),
-    (too_many_points, '60 bytes of data do not hold 4000000000 points'),
-    (no_step, 'impossible type, count or offset'),
-    (with_u(math.nan), "field 'u' of point 0 is nan; leave out points without a value"),
-    (with_u(math.inf), "field 'u' of point 0 is inf"),
-    (landmark_twice, 'landmark 5 is listed twice'),
-])
+@pytest.mark.parametrize(
+    ('spoil', 'reason'),
+    [
+        (without_field, "field 'v' is missing; needed are landmark, u, v"),
+        (wrong_kind, "field 'u' is uint32; a floating-point number is needed"),
+        (float_landmark, "field 'landmark' is float32; a whole number is needed"),
+        (unknown_datatype, "field 'u' has an impossible type"),
+        (field_past_the_end, "field 'v' has an impossible type, count or offset"),
+        (several_values, "field 'v' has an impossible type, count or offset"),
+        (field_twice, "field 'u' has an impossible type"),
+        (too_few_bytes, '59 bytes of data do not hold 3 points of 20 bytes'),
+        (too_many_points, '60 bytes of data do not hold 4000000000 points'),
+        (no_step, 'impossible type, count or offset'),
+        (with_u(math.nan), "field 'u' of point 0 is nan; leave out points without a value"),
+        (with_u(math.inf), "field 'u' of point 0 is inf"),
+        (landmark_twice, 'landmark 5 is listed twice'),
+    ],
+)
 def test_image_points_that_cannot_be_used(spoil: Any, reason: str) -> None:
     with pytest.raises(ObservationError, match=r'^left/image_points: ') as caught:
         decoding.read_image_points(spoil(image_points()), 'left/image_points')
@@ -197,11 +204,14 @@ def test_poses_and_transforms_survive() -> None:
     assert np.abs(decoding.read_transform(message).difference(POSE)).max() < 1e-15
 
 
-@pytest.mark.parametrize(('field', 'value', 'reason'), [
-    ('position.x', math.nan, 'not a finite number'),
-    ('orientation.w', math.inf, 'not a finite number'),
-    ('orientation.w', 2.0, 'not a unit quaternion'),
-])
+@pytest.mark.parametrize(
+    ('field', 'value', 'reason'),
+    [
+        ('position.x', math.nan, 'not a finite number'),
+        ('orientation.w', math.inf, 'not a finite number'),
+        ('orientation.w', 2.0, 'not a unit quaternion'),
+    ],
+)
 def test_poses_that_cannot_be_used(field: str, value: float, reason: str) -> None:
     message = messages.pose_message(POSE, STAMP, 'world')
     part, axis = field.split('.')
@@ -255,7 +265,7 @@ def test_a_kannala_brandt_lens_is_its_own_equivalent_without_the_shift() -> None
 
 def test_markers_keep_every_point() -> None:
     shape = messages.Segments('rays', np.eye(3)[[0, 1]], (1.0, 0.5, 0.0, 1.0), 0.01)
-    marker, = messages.markers_message([shape], STAMP, 'world').markers
+    (marker,) = messages.markers_message([shape], STAMP, 'world').markers
     assert marker.type == marker.LINE_LIST and marker.ns == 'rays'
     assert [(p.x, p.y, p.z) for p in marker.points] == [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)]
 

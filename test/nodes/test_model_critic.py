@@ -69,10 +69,17 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def graph(ros_domain: int, scene: Path) -> Iterator[Callable[..., Graph]]:
     """Return a function that starts a graph with a camera's scene and further parameters."""
     graphs: list[Graph] = []
-    fixed = (f'environment:={scene}/landmarks.csv', f'poses_file:={scene}/poses.csv',
-             'noise_px:=0.05', 'rate:=200.0', 'synthetic_camera:wait_for_subscribers:=1',
-             f'model_critic:lens:={scene}/given.yaml', f'min_frames:={FRAMES}',
-             'every_frames:=16', 'max_frames:=32')
+    fixed = (
+        f'environment:={scene}/landmarks.csv',
+        f'poses_file:={scene}/poses.csv',
+        'noise_px:=0.05',
+        'rate:=200.0',
+        'synthetic_camera:wait_for_subscribers:=1',
+        f'model_critic:lens:={scene}/given.yaml',
+        f'min_frames:={FRAMES}',
+        'every_frames:=16',
+        'max_frames:=32',
+    )
 
     def start(*parameters: str) -> Graph:
         graphs.append(Graph(*(word for p in (*fixed, *parameters) for word in ('-p', p))))
@@ -103,8 +110,11 @@ def test_the_verdict_is_published(graph: Callable[..., Graph], scene: Path) -> N
     assert e0 == pytest.approx(0.003, abs=5 * error) and 0 < error < 0.0003
     assert float(first['extended_heldout_rms_px']) < float(first['base_heldout_rms_px'])
     assert gains[0].data == float(first['gain'])
-    status, = g.until(lambda: [
-        m.status[0] for m in diagnostics if m.status[0].name == '/model_critic: verdict'][:1])
+    (status,) = g.until(
+        lambda: [m.status[0] for m in diagnostics if m.status[0].name == '/model_critic: verdict'][
+            :1
+        ]
+    )
     assert status.level == status.WARN
     assert 'viewpoint_shift (e0 = ' in status.message and 'mm' in status.message
 
@@ -201,7 +211,10 @@ def test_a_verdict_is_logged_where_it_is_another_one(monkeypatch: pytest.MonkeyP
         found = SimpleNamespace(decision={'lens': SimpleNamespace(say=say)})
         ModelCritic._finish(critic, Mock(**{'future.result.return_value': found}))
     assert critic.get_logger().info.call_args_list == [
-        call('keep'), call('recalibrate'), call('keep')]
+        call('keep'),
+        call('recalibrate'),
+        call('keep'),
+    ]
 
 
 def test_work_in_the_background_raises_where_it_is_asked_for() -> None:
@@ -214,8 +227,12 @@ def test_work_in_the_background_raises_where_it_is_asked_for() -> None:
 
 
 def test_two_runs_are_drawn_into_one_picture(tmp_path: Path) -> None:
-    columns = {'namespace': ['/', '/'], 'stamp_ns': [0, 10**9],
-               'before.axis_error_rad': [1.0, 2.0], 'depth.rms_px': [1.0, 1.0]}
+    columns = {
+        'namespace': ['/', '/'],
+        'stamp_ns': [0, 10**9],
+        'before.axis_error_rad': [1.0, 2.0],
+        'depth.rms_px': [1.0, 1.0],
+    }
     path = tmp_path / 'runs.png'
     assert draw_runs(columns, path) == [] and not path.exists()
     assert draw_runs({**columns, 'after.axis_error_rad': [0.5, None]}, path) == [path]
@@ -227,23 +244,47 @@ def test_from_a_recording_with_a_hidden_effect_to_a_better_localizer(
     scene: Path, tmp_path: Path, ros_domain: int, caller: Caller
 ) -> None:
     bag, errors, extended = (tmp_path / name for name in ('bag', 'errors', 'extended.yaml'))
-    replay = ['run', 'measured_camera', '--ros-args', *values(
-        observations=bag, repeat='false', rate=100.0)]
+    replay = [
+        'run',
+        'measured_camera',
+        '--ros-args',
+        *values(observations=bag, repeat='false', rate=100.0),
+    ]
 
     def ask() -> Any:
         return caller.call('std_srvs/srv/Trigger', '/model_critic/write_extended_lens')
 
     with Processes(tmp_path / 'logs') as processes:
         processes.start('recorder', ['record', '-o', str(bag)])
-        processes.start('camera', ['run', 'synthetic_camera', '--ros-args', *values(
-            lens=scene / 'hidden.yaml', environment=scene / 'landmarks.csv',
-            poses_file=scene / 'poses.csv', noise_px=0.05, rate=100.0, repeat='false',
-            wait_for_subscribers=1)])
+        processes.start(
+            'camera',
+            [
+                'run',
+                'synthetic_camera',
+                '--ros-args',
+                *values(
+                    lens=scene / 'hidden.yaml',
+                    environment=scene / 'landmarks.csv',
+                    poses_file=scene / 'poses.csv',
+                    noise_px=0.05,
+                    rate=100.0,
+                    repeat='false',
+                    wait_for_subscribers=1,
+                ),
+            ],
+        )
         processes.wait(['camera'], TIMEOUT)
         processes.stop('recorder')
 
-        processes.start('critic', ['run', 'model_critic', '--ros-args', *values(
-            lens=scene / 'given.yaml', min_frames=FRAMES, output=extended)])
+        processes.start(
+            'critic',
+            [
+                'run',
+                'model_critic',
+                '--ros-args',
+                *values(lens=scene / 'given.yaml', min_frames=FRAMES, output=extended),
+            ],
+        )
         answer = ask()
         assert not answer.success and answer.message == f'no diagnosis yet: 0 of {FRAMES} frames'
         processes.start('replay', [*replay, *values(wait_for_subscribers=1)])
@@ -254,12 +295,28 @@ def test_from_a_recording_with_a_hidden_effect_to_a_better_localizer(
 
         processes.start('recorder', ['record', '-o', str(errors)])
         for name, lens in (('before', scene / 'given.yaml'), ('after', extended)):
-            processes.start(name, [
-                'run', 'localizer', '--ros-args', '-r', f'__node:={name}',
-                *values(lens=lens, wait_for_subscribers=2)])
-            processes.start('replay', [*replay, *values(
-                true_poses=scene / 'poses.csv', lock_step=f'{name}/result',
-                wait_for_subscribers=2)])
+            processes.start(
+                name,
+                [
+                    'run',
+                    'localizer',
+                    '--ros-args',
+                    '-r',
+                    f'__node:={name}',
+                    *values(lens=lens, wait_for_subscribers=2),
+                ],
+            )
+            processes.start(
+                'replay',
+                [
+                    *replay,
+                    *values(
+                        true_poses=scene / 'poses.csv',
+                        lock_step=f'{name}/result',
+                        wait_for_subscribers=2,
+                    ),
+                ],
+            )
             processes.wait(['replay'], TIMEOUT)
             processes.stop(name)
         processes.stop('recorder')

@@ -27,8 +27,11 @@ def node_class(name: str) -> Any:
     return getattr(module, ''.join(word.title() for word in name.split('_')))
 
 
-TABLES = {name: rows(node_class(name).SETTINGS) for name in NODES
-          if (Path(__file__).parents[2] / f'fisheye_svp_ros/nodes/{name}.py').exists()}
+TABLES = {
+    name: rows(node_class(name).SETTINGS)
+    for name in NODES
+    if (Path(__file__).parents[2] / f'fisheye_svp_ros/nodes/{name}.py').exists()
+}
 
 
 @pytest.fixture
@@ -86,25 +89,43 @@ def test_every_parameter_is_described_and_refuses_what_breaks_it(
         assert described.read_only == row.fixed
 
 
-@pytest.mark.parametrize(('name', 'parameter', 'value', 'reason'), [
-    ('synthetic_camera', 'lens', 'nothere', "'nothere' is neither a file"),
-    ('synthetic_camera', 'environment', 'cellar', "environment 'cellar' is unknown"),
-    ('synthetic_camera', 'environment', 'nothere.csv', 'start it with folder:=DIR'),
-    ('synthetic_camera', 'poses', [0.0] * 6, 'poses holds 6 numbers; seven a pose are needed'),
-    ('synthetic_camera', 'poses', [0.0] * 7, 'the quaternion of pose 0 has norm 0, not 1'),
-    ('synthetic_camera', 'poses', [math.nan] * 7, 'poses is nan; a finite number is needed'),
-    ('synthetic_camera', 'poses_file', 'nothere.csv', 'start it with folder:=DIR'),
-    ('measured_camera', 'observations', '', 'observations is empty; name the file to replay'),
-    ('measured_camera', 'observations', 'nothere.csv', 'start it with folder:=DIR'),
-    ('measured_camera', 'true_poses', 'nothere.csv', 'start it with folder:=DIR'),
-    ('measured_camera', 'lens', 'nothere', "'nothere' is neither a file"),
-    ('localizer', 'lens', 'nothere', "'nothere' is neither a file"),
-    ('stereo_calibrator', 'lens', 'nothere', "'nothere' is neither a file"),
-    ('stereo_depth', 'lens', 'nothere', "'nothere' is neither a file"),
-    ('stereo_depth', 'rig', 'fals', "rig is 'fals'; true, topic or the file of a rig is needed"),
-    ('rectifier', 'rig', 'x', "rig is 'x', but stereo is false; start the node with stereo:=true"),
-    ('detector', 'board_frame', '/board', "board_frame is '/board'; a frame id begins without a"),
-])
+@pytest.mark.parametrize(
+    ('name', 'parameter', 'value', 'reason'),
+    [
+        ('synthetic_camera', 'lens', 'nothere', "'nothere' is neither a file"),
+        ('synthetic_camera', 'environment', 'cellar', "environment 'cellar' is unknown"),
+        ('synthetic_camera', 'environment', 'nothere.csv', 'start it with folder:=DIR'),
+        ('synthetic_camera', 'poses', [0.0] * 6, 'poses holds 6 numbers; seven a pose are needed'),
+        ('synthetic_camera', 'poses', [0.0] * 7, 'the quaternion of pose 0 has norm 0, not 1'),
+        ('synthetic_camera', 'poses', [math.nan] * 7, 'poses is nan; a finite number is needed'),
+        ('synthetic_camera', 'poses_file', 'nothere.csv', 'start it with folder:=DIR'),
+        ('measured_camera', 'observations', '', 'observations is empty; name the file to replay'),
+        ('measured_camera', 'observations', 'nothere.csv', 'start it with folder:=DIR'),
+        ('measured_camera', 'true_poses', 'nothere.csv', 'start it with folder:=DIR'),
+        ('measured_camera', 'lens', 'nothere', "'nothere' is neither a file"),
+        ('localizer', 'lens', 'nothere', "'nothere' is neither a file"),
+        ('stereo_calibrator', 'lens', 'nothere', "'nothere' is neither a file"),
+        ('stereo_depth', 'lens', 'nothere', "'nothere' is neither a file"),
+        (
+            'stereo_depth',
+            'rig',
+            'fals',
+            "rig is 'fals'; true, topic or the file of a rig is needed",
+        ),
+        (
+            'rectifier',
+            'rig',
+            'x',
+            "rig is 'x', but stereo is false; start the node with stereo:=true",
+        ),
+        (
+            'detector',
+            'board_frame',
+            '/board',
+            "board_frame is '/board'; a frame id begins without a",
+        ),
+    ],
+)
 def test_a_value_that_cannot_be_used_is_refused_with_the_reason(
     name: str, parameter: str, value: Any, reason: str, start: Callable[..., Any]
 ) -> None:
@@ -124,9 +145,7 @@ def test_a_good_value_is_taken_into_use(start: Callable[..., Any]) -> None:
     assert node.settings.lens == 'fish180' and node.settings.svp == 'true'
 
 
-def test_a_whole_number_is_taken_for_a_floating_point_parameter(
-    start: Callable[..., Any]
-) -> None:
+def test_a_whole_number_is_taken_for_a_floating_point_parameter(start: Callable[..., Any]) -> None:
     node = start('synthetic_camera')
     for name, value in (('rate', 1), ('poses', [0, 0, 0, 1, 0, 0, 0])):
         assert set_parameter(node, name, value).successful, name
@@ -145,15 +164,29 @@ def test_a_parameter_of_ros_itself_starts_nothing_over(start: Callable[..., Any]
     assert camera._steps is not steps
 
 
-@pytest.mark.parametrize(('arguments', 'solves_svp', 'said'), [
-    ((), True, 'the lens that scenario names without its viewpoint shift (svp: auto)'),
-    (('lens:=fish180',), False, 'the lens fish180 with its viewpoint shift (svp: auto)'),
-    (('lens:=fish180', 'svp:=true'), True, 'lens fish180 without its viewpoint shift (svp: true)'),
-    (('lens:=fish180', "svp:='true'"), True, 'without its viewpoint shift (svp: true)'),
-    (('svp:=false',), False, 'the lens that scenario names with its viewpoint shift (svp: false)'),
-])
+@pytest.mark.parametrize(
+    ('arguments', 'solves_svp', 'said'),
+    [
+        ((), True, 'the lens that scenario names without its viewpoint shift (svp: auto)'),
+        (('lens:=fish180',), False, 'the lens fish180 with its viewpoint shift (svp: auto)'),
+        (
+            ('lens:=fish180', 'svp:=true'),
+            True,
+            'lens fish180 without its viewpoint shift (svp: true)',
+        ),
+        (('lens:=fish180', "svp:='true'"), True, 'without its viewpoint shift (svp: true)'),
+        (
+            ('svp:=false',),
+            False,
+            'the lens that scenario names with its viewpoint shift (svp: false)',
+        ),
+    ],
+)
 def test_a_node_says_which_lens_it_solves_with(
-    arguments: tuple[str, ...], solves_svp: bool, said: str, start: Callable[..., Any],
+    arguments: tuple[str, ...],
+    solves_svp: bool,
+    said: str,
+    start: Callable[..., Any],
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     node = start('localizer', *(word for one in arguments for word in ('-p', one)))
@@ -164,12 +197,27 @@ def test_a_node_says_which_lens_it_solves_with(
     assert said in ' '.join(capfd.readouterr().err.split())
 
 
-@pytest.mark.parametrize(('name', 'argument', 'reason'), [
-    ('localizer', 'camera_frame:=/a', "camera_frame is '/a'; a frame id begins without a slash"),
-    ('localizer', 'camera_frame:=a b', "camera_frame is 'a b'; a frame id begins without a slash"),
-    ('measured_camera', 'world_frame:=/map', "world_frame is '/map'; a frame id begins without"),
-    ('model_critic', 'output:=/tmp', "output is '/tmp', a folder; name a file"),
-])
+@pytest.mark.parametrize(
+    ('name', 'argument', 'reason'),
+    [
+        (
+            'localizer',
+            'camera_frame:=/a',
+            "camera_frame is '/a'; a frame id begins without a slash",
+        ),
+        (
+            'localizer',
+            'camera_frame:=a b',
+            "camera_frame is 'a b'; a frame id begins without a slash",
+        ),
+        (
+            'measured_camera',
+            'world_frame:=/map',
+            "world_frame is '/map'; a frame id begins without",
+        ),
+        ('model_critic', 'output:=/tmp', "output is '/tmp', a folder; name a file"),
+    ],
+)
 def test_a_node_does_not_start_with_a_wrong_name(
     name: str, argument: str, reason: str, start: Callable[..., Any]
 ) -> None:
@@ -177,19 +225,22 @@ def test_a_node_does_not_start_with_a_wrong_name(
         start(name, '-p', argument)
 
 
-@pytest.mark.parametrize(('argument', 'reason'), [
-    ('rate:=0.0', 'rate'),
-    ('style:=triple', 'style'),
-    ('poses:=[1.0]', 'seven a pose'),
-    ('sweep.rate:=[1.0]', 'no such parameter to sweep'),
-    ('sweep.poses:=[1.0]', 'no such parameter to sweep'),
-    ('sweep.radius:=[1.0, -1.0]', 'radius is -1.0; allowed is 0.001 to 1e+06'),
-    ('sweep.radius:=[near]', "radius is 'near'; float is needed"),
-    ('sweep.radius:=2.0', 'a list of at least one value is needed'),
-    ('sweep.lens:=[fish180, fish999]', "'fish999' is neither a file"),
-    ('sweep.environment:=[whole, cellar]', "environment 'cellar' is unknown"),
-    ('sweep.style:=[mono, triple]', "style is 'triple'"),
-])
+@pytest.mark.parametrize(
+    ('argument', 'reason'),
+    [
+        ('rate:=0.0', 'rate'),
+        ('style:=triple', 'style'),
+        ('poses:=[1.0]', 'seven a pose'),
+        ('sweep.rate:=[1.0]', 'no such parameter to sweep'),
+        ('sweep.poses:=[1.0]', 'no such parameter to sweep'),
+        ('sweep.radius:=[1.0, -1.0]', 'radius is -1.0; allowed is 0.001 to 1e+06'),
+        ('sweep.radius:=[near]', "radius is 'near'; float is needed"),
+        ('sweep.radius:=2.0', 'a list of at least one value is needed'),
+        ('sweep.lens:=[fish180, fish999]', "'fish999' is neither a file"),
+        ('sweep.environment:=[whole, cellar]', "environment 'cellar' is unknown"),
+        ('sweep.style:=[mono, triple]', "style is 'triple'"),
+    ],
+)
 def test_a_node_does_not_start_with_what_it_cannot_use(
     argument: str, reason: str, start: Callable[..., Any]
 ) -> None:
@@ -205,7 +256,9 @@ def test_svp_is_one_of_three_words(start: Callable[..., Any]) -> None:
         start('localizer', '-p', 'svp:=maybe')
     table = SolverSettings()
     assert [with_values(table, {'svp': value}).svp for value in (True, False, 'auto')] == [
-        'true', 'false', 'auto'
+        'true',
+        'false',
+        'auto',
     ]
     with pytest.raises(ParameterError, match='lens is True; str is needed'):
         with_values(table, {'lens': True})
@@ -228,7 +281,12 @@ def test_a_sweep_is_the_product_of_its_lists_the_last_fastest() -> None:
     sweep = sweep_of(Scenario, {'sweep.radius': [2, 0.5], 'sweep.seed': [1, 2, 3], 'radius': 7.0})
     assert len(sweep) == 6
     assert [(p['radius'], p['seed']) for p in sweep] == [
-        (2.0, 1), (2.0, 2), (2.0, 3), (0.5, 1), (0.5, 2), (0.5, 3)
+        (2.0, 1),
+        (2.0, 2),
+        (2.0, 3),
+        (0.5, 1),
+        (0.5, 2),
+        (0.5, 3),
     ]
     assert with_values(Scenario(), next(iter(sweep))).seed == 1
 
@@ -243,12 +301,16 @@ def test_a_parameter_that_means_nothing_is_named(
 
 
 def test_what_a_file_says_of_all_nodes_may_be_for_others(
-    start: Callable[..., Any], capfd: pytest.CaptureFixture[str], tmp_path: Path,
+    start: Callable[..., Any],
+    capfd: pytest.CaptureFixture[str],
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     file = tmp_path / 'all.yaml'
-    file.write_text('/**: {ros__parameters: {noise_px: 1.0, camera.exposure: 7, patence: 1.0}}\n'
-                    'localizer: {ros__parameters: {radius: 1.0}}\n')
+    file.write_text(
+        '/**: {ros__parameters: {noise_px: 1.0, camera.exposure: 7, patence: 1.0}}\n'
+        'localizer: {ros__parameters: {radius: 1.0}}\n'
+    )
     monkeypatch.setattr('sys.argv', ['localizer', '--ros-args', '--params-file', str(file)])
     start('localizer', '--params-file', str(file))
     said = capfd.readouterr().err
@@ -257,13 +319,23 @@ def test_what_a_file_says_of_all_nodes_may_be_for_others(
     assert "'radius' is unknown to this node; known are" in said
 
 
-@pytest.mark.parametrize(('node', 'words', 'wanted'), [
-    ('synthetic_camera', ('noise_px:=1', 'radius:=2', 'rate:=50'),
-     {'noise_px': 1.0, 'radius': 2.0, 'rate': 50.0}),
-    ('synthetic_camera', ('poses:=[0, 0, 0, 1, 0, 0, 0]',), {'poses': [0.0, 0, 0, 1, 0, 0, 0]}),
-    ('synthetic_camera', ('sweep.radius:=[2, 1]',), {'sweep.radius': [2.0, 1.0]}),
-    ('localizer', ('patience:=3',), {'patience': 3.0}),
-])
+@pytest.mark.parametrize(
+    ('node', 'words', 'wanted'),
+    [
+        (
+            'synthetic_camera',
+            ('noise_px:=1', 'radius:=2', 'rate:=50'),
+            {'noise_px': 1.0, 'radius': 2.0, 'rate': 50.0},
+        ),
+        (
+            'synthetic_camera',
+            ('poses:=[0, 0, 0, 1, 0, 0, 0]',),
+            {'poses': [0.0, 0, 0, 1, 0, 0, 0]},
+        ),
+        ('synthetic_camera', ('sweep.radius:=[2, 1]',), {'sweep.radius': [2.0, 1.0]}),
+        ('localizer', ('patience:=3',), {'patience': 3.0}),
+    ],
+)
 def test_whole_numbers_are_taken_where_others_are_asked_for(
     start: Callable[..., Any], node: str, words: tuple[str, ...], wanted: dict[str, Any]
 ) -> None:
@@ -278,7 +350,8 @@ def test_overrides_of_qos_do_not_bury_those_of_the_node(start: Callable[..., Any
     node = start('localizer', '-p', 'qos_overrides./image_points.subscription.depth:=7')
     names = {*node.list_parameters([], 0).names}
     assert {name for name in names if name.startswith('qos_overrides')} == {
-        'qos_overrides./image_points.subscription.depth'}
+        'qos_overrides./image_points.subscription.depth'
+    }
 
 
 def test_the_lens_is_said_when_it_changes(

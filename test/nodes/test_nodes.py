@@ -69,8 +69,13 @@ def stamps(heard: list[Any]) -> list[int]:
 
 
 def test_one_set_carries_one_stamp_on_all_topics(graph: Callable[..., Graph]) -> None:
-    g = graph('wait_for_subscribers:=1', 'repeat:=false', 'rate:=100.0', 'noise_px:=0.1',
-              'poses:=[0.0,0.0,0.0,1.0,0.0,0.0,0.0, 0.1,0.0,0.0,1.0,0.0,0.0,0.0]')
+    g = graph(
+        'wait_for_subscribers:=1',
+        'repeat:=false',
+        'rate:=100.0',
+        'noise_px:=0.1',
+        'poses:=[0.0,0.0,0.0,1.0,0.0,0.0,0.0, 0.1,0.0,0.0,1.0,0.0,0.0,0.0]',
+    )
     scenarios = g.hear(DiagnosticArray, 'scenario')
     poses = g.hear(PoseStamped, 'true_pose')
     landmarks = g.hear(PointCloud2, 'landmarks', LATCHED)
@@ -103,7 +108,7 @@ def test_a_rig_has_its_cameras_below_left_and_right(graph: Callable[..., Graph])
 
 
 def test_the_noise_is_that_of_the_seed_and_new_in_each_repetition(
-    graph: Callable[..., Graph]
+    graph: Callable[..., Graph],
 ) -> None:
     g = graph('wait_for_subscribers:=1', 'rate:=200.0', 'noise_px:=0.5', 'seed:=7')
     points = g.hear(PointCloud2, 'image_points')
@@ -116,8 +121,13 @@ def test_the_noise_is_that_of_the_seed_and_new_in_each_repetition(
 
 def test_a_trajectory_moves_in_even_steps(graph: Callable[..., Graph]) -> None:
     half = np.sin(np.pi / 8), np.cos(np.pi / 8)
-    g = graph('wait_for_subscribers:=1', 'repeat:=false', 'rate:=200.0', 'trajectory_steps:=4',
-              f'poses:=[0.0,0.0,0.0,0.0,0.0,0.0,1.0, 0.4,0.0,0.0,0.0,0.0,{half[0]},{half[1]}]')
+    g = graph(
+        'wait_for_subscribers:=1',
+        'repeat:=false',
+        'rate:=200.0',
+        'trajectory_steps:=4',
+        f'poses:=[0.0,0.0,0.0,0.0,0.0,0.0,1.0, 0.4,0.0,0.0,0.0,0.0,{half[0]},{half[1]}]',
+    )
     poses = g.hear(PoseStamped, 'true_pose')
     points = g.hear(PointCloud2, 'image_points')
     g.start(SyntheticCamera)
@@ -138,15 +148,23 @@ def test_markers_are_drawn_while_somebody_looks(graph: Callable[..., Graph]) -> 
     assert shown == {'landmarks': 33, 'camera true': 16, 'rays': 66}
 
 
-SWEEP = ('sweep.radius:=[2.0,0.5,0.2]', 'sweep.environment:=[whole,inner,outer]',
-         'sweep.seed:=[1,2]', 'noise_px:=0.2')
+SWEEP = (
+    'sweep.radius:=[2.0,0.5,0.2]',
+    'sweep.environment:=[whole,inner,outer]',
+    'sweep.seed:=[1,2]',
+    'noise_px:=0.2',
+)
 
 
 def test_in_lock_step_every_scenario_is_answered_once_and_in_order(
-    graph: Callable[..., Graph]
+    graph: Callable[..., Graph],
 ) -> None:
-    g = graph('synthetic_camera:wait_for_subscribers:=1', 'repeat:=false',
-              'lock_step:=localizer/result', *SWEEP)
+    g = graph(
+        'synthetic_camera:wait_for_subscribers:=1',
+        'repeat:=false',
+        'lock_step:=localizer/result',
+        *SWEEP,
+    )
     scenarios = g.hear(DiagnosticArray, 'scenario')
     results = g.hear(DiagnosticArray, 'localizer/result')
     g.start(Localizer)
@@ -158,7 +176,10 @@ def test_in_lock_step_every_scenario_is_answered_once_and_in_order(
     assert [int(t['scenario']) for t in tags] == list(range(18))
     assert {t['scenarios'] for t in tags} == {'18'}
     assert [(t['radius'], t['environment'], t['seed']) for t in tags[:4]] == [
-        ('2.0', 'whole', '1'), ('2.0', 'whole', '2'), ('2.0', 'inner', '1'), ('2.0', 'inner', '2')
+        ('2.0', 'whole', '1'),
+        ('2.0', 'whole', '2'),
+        ('2.0', 'inner', '1'),
+        ('2.0', 'inner', '2'),
     ]
     counts = {'whole': 33.0, 'inner': 15.0, 'outer': 18.0}
     for tag, result in zip(tags, results, strict=True):
@@ -195,9 +216,7 @@ def test_a_change_of_parameters_starts_over(graph: Callable[..., Graph]) -> None
     assert values(scenarios[-1])['radius'] == '0.5'
 
 
-def test_a_rig_of_three_cameras_has_a_namespace_each(
-    ros_domain: int, tmp_path: Path
-) -> None:
+def test_a_rig_of_three_cameras_has_a_namespace_each(ros_domain: int, tmp_path: Path) -> None:
     """A localizer of one of them finds its true pose with its lens."""
     lens = load_lens(lens_path('fish180'))
     names = ('front', 'rear', 'top')
@@ -205,11 +224,20 @@ def test_a_rig_of_three_cameras_has_a_namespace_each(
         save_lens(replace(lens, name=name, cx=lens.cx + number), tmp_path / f'{name}.yaml')
     steps = [Pose(np.eye(3), np.array([0.1 * (i + 1), 0.0, 0.0])) for i in range(2)]
     save_rig(steps, tmp_path / 'rig.yaml', names)
-    parameters = ('svp:=false', f'rig_file:={tmp_path}', f'localizer:lens:={tmp_path}/top.yaml',
-                  'rate:=20.0', 'radius:=0.5')
-    g = Graph(*(word for one in parameters for word in ('-p', one)),
-              '-r', 'localizer:image_points:=top/image_points',
-              '-r', 'localizer:true_pose:=top/true_pose')
+    parameters = (
+        'svp:=false',
+        f'rig_file:={tmp_path}',
+        f'localizer:lens:={tmp_path}/top.yaml',
+        'rate:=20.0',
+        'radius:=0.5',
+    )
+    g = Graph(
+        *(word for one in parameters for word in ('-p', one)),
+        '-r',
+        'localizer:image_points:=top/image_points',
+        '-r',
+        'localizer:true_pose:=top/true_pose',
+    )
     results = g.hear(DiagnosticArray, 'localizer/result')
     infos = [g.hear(CameraInfo, f'{name}/camera_info', LATCHED) for name in names]
     poses = [g.hear(PoseStamped, f'{name}/true_pose') for name in names]
@@ -217,7 +245,8 @@ def test_a_rig_of_three_cameras_has_a_namespace_each(
     g.start(SyntheticCamera)
     g.until(lambda: results and all(infos) and all(poses))
     assert [heard[0].header.frame_id for heard in infos] == [
-        f'{name}_camera_optical_frame' for name in names]
+        f'{name}_camera_optical_frame' for name in names
+    ]
     assert float(values(results[0])['position_error_m']) < 1e-9
     first, last = (heard[0].pose.position for heard in (poses[0], poses[2]))
     assert abs(abs(last.x - first.x) - 0.3) < 1e-9
@@ -245,14 +274,16 @@ def test_the_localizer_with_the_true_lens_makes_no_error(
 
 
 def test_the_localizer_publishes_everything_of_a_set_under_its_stamp(
-    graph: Callable[..., Graph]
+    graph: Callable[..., Graph],
 ) -> None:
     g = graph('rate:=50.0', 'repeat:=false', 'wait_for_subscribers:=1')
     heard = {
         topic: g.hear(kind, f'localizer/{topic}')
         for topic, kind in (
-            ('pose', PoseWithCovarianceStamped), ('position_error', Vector3Stamped),
-            ('rotation_error', Vector3Stamped), ('residuals', PointCloud2),
+            ('pose', PoseWithCovarianceStamped),
+            ('position_error', Vector3Stamped),
+            ('rotation_error', Vector3Stamped),
+            ('residuals', PointCloud2),
             ('result', DiagnosticArray),
             *((f'metrics/{name}', Float64) for name in Localizer.METRICS),
         )
@@ -404,7 +435,7 @@ def test_a_pose_that_is_not_to_be_relied_on_is_a_warning(graph: Callable[..., Gr
 
 
 def test_a_camera_that_stays_where_it_is_is_warned_of_in_every_set(
-    graph: Callable[..., Graph]
+    graph: Callable[..., Graph],
 ) -> None:
     sets = Sets(graph('lens:=fish214', 'patience:=0.2', 'sigma_px:=0.3'))
     sets.tell_landmarks(0, 2.0)
@@ -429,12 +460,16 @@ def test_a_lens_that_is_wrong_in_every_set_is_not_searched_for_gross_errors_in_e
     sets = Sets(graph('lens:=fish214', 'patience:=0.2', 'sigma_px:=0.3'))
     sets.tell_landmarks(0, 2.0)
     search, searched = reliability._consensus_pose, []
-    monkeypatch.setattr(reliability, '_consensus_pose', lambda *arguments: (
-        searched.append(stamp), search(*arguments))[1])
+    monkeypatch.setattr(
+        reliability,
+        '_consensus_pose',
+        lambda *arguments: (searched.append(stamp), search(*arguments))[1],
+    )
     seen = simulate_scenario(Scenario(radius=2.0, noise_px=0.3)).observations
     for stamp in range(1, 22):
         sets.points.publish(
-            messages.image_points_message(seen.landmark, 0.5 * seen.uv, stamp, 'camera'))
+            messages.image_points_message(seen.landmark, 0.5 * seen.uv, stamp, 'camera')
+        )
         sets.result(stamp)
     assert searched == [1, 11, 21]
 
@@ -498,12 +533,15 @@ def all_in_one_place(sets: Sets, stamp: int) -> None:
     sets.points.publish(messages.image_points_message(np.arange(8), uv, stamp, 'camera'))
 
 
-@pytest.mark.parametrize(('spoil', 'reason'), [
-    (unknown_landmark, 'landmark 99 is not one of the landmarks'),
-    (too_few, 'has 3 usable points'),
-    (far_outside, 'has 0 usable points inside the field of view'),
-    (all_in_one_place, ''),
-])
+@pytest.mark.parametrize(
+    ('spoil', 'reason'),
+    [
+        (unknown_landmark, 'landmark 99 is not one of the landmarks'),
+        (too_few, 'has 3 usable points'),
+        (far_outside, 'has 0 usable points inside the field of view'),
+        (all_in_one_place, ''),
+    ],
+)
 def test_a_set_that_cannot_be_solved_has_a_result_that_says_why(
     sets: Sets, spoil: Callable[[Sets, int], None], reason: str
 ) -> None:
@@ -533,10 +571,15 @@ def test_malformed_messages_are_counted_and_the_node_lives_on(sets: Sets) -> Non
     sets.tell_points(5, 2.0)
     sets.tell_truth(5)
     assert float(sets.result(5)['position_error_m']) < 1e-9
-    wanted = {'image_points: dropped': '4', 'true_pose: dropped': '1', 'landmarks: dropped': '1',
-              'image_points: received': '5'}
-    sets.graph.until(lambda: sets.diagnostics
-                     and wanted.items() <= values(sets.diagnostics[-1]).items())
+    wanted = {
+        'image_points: dropped': '4',
+        'true_pose: dropped': '1',
+        'landmarks: dropped': '1',
+        'image_points: received': '5',
+    }
+    sets.graph.until(
+        lambda: sets.diagnostics and wanted.items() <= values(sets.diagnostics[-1]).items()
+    )
     told = [message.status[0] for message in sets.diagnostics]
     assert {status.name for status in told} == {'/localizer: inputs'}
     warnings = [status.message for status in told if status.level == status.WARN]
@@ -548,19 +591,24 @@ def test_malformed_messages_are_counted_and_the_node_lives_on(sets: Sets) -> Non
 def test_two_landmarks_of_one_id_are_refused(sets: Sets) -> None:
     twice = Landmarks(np.array([1, 1]), np.zeros((2, 3)))
     sets.landmarks.publish(messages.landmarks_message(twice, 0, 'world'))
-    sets.graph.until(lambda: sets.diagnostics and values(
-        sets.diagnostics[-1])['landmarks: dropped'] == '1')
+    sets.graph.until(
+        lambda: sets.diagnostics and values(sets.diagnostics[-1])['landmarks: dropped'] == '1'
+    )
     assert 'landmark 1 is listed twice' in sets.diagnostics[-1].status[0].message
 
 
 @pytest.mark.parametrize('style', ['parallel', 'vergent', 'divergent'])
-def test_stereo_with_the_true_lens_makes_no_error(
-    graph: Callable[..., Graph], style: str
-) -> None:
-    g = graph('svp:=false', f'style:={style}', 'radius:=0.5', 'poses_file:=calibration',
-              'repeat:=false', 'synthetic_camera:lens:=fish180',
-              'synthetic_camera:wait_for_subscribers:=2',
-              'lock_step:=stereo_calibrator/result stereo_depth/result')
+def test_stereo_with_the_true_lens_makes_no_error(graph: Callable[..., Graph], style: str) -> None:
+    g = graph(
+        'svp:=false',
+        f'style:={style}',
+        'radius:=0.5',
+        'poses_file:=calibration',
+        'repeat:=false',
+        'synthetic_camera:lens:=fish180',
+        'synthetic_camera:wait_for_subscribers:=2',
+        'lock_step:=stereo_calibrator/result stereo_depth/result',
+    )
     calibrated = g.hear(DiagnosticArray, 'stereo_calibrator/result')
     measured = g.hear(DiagnosticArray, 'stereo_depth/result')
     clouds = g.hear(PointCloud2, 'stereo_depth/points')
@@ -584,9 +632,16 @@ def test_stereo_with_the_true_lens_makes_no_error(
 
 
 def test_the_calibrator_never_mixes_scenarios(graph: Callable[..., Graph]) -> None:
-    g = graph('sweep.style:=[parallel,divergent]', 'sweep.radius:=[0.5,2.0]', 'repeat:=false',
-              'poses_file:=calibration', 'svp:=false', 'views:=4',
-              'synthetic_camera:wait_for_subscribers:=1', 'lock_step:=stereo_calibrator/result')
+    g = graph(
+        'sweep.style:=[parallel,divergent]',
+        'sweep.radius:=[0.5,2.0]',
+        'repeat:=false',
+        'poses_file:=calibration',
+        'svp:=false',
+        'views:=4',
+        'synthetic_camera:wait_for_subscribers:=1',
+        'lock_step:=stereo_calibrator/result',
+    )
     results = g.hear(DiagnosticArray, 'stereo_calibrator/result')
     g.start(StereoCalibrator)
     g.start(SyntheticCamera)
@@ -604,8 +659,13 @@ def test_the_calibrator_counts_a_set_that_is_played_again_once(
     table = simulate_scenario(scenario).observations
     few = table.take(table.frame < 3)
     write_observations(tmp_path / 'observations.csv', replace(few, t=few.frame + 1.0))
-    g = graph(f'observations:={tmp_path}/observations.csv', 'lens:=fish180', 'rate:=50.0',
-              'measured_camera:wait_for_subscribers:=1', 'lock_step:=stereo_calibrator/result')
+    g = graph(
+        f'observations:={tmp_path}/observations.csv',
+        'lens:=fish180',
+        'rate:=50.0',
+        'measured_camera:wait_for_subscribers:=1',
+        'lock_step:=stereo_calibrator/result',
+    )
     results = g.hear(DiagnosticArray, 'stereo_calibrator/result')
     g.start(StereoCalibrator)
     g.start(MeasuredCamera)
@@ -614,8 +674,9 @@ def test_the_calibrator_counts_a_set_that_is_played_again_once(
 
 
 def test_depth_with_a_rig_from_a_topic(graph: Callable[..., Graph]) -> None:
-    g = graph('rig:=topic', 'style:=parallel', 'rate:=20.0', 'patience:=0.5', 'radius:=0.5',
-              'svp:=false')
+    g = graph(
+        'rig:=topic', 'style:=parallel', 'rate:=20.0', 'patience:=0.5', 'radius:=0.5', 'svp:=false'
+    )
     results = g.hear(DiagnosticArray, 'stereo_depth/result')
     g.start(StereoDepth)
     rig = g.tell(TransformStamped, 'rig', LATCHED)
@@ -633,8 +694,16 @@ def test_depth_with_lenses_and_rig_of_a_camchain(
 ) -> None:
     lens = load_lens(lens_path('fish180'))
     path = write_camchain(tmp_path / 'camchain.yaml', lens, lens, rig('vergent', 0.15))
-    g = graph('synthetic_camera:lens:=fish180', 'style:=vergent', 'rate:=20.0', 'patience:=0.5',
-              'radius:=0.5', 'shift_scale:=0.0', f'stereo_depth:lens:={path}', f'rig:={path}')
+    g = graph(
+        'synthetic_camera:lens:=fish180',
+        'style:=vergent',
+        'rate:=20.0',
+        'patience:=0.5',
+        'radius:=0.5',
+        'shift_scale:=0.0',
+        f'stereo_depth:lens:={path}',
+        f'rig:={path}',
+    )
     results = g.hear(DiagnosticArray, 'stereo_depth/result')
     node = g.start(StereoDepth)
     g.start(SyntheticCamera)
@@ -648,9 +717,17 @@ def test_depth_with_lenses_and_rig_of_a_camchain(
 def test_optimal_depth_has_the_smaller_error_under_noise(graph: Callable[..., Graph]) -> None:
     errors = []
     for optimal in ('false', 'true'):
-        g = graph('style:=divergent', 'radius:=0.5', 'svp:=false', f'optimal:={optimal}',
-                  'noise_px:=1.0', 'sweep.seed:=[0,1,2,3,4,5,6,7]', 'repeat:=false',
-                  'synthetic_camera:wait_for_subscribers:=1', 'lock_step:=stereo_depth/result')
+        g = graph(
+            'style:=divergent',
+            'radius:=0.5',
+            'svp:=false',
+            f'optimal:={optimal}',
+            'noise_px:=1.0',
+            'sweep.seed:=[0,1,2,3,4,5,6,7]',
+            'repeat:=false',
+            'synthetic_camera:wait_for_subscribers:=1',
+            'lock_step:=stereo_depth/result',
+        )
         results = g.hear(DiagnosticArray, 'stereo_depth/result')
         g.start(StereoDepth)
         g.start(SyntheticCamera)
@@ -686,17 +763,27 @@ def test_a_recorder_survives_what_strangers_publish(
     with BagWriter(tmp_path / 'bag') as bag:
         recorder = one.start(lambda: Recorder(bag, re.compile('.*')))
         publishers = recorder.get_publishers_info_by_topic
-        one.until(lambda: any(
-            publishers(topic) for topic, _ in one.probe.get_topic_names_and_types()))
+        one.until(
+            lambda: any(publishers(topic) for topic, _ in one.probe.get_topic_names_and_types())
+        )
         # As a stranger's types look to this machine: unknown, or not even of three parts.
         told = dict(one.probe.get_topic_names_and_types())
-        types = {**told, '/a': ['nobody_msgs/msg/Thing'], '/b': ['odd'],
-                 '/c': ['std_msgs/msg/Nothing']}
+        types = {
+            **told,
+            '/a': ['nobody_msgs/msg/Thing'],
+            '/b': ['odd'],
+            '/c': ['std_msgs/msg/Nothing'],
+        }
         recorder.get_topic_names_and_types = lambda: list(types.items())
         profile = next(p for topic in told for p in publishers(topic)).qos_profile
-        recorder.get_publishers_info_by_topic = lambda topic: [
-            Endpoint(types[topic][0], profile)] if topic in '/a/b/c' else [
-            *publishers(topic), *[Endpoint('std_msgs/msg/Float64', profile)] * (topic == '/twice')]
+        recorder.get_publishers_info_by_topic = lambda topic: (
+            [Endpoint(types[topic][0], profile)]
+            if topic in '/a/b/c'
+            else [
+                *publishers(topic),
+                *[Endpoint('std_msgs/msg/Float64', profile)] * (topic == '/twice'),
+            ]
+        )
         # One process of Fast DDS has one type a topic; the other is somebody else's.
         twice = one.probe.create_publisher(CameraInfo, '/twice', 10)
         one.until(lambda: publishers('/twice'))
@@ -706,8 +793,12 @@ def test_a_recorder_survives_what_strangers_publish(
         one.until(lambda: bag.count)
         assert recorder.topics.isdisjoint({'/a', '/b', '/c'})
     said = capfd.readouterr().err
-    for text in ('/a: nobody_msgs/msg/Thing is not recorded', '/b: odd is not recorded',
-                 '/c: std_msgs/msg/Nothing is not recorded', 'only sensor_msgs/msg/CameraInfo'):
+    for text in (
+        '/a: nobody_msgs/msg/Thing is not recorded',
+        '/b: odd is not recorded',
+        '/c: std_msgs/msg/Nothing is not recorded',
+        'only sensor_msgs/msg/CameraInfo',
+    ):
         assert said.count(text) == 1, said
 
 

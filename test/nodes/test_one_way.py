@@ -44,8 +44,11 @@ def flat(tmp_path: Path) -> Scenario:
     write_table(tmp_path / 'board.csv', {'landmark': target.ids, 'x': x, 'y': y, 'z': z})
     write_poses(tmp_path / 'poses.csv', np.arange(SETS), poses)
     return Scenario(
-        lens=f'{tmp_path}/tele.yaml', environment=f'{tmp_path}/board.csv', noise_px=0.1,
-        poses_file=f'{tmp_path}/poses.csv', seed=3,
+        lens=f'{tmp_path}/tele.yaml',
+        environment=f'{tmp_path}/board.csv',
+        noise_px=0.1,
+        poses_file=f'{tmp_path}/poses.csv',
+        seed=3,
     )
 
 
@@ -58,11 +61,17 @@ def graph(ros_domain: int, flat: Scenario) -> Iterator[Graph]:
 
 
 def by_sweep(scenario: Scenario) -> np.ndarray:
-    plan = plan_sweep({'synthetic_camera': {
-        'lens': scenario.lens, 'environment': scenario.environment,
-        'poses_file': scenario.poses_file, 'noise_px': scenario.noise_px,
-        'sweep.seed': [scenario.seed],
-    }})
+    plan = plan_sweep(
+        {
+            'synthetic_camera': {
+                'lens': scenario.lens,
+                'environment': scenario.environment,
+                'poses_file': scenario.poses_file,
+                'noise_px': scenario.noise_px,
+                'sweep.seed': [scenario.seed],
+            }
+        }
+    )
     columns = sweep_rows(plan, range(1))
     return np.array([columns[f'localizer.position_error_{axis}_m'] for axis in 'xyz']).T
 
@@ -84,8 +93,11 @@ def by_node(graph: Graph, observations: Observations, true: Pose) -> np.ndarray:
     views = group_views(observations)
     for i, used in enumerate(views.used):
         truth.publish(messages.pose_message(true.take(i), i + 1, 'world'))
-        points.publish(messages.image_points_message(
-            views.landmark[i][used], views.uv[i][used], i + 1, 'camera'))
+        points.publish(
+            messages.image_points_message(
+                views.landmark[i][used], views.uv[i][used], i + 1, 'camera'
+            )
+        )
         graph.until(lambda count=i + 1: len(heard) == count)
     return np.stack([read_pose(message.pose).position for message in heard])
 
@@ -115,8 +127,19 @@ def test_angles_and_ranges_are_those_of_the_corrected_target(tmp_path: Path) -> 
     uv = [639.5, 479.5] + 400 * theta[:, None] * seen[:, :2] / np.hypot(*seen[:, :2].T)[:, None]
     table = make_observations(np.zeros(count), target.ids, uv, target.points)
     write_observations(tmp_path / 'seen.csv', table)
-    assert main(['localize', f'{tmp_path}/seen.csv', '--lens', f'{tmp_path}/wide.yaml',
-                 '-o', f'{tmp_path}/out']) == 0
+    assert (
+        main(
+            [
+                'localize',
+                f'{tmp_path}/seen.csv',
+                '--lens',
+                f'{tmp_path}/wide.yaml',
+                '-o',
+                f'{tmp_path}/out',
+            ]
+        )
+        == 0
+    )
     told = CsvTable(tmp_path / 'out' / 'residuals.csv', ['theta', 'range'])
     model, views = ForwardModel(lens), group_views(table)
     cloud = residual_points(model, views, localize(model, views))

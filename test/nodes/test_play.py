@@ -47,7 +47,7 @@ def rosbag2() -> Any:
 
 
 def test_without_a_clock_simulated_time_silences_no_diagnostics(
-    graph: Callable[..., Graph]
+    graph: Callable[..., Graph],
 ) -> None:
     g = graph('use_sim_time:=true')
     diagnostics = g.hear(DiagnosticArray, '/diagnostics')
@@ -95,20 +95,26 @@ def test_rosbag2_knows_a_recording_and_indexes_one_that_was_cut_short(
         known = rosbag2.Info().read_metadata(str(one), 'mcap')
         topics = {t.topic_metadata.name: t for t in known.topics_with_message_count}
         assert {name: t.message_count for name, t in topics.items()} == {
-            '/landmarks': 1, '/image_points': SETS}
+            '/landmarks': 1,
+            '/image_points': SETS,
+        }
         assert len(topics['/landmarks'].topic_metadata.offered_qos_profiles) == 1
 
 
 @pytest.mark.parametrize('more', [(), ('--clock', '50', '--loop')])
 def test_who_comes_late_to_a_recording_that_is_played_hears_its_landmarks(
-    graph: Callable[..., Graph], process: Callable[..., NodeProcess], rosbag2: Any,
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: tuple[str, ...],
+    graph: Callable[..., Graph],
+    process: Callable[..., NodeProcess],
+    rosbag2: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    more: tuple[str, ...],
 ) -> None:
-    now = [10 ** 9]
+    now = [10**9]
     monkeypatch.setattr(bags, 'time', SimpleNamespace(time_ns=lambda: now[0]))
 
     def pause() -> None:
-        now[0] += 4 * 10 ** 9 if now[0] == 10 ** 9 else 10 ** 8
+        now[0] += 4 * 10**9 if now[0] == 10**9 else 10**8
 
     with BagWriter(tmp_path / 'bag') as bag:
         bag.add('/image_points', CLOUD)
@@ -125,21 +131,38 @@ def test_who_comes_late_to_a_recording_that_is_played_hears_its_landmarks(
     assert player.finish(signal.SIGINT if more else None) == 0
 
 
-@pytest.mark.parametrize('form', [
-    ('-s', 'mcap'),
-    ('-s', 'sqlite3', '--compression-mode', 'file', '--compression-format', 'zstd'),
-])
+@pytest.mark.parametrize(
+    'form',
+    [
+        ('-s', 'mcap'),
+        ('-s', 'sqlite3', '--compression-mode', 'file', '--compression-format', 'zstd'),
+    ],
+)
 def test_a_table_of_what_rosbag2_recorded_is_that_of_our_own_recording(
     process: Callable[..., NodeProcess], rosbag2: Any, tmp_path: Path, form: tuple[str, ...]
 ) -> None:
     theirs, own = tmp_path / 'theirs', tmp_path / 'own'
-    recorders = [process('ros2', 'bag', 'record', *form, '-a', '-o', str(theirs)),
-                 process(*OURS, 'record', '-o', str(own))]
+    recorders = [
+        process('ros2', 'bag', 'record', *form, '-a', '-o', str(theirs)),
+        process(*OURS, 'record', '-o', str(own)),
+    ]
     localizer = process(*OURS, 'run', 'localizer', '--ros-args', '-p', 'wait_for_subscribers:=3')
     camera = process(
-        *OURS, 'run', 'synthetic_camera', '--ros-args', '-p', 'wait_for_subscribers:=3',
-        '-p', 'repeat:=false', '-p', 'rate:=2.0', '-p', 'lock_step:=localizer/result',
-        '-p', 'sweep.radius:=[2.0, 0.5, 0.2]')
+        *OURS,
+        'run',
+        'synthetic_camera',
+        '--ros-args',
+        '-p',
+        'wait_for_subscribers:=3',
+        '-p',
+        'repeat:=false',
+        '-p',
+        'rate:=2.0',
+        '-p',
+        'lock_step:=localizer/result',
+        '-p',
+        'sweep.radius:=[2.0, 0.5, 0.2]',
+    )
     assert camera.finish() == 0
     assert [one.finish(signal.SIGINT) for one in (localizer, *recorders)] == [0, 0, 0]
     tables = [tabulate(Bag(path).records(is_tabulated)) for path in (theirs, own)]

@@ -106,8 +106,11 @@ def test_a_node_belongs_to_the_nearest_scenario_above_it(tmp_path: Path) -> None
             message = messages.key_values_message('n', {'rms_px': 3.0}, 5)
             bag.write(f'{node}/result', DIAGNOSTICS, serialize_message(message))
     assert tabulate(Bag(tmp_path / 'bag').records(is_tabulated)) == {
-        'namespace': ['/x', '/x/left'], 'stamp_ns': [5, 5], 'radius': [1.0, 2.0],
-        'right/localizer.rms_px': [3.0, None], 'localizer.rms_px': [None, 3.0],
+        'namespace': ['/x', '/x/left'],
+        'stamp_ns': [5, 5],
+        'radius': [1.0, 2.0],
+        'right/localizer.rms_px': [3.0, None],
+        'localizer.rms_px': [None, 3.0],
     }
 
 
@@ -149,7 +152,8 @@ def test_the_command_prints_all_columns_in_the_width_of_the_terminal(
     assert max(map(len, lines)) <= 100
     headers = [line.split() for line in lines if 'localizer.' in line]
     assert [name for _, *names in headers for name in names] == [
-        f'localizer.{name}' for name in metrics]
+        f'localizer.{name}' for name in metrics
+    ]
     assert {first for first, *_ in headers} == {'radius'}
 
 
@@ -159,9 +163,9 @@ def test_a_recording_that_was_cut_short_yields_what_is_whole(
 ) -> None:
     write_results(tmp_path / 'bag', 40, flush_each=True)
     whole = len(tabulate(Bag(tmp_path / 'bag').records(is_tabulated))['localizer.rms_px'])
-    file, = (tmp_path / 'bag').glob('*.mcap')
+    (file,) = (tmp_path / 'bag').glob('*.mcap')
     data = file.read_bytes()
-    file.write_bytes(data[:int(part * len(data))])
+    file.write_bytes(data[: int(part * len(data))])
     (tmp_path / 'bag' / 'metadata.yaml').unlink()
     bag = Bag(tmp_path / 'bag')
     columns = tabulate(bag.records(is_tabulated))
@@ -169,7 +173,7 @@ def test_a_recording_that_was_cut_short_yields_what_is_whole(
     known = [v for v in columns.get('localizer.rms_px', []) if v is not None]
     assert len(columns['stamp_ns']) == whole
     # Results were written from the last stamp to the first: the first are what is lost.
-    assert known == [n / 3 for n in range(40)][40 - len(known):]
+    assert known == [n / 3 for n in range(40)][40 - len(known) :]
     if part > 0.5:
         assert known
     assert main(['table', str(tmp_path / 'bag')]) == 0
@@ -178,9 +182,9 @@ def test_a_recording_that_was_cut_short_yields_what_is_whole(
 
 def test_a_chunk_that_is_cut_short_yields_its_whole_messages(tmp_path: Path) -> None:
     write_results(tmp_path / 'bag', 40)
-    file, = (tmp_path / 'bag').glob('*.mcap')
+    (file,) = (tmp_path / 'bag').glob('*.mcap')
     data = file.read_bytes()
-    file.write_bytes(data[:len(data) // 3])
+    file.write_bytes(data[: len(data) // 3])
     stamps = tabulate(Bag(file).records(is_tabulated))['stamp_ns']
     assert stamps == list(range(len(stamps))) and 20 < len(stamps) < 40
 
@@ -194,7 +198,7 @@ def test_who_waits_is_told_how_far_the_reading_is(tmp_path: Path) -> None:
 
 def test_no_flipped_bit_changes_a_table_in_silence(tmp_path: Path) -> None:
     write_results(tmp_path / 'bag', 12, flush_each=True)
-    file, = (tmp_path / 'bag').glob('*.mcap')
+    (file,) = (tmp_path / 'bag').glob('*.mcap')
     good, rng = file.read_bytes(), np.random.default_rng(5)
     table = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
     told = 0
@@ -215,7 +219,7 @@ def test_no_flipped_bit_changes_a_table_in_silence(tmp_path: Path) -> None:
 
 def test_a_chunk_that_became_a_footer_is_no_end(tmp_path: Path) -> None:
     write_results(tmp_path / 'bag', 3)
-    file, = (tmp_path / 'bag').glob('*.mcap')
+    (file,) = (tmp_path / 'bag').glob('*.mcap')
     data = bytearray(file.read_bytes())
     chunk = 8 + 9 + int.from_bytes(data[9:17], 'little')
     assert data[chunk] == 6
@@ -226,10 +230,10 @@ def test_a_chunk_that_became_a_footer_is_no_end(tmp_path: Path) -> None:
 
 
 def test_what_is_whole_after_the_damage_is_read_once_and_the_place_is_named(
-    tmp_path: Path
+    tmp_path: Path,
 ) -> None:
     write_results(tmp_path / 'bag', 40, flush_each=True)
-    file, = (tmp_path / 'bag').glob('*.mcap')
+    (file,) = (tmp_path / 'bag').glob('*.mcap')
     data = bytearray(file.read_bytes())
     place = data.index(b'rms_px', len(data) // 2)
     data[place] ^= 1
@@ -293,24 +297,39 @@ def test_a_recording_says_what_its_publishers_offered(tmp_path: Path) -> None:
         bag.add('/landmarks', CLOUD, [OfferedQos(latched=True)])
         bag.add('/camera_info', 'sensor_msgs/msg/CameraInfo', [OfferedQos(reliable=False)])
     topics = {
-        topic: one['offered_qos_profiles'] for topic, one in metadata(tmp_path / 'bag').items()}
+        topic: one['offered_qos_profiles'] for topic, one in metadata(tmp_path / 'bag').items()
+    }
     (latched,), (plain,) = topics['/landmarks'], topics['/camera_info']
     assert latched['durability'] == 'transient_local' and latched['reliability'] == 'reliable'
     assert plain['durability'] == 'volatile' and plain['reliability'] == 'best_effort'
 
 
-@pytest.mark.parametrize(('make', 'reason'), [
-    (lambda path: None, 'no such recording; check the path'),
-    (lambda path: path.mkdir(), 'no .mcap or .db3 file in this folder'),
-    (lambda path: (path.mkdir(), (path / 'x.mcap').write_bytes(b'')),
-     'not a recording, or no part of it is intact'),
-    (lambda path: (path.mkdir(), (path / 'x.mcap').write_bytes(os.urandom(5000))),
-     'not a recording, or no part of it is intact'),
-    (lambda path: (path.mkdir(), (path / 'x.mcap').write_bytes(b'\x89MCAP0\r\n' + b'\5' * 999)),
-     'not a recording, or no part of it is intact'),
-])
+@pytest.mark.parametrize(
+    ('make', 'reason'),
+    [
+        (lambda path: None, 'no such recording; check the path'),
+        (lambda path: path.mkdir(), 'no .mcap or .db3 file in this folder'),
+        (
+            lambda path: (path.mkdir(), (path / 'x.mcap').write_bytes(b'')),
+            'not a recording, or no part of it is intact',
+        ),
+        (
+            lambda path: (path.mkdir(), (path / 'x.mcap').write_bytes(os.urandom(5000))),
+            'not a recording, or no part of it is intact',
+        ),
+        (
+            lambda path: (
+                path.mkdir(),
+                (path / 'x.mcap').write_bytes(b'\x89MCAP0\r\n' + b'\5' * 999),
+            ),
+            'not a recording, or no part of it is intact',
+        ),
+    ],
+)
 def test_what_is_no_recording_is_refused(
-    tmp_path: Path, make: Callable[[Path], None], reason: str,
+    tmp_path: Path,
+    make: Callable[[Path], None],
+    reason: str,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     make(tmp_path / 'bag')
@@ -371,6 +390,7 @@ def test_observations_of_two_worlds_are_refused(tmp_path: Path) -> None:
 @pytest.fixture
 def command(start_process: Callable[..., NodeProcess]) -> Callable[..., NodeProcess]:
     """Return a function that starts `fisheye-svp ARGUMENTS`."""
+
     def run(*arguments: str) -> NodeProcess:
         env = os.environ | {'PYTHONUNBUFFERED': '1'}
         env['PYTHONPATH'] = os.pathsep.join([str(ROOT), env.get('PYTHONPATH', '')])
@@ -385,9 +405,19 @@ def test_the_recorder_writes_every_message_until_it_is_interrupted(
 ) -> None:
     recorder = command('record', '-o', str(tmp_path / 'bag'))
     camera = command(
-        'run', 'synthetic_camera', '--ros-args', '-p', 'wait_for_subscribers:=1',
-        '-p', 'repeat:=false', '-p', 'rate:=20.0', '-p', 'sweep.seed:=[1, 2, 3, 4, 5]',
-        '-p', 'noise_px:=0.1',
+        'run',
+        'synthetic_camera',
+        '--ros-args',
+        '-p',
+        'wait_for_subscribers:=1',
+        '-p',
+        'repeat:=false',
+        '-p',
+        'rate:=20.0',
+        '-p',
+        'sweep.seed:=[1, 2, 3, 4, 5]',
+        '-p',
+        'noise_px:=0.1',
     )
     assert camera.finish() == 0
     assert recorder.finish(signal.SIGINT) == 0
@@ -403,8 +433,19 @@ def test_a_camera_ends_when_what_it_sent_has_come(
     """A recorder that is held up gets the last sets, too: they are lost with their publisher."""
     recorder = command('record', '-o', str(tmp_path / 'bag'))
     seeds = [*range(1, 21)]
-    camera = command('run', 'synthetic_camera', '--ros-args', '-p', 'wait_for_subscribers:=1',
-                     '-p', 'repeat:=false', '-p', 'rate:=20.0', '-p', f'sweep.seed:={seeds}')
+    camera = command(
+        'run',
+        'synthetic_camera',
+        '--ros-args',
+        '-p',
+        'wait_for_subscribers:=1',
+        '-p',
+        'repeat:=false',
+        '-p',
+        'rate:=20.0',
+        '-p',
+        f'sweep.seed:={seeds}',
+    )
     camera.wait_for('scenario 1 of 20')
     recorder.process.send_signal(signal.SIGSTOP)
     time.sleep(2.0)  # twice as long as all sets take
@@ -415,13 +456,16 @@ def test_a_camera_ends_when_what_it_sent_has_come(
 
 
 def test_no_empty_recording_is_left_behind(
-    ros_domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    ros_domain: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(Recorder, 'spin', lambda *_: None)  # interrupted before anything came
     assert main(['record', '-o', str(tmp_path / 'bag')]) == 2
     assert 'no message arrived on a recorded topic, so nothing is kept' in (
-        capsys.readouterr().err)
+        capsys.readouterr().err
+    )
     assert not (tmp_path / 'bag').exists()
 
 
@@ -429,8 +473,15 @@ def test_a_recorder_that_is_killed_leaves_what_it_has_flushed(
     command: Callable[..., NodeProcess], tmp_path: Path
 ) -> None:
     recorder = command('record', '-o', str(tmp_path / 'bag'))
-    camera = command('run', 'synthetic_camera', '--ros-args', '-p', 'wait_for_subscribers:=1',
-                     '-p', 'rate:=300.0')
+    camera = command(
+        'run',
+        'synthetic_camera',
+        '--ros-args',
+        '-p',
+        'wait_for_subscribers:=1',
+        '-p',
+        'rate:=300.0',
+    )
     file = tmp_path / 'bag' / 'bag_0.mcap'
     until(lambda: file.exists() and file.stat().st_size > 20_000)
     recorder.process.send_signal(signal.SIGKILL)
@@ -479,17 +530,40 @@ def test_measured_camera_and_localizer_agree_with_the_command(
     command: Callable[..., NodeProcess], tmp_path: Path
 ) -> None:
     lens = tmp_path / 'lens.yaml'
-    assert main(['calibrate', str(DATA / 'train.csv'), '--model', 'kannala_brandt',
-                 '--image-size', '1280x800', '-o', str(lens)]) == 0
-    assert main(['localize', str(DATA / 'test.csv'), '--lens', str(lens),
-                 '-o', str(tmp_path)]) == 0
+    assert (
+        main(
+            [
+                'calibrate',
+                str(DATA / 'train.csv'),
+                '--model',
+                'kannala_brandt',
+                '--image-size',
+                '1280x800',
+                '-o',
+                str(lens),
+            ]
+        )
+        == 0
+    )
+    assert (
+        main(['localize', str(DATA / 'test.csv'), '--lens', str(lens), '-o', str(tmp_path)]) == 0
+    )
     recorder = command('record', '-o', str(tmp_path / 'bag'))
-    localizer = command('run', 'localizer', '--ros-args', '-p', f'lens:={lens}',
-                        '-p', 'wait_for_subscribers:=2')
+    localizer = command(
+        'run', 'localizer', '--ros-args', '-p', f'lens:={lens}', '-p', 'wait_for_subscribers:=2'
+    )
     camera = command(
-        'run', 'measured_camera', '--ros-args', '-p', f'observations:={DATA / "test.csv"}',
-        '-p', 'wait_for_subscribers:=2', '-p', 'repeat:=false',
-        '-p', 'lock_step:=localizer/result',
+        'run',
+        'measured_camera',
+        '--ros-args',
+        '-p',
+        f'observations:={DATA / "test.csv"}',
+        '-p',
+        'wait_for_subscribers:=2',
+        '-p',
+        'repeat:=false',
+        '-p',
+        'lock_step:=localizer/result',
     )
     assert camera.finish() == 0
     assert recorder.finish(signal.SIGINT) == 0 and localizer.finish(signal.SIGINT) == 0

@@ -83,10 +83,18 @@ def test_one_camera_with_a_lens_file(graph: Callable[..., Graph], lens: Path) ->
     np.testing.assert_allclose(np.reshape(infos[-1].p, (3, 4)), side.p)
 
 
-@pytest.mark.parametrize(('encoding', 'sent'), [
-    ('rgb8', 'rgb8'), ('bgra8', 'bgra8'), ('mono16', 'mono16'), ('bayer_rggb8', 'bgr8'),
-    ('yuv422_yuy2', 'bgr8'), ('nv12', 'mono8'), ('8UC3', '8UC3'),
-])
+@pytest.mark.parametrize(
+    ('encoding', 'sent'),
+    [
+        ('rgb8', 'rgb8'),
+        ('bgra8', 'bgra8'),
+        ('mono16', 'mono16'),
+        ('bayer_rggb8', 'bgr8'),
+        ('yuv422_yuy2', 'bgr8'),
+        ('nv12', 'mono8'),
+        ('8UC3', '8UC3'),
+    ],
+)
 def test_encodings_stay_where_pixels_have_colors(
     graph: Callable[..., Graph], lens: Path, encoding: str, sent: str
 ) -> None:
@@ -97,8 +105,14 @@ def test_encodings_stay_where_pixels_have_colors(
     channels = {'rgb8': 3, '8UC3': 3, 'bgra8': 4, 'yuv422_yuy2': 2, 'mono16': 2}.get(encoding, 1)
     height = LENS.height * 3 // 2 if encoding == 'nv12' else LENS.height
     data = np.full((height, LENS.width * channels), 128, np.uint8)
-    raw = Image(header=header(7, 'optical'), height=LENS.height, width=LENS.width,
-                encoding=encoding, step=data.shape[1], data=array('B', data.tobytes()))
+    raw = Image(
+        header=header(7, 'optical'),
+        height=LENS.height,
+        width=LENS.width,
+        encoding=encoding,
+        step=data.shape[1],
+        data=array('B', data.tobytes()),
+    )
     g.until(lambda: (tell.publish(raw), images)[1])
     assert images[-1].encoding == sent
     assert (np.abs(pixels_of(images[-1])[200, 200].astype(int) - 128) <= 4).all()
@@ -117,8 +131,12 @@ def test_compressed_images_come_out_once(graph: Callable[..., Graph], lens: Path
     assert images[-1].encoding == 'bgr8' and images[-1].header.frame_id == 'optical'
     before = node._inputs['image'].count.received
     heard = len(images)
-    g.until(lambda: (tell.publish(image_message(grey, 5, 'optical')),
-                     node._inputs['image'].count.received > before + 1)[1])
+    g.until(
+        lambda: (
+            tell.publish(image_message(grey, 5, 'optical')),
+            node._inputs['image'].count.received > before + 1,
+        )[1]
+    )
     g.idle(0.2)
     assert all(one.encoding == 'bgr8' for one in images[heard:])
 
@@ -151,8 +169,12 @@ def test_one_camera_with_a_camera_info(graph: Callable[..., Graph]) -> None:
     np.testing.assert_array_equal(pixels_of(images[-1]), side.remap(grey))
     # Another size than that of the lens is refused, and the next image comes through.
     dropped, heard = node._inputs['image'].count.dropped, len(images)
-    g.until(lambda: (tell.publish(image_message(grey[:-1], 9, 'optical')),
-                     node._inputs['image'].count.dropped > dropped)[1])
+    g.until(
+        lambda: (
+            tell.publish(image_message(grey[:-1], 9, 'optical')),
+            node._inputs['image'].count.dropped > dropped,
+        )[1]
+    )
     g.until(lambda: (tell.publish(raw), len(images) > heard)[1])
     kept = node._side('', 7)
     assert node._side('', 8) is kept  # maps are computed once
@@ -169,27 +191,40 @@ def lenses(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize('source', ['file', 'camera_info', 'folder'])
 def test_a_stereo_pair(graph: Callable[..., Graph], lenses: Path, source: str) -> None:
-    given = [f'lens:={lenses}/'] if source == 'file' else [
-        f'rig:={lenses}/' + 'rig.yaml' * (source != 'folder')]
+    given = (
+        [f'lens:={lenses}/']
+        if source == 'file'
+        else [f'rig:={lenses}/' + 'rig.yaml' * (source != 'folder')]
+    )
     g = graph('stereo:=true', f'field_of_view:={FIELD}', 'range:=0.2', *given)
     g.start(Rectifier)
     known = (LENS, RIGHT) if source == 'file' else (LENS.svp(), RIGHT.svp())
     pair = fsvp.rectify_maps(*known, RIG, field_of_view=FIELD, range_m=0.2)
     camera, sides = poses(1, 4).take(0), {}
     told = []
-    for name, one, pose in (('left', LENS, camera), ('right', RIGHT, camera.compose(
-            RIG.inverse()))):
+    for name, one, pose in (
+        ('left', LENS, camera),
+        ('right', RIGHT, camera.compose(RIG.inverse())),
+    ):
         grey = render(one, PRINTED, pose, Exposure(), np.random.default_rng(0))
-        sides[name] = (grey, image_message(grey, 7, f'{name}_optical'),
-                       g.hear(Image, f'{name}/image_rect', SENSOR),
-                       g.hear(CameraInfo, f'{name}/camera_info', SENSOR))
+        sides[name] = (
+            grey,
+            image_message(grey, 7, f'{name}_optical'),
+            g.hear(Image, f'{name}/image_rect', SENSOR),
+            g.hear(CameraInfo, f'{name}/camera_info', SENSOR),
+        )
         told.append((g.tell(Image, f'{name}/image', SENSOR), sides[name][1]))
         info = g.tell(CameraInfo, f'{name}/image/camera_info', LATCHED)
         info.publish(camera_info_message(one, 7, f'{name}_optical'))
-    g.until(lambda: ([tell.publish(raw) for tell, raw in told],
-                     all(images and infos for *_, images, infos in sides.values()))[1])
-    for side, (grey, raw, images, infos) in zip((pair.left, pair.right), sides.values(),
-                                                strict=True):
+    g.until(
+        lambda: (
+            [tell.publish(raw) for tell, raw in told],
+            all(images and infos for *_, images, infos in sides.values()),
+        )[1]
+    )
+    for side, (grey, raw, images, infos) in zip(
+        (pair.left, pair.right), sides.values(), strict=True
+    ):
         contract(infos[-1], images[-1], raw)
         np.testing.assert_array_equal(pixels_of(images[-1]), side.remap(grey))
     # stereo_image_proc: same K and size; Tx = -fx * baseline in the right P alone.
@@ -235,7 +270,9 @@ def test_a_topic_that_would_be_heard_and_published_is_refused(ros_domain: int) -
 def test_shared_memory_holds_images() -> None:
     """As docs/reference/nodes.md tells to use it: several color images of 1280 x 800 px."""
     profile = ElementTree.parse(ROOT / 'config' / 'fastdds' / 'images.xml')
-    sizes = {name: int(profile.findtext(f'.//{{*}}{name}') or 0)
-             for name in ('segment_size', 'maxMessageSize')}
+    sizes = {
+        name: int(profile.findtext(f'.//{{*}}{name}') or 0)
+        for name in ('segment_size', 'maxMessageSize')
+    }
     image = 3 * 1280 * 800
     assert sizes['segment_size'] > 10 * image and sizes['maxMessageSize'] > image

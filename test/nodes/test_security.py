@@ -18,7 +18,8 @@ from fisheye_svp_ros.nodes import NODES
 
 OBSERVATIONS = 'frame,landmark,u,v,x,y,z,camera\n' + ''.join(
     f'0,{i},{100 + 7 * i},{200 - 3 * i},{0.1 * i},{0.01 * i * i},1,{camera}\n'
-    for camera in ('left', 'right') for i in range(6)
+    for camera in ('left', 'right')
+    for i in range(6)
 )
 SOLVERS = ('localizer', 'stereo_calibrator', 'stereo_depth', 'model_critic')
 
@@ -29,11 +30,23 @@ def graph(ros_domain: int, tmp_path: Path) -> Iterator[Graph]:
     path = tmp_path / 'observations.csv'
     path.write_text(OBSERVATIONS)
     solvers = [word for name in SOLVERS for word in ('-p', f'{name}:lens:=camera_info')]
-    one = Graph('-p', f'observations:={path}', '-p', 'style:=parallel',
-                '-p', 'lock_step:=localizer/result',
-                '-p', f'publish_tf:={find_spec("tf2_msgs") is not None}', *solvers,
-                '-p', 'guide:=e0', '-p', f'guide_output:={tmp_path / "guided"}',
-                '-p', 'detector:lens:=camera_info')
+    one = Graph(
+        '-p',
+        f'observations:={path}',
+        '-p',
+        'style:=parallel',
+        '-p',
+        'lock_step:=localizer/result',
+        '-p',
+        f'publish_tf:={find_spec("tf2_msgs") is not None}',
+        *solvers,
+        '-p',
+        'guide:=e0',
+        '-p',
+        f'guide_output:={tmp_path / "guided"}',
+        '-p',
+        'detector:lens:=camera_info',
+    )
     yield one
     one.close()
 
@@ -41,8 +54,8 @@ def graph(ros_domain: int, tmp_path: Path) -> Iterator[Graph]:
 def policy(name: str) -> dict[str, set[str]]:
     """Return the patterns of full names that a policy allows, by what for."""
     root = ElementTree.parse(ROOT / 'config' / 'sros2' / f'{name}.policy.xml').getroot()
-    enclave, = root.iter('enclave')
-    profile, = root.iter('profile')
+    (enclave,) = root.iter('enclave')
+    (profile,) = root.iter('profile')
     assert enclave.get('path') == f'/{name}' and profile.get('node') == name
     allowed: dict[str, set[str]] = {'publish': set(), 'subscribe': set(), 'reply': set()}
     for element in profile:

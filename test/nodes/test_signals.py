@@ -31,6 +31,7 @@ def handlers() -> Iterator[list[object]]:
 
 def interrupted(number: signal.Signals, went_on: list[bool]) -> Callable[..., None]:
     """Return a function that gets a signal."""
+
     def run(*_: object, **__: object) -> None:
         os.kill(os.getpid(), number)
         went_on.append(True)
@@ -39,11 +40,20 @@ def interrupted(number: signal.Signals, went_on: list[bool]) -> Callable[..., No
 
 
 @pytest.mark.parametrize('number', SIGNALS)
-@pytest.mark.parametrize(('command', 'kind', 'status', 'text'), [
-    ('record', Recorder, 2, RECORDED), ('watch', Watcher, 0, '')])
+@pytest.mark.parametrize(
+    ('command', 'kind', 'status', 'text'),
+    [('record', Recorder, 2, RECORDED), ('watch', Watcher, 0, '')],
+)
 def test_a_signal_ends_the_building_of_a_node_there_and_then(
-    command: str, kind: type, status: int, text: str, number: signal.Signals, ros_domain: int,
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
+    command: str,
+    kind: type,
+    status: int,
+    text: str,
+    number: signal.Signals,
+    ros_domain: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
     handlers: list[object],
 ) -> None:
     went_on: list[bool] = []
@@ -58,7 +68,10 @@ def test_a_signal_ends_the_building_of_a_node_there_and_then(
 
 @pytest.mark.parametrize('number', SIGNALS)
 def test_a_signal_before_there_is_a_recorder_is_not_lost(
-    number: signal.Signals, ros_domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    number: signal.Signals,
+    ros_domain: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr('fisheye_svp_ros.nodes.session.rclpy.init', interrupted(number, []))

@@ -17,18 +17,26 @@ from benchmark.soak import hostile
 from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
 from fisheye_svp_ros.nodes.localizer import Localizer
 
-KINDS = {'landmarks': PointCloud2, 'scenario': DiagnosticArray, 'true_pose': PoseStamped,
-         'image_points': PointCloud2}
+KINDS = {
+    'landmarks': PointCloud2,
+    'scenario': DiagnosticArray,
+    'true_pose': PoseStamped,
+    'image_points': PointCloud2,
+}
 
 
 def test_every_hostile_message_is_received_read_and_counted(graph: Callable[..., Graph]) -> None:
     g = graph('patience:=5.0', 'backlog:=10000')
-    results, diagnostics = g.hear(DiagnosticArray, 'localizer/result'), g.hear(
-        DiagnosticArray, '/diagnostics')
+    results, diagnostics = (
+        g.hear(DiagnosticArray, 'localizer/result'),
+        g.hear(DiagnosticArray, '/diagnostics'),
+    )
     g.start(Localizer)
     writers = {topic: g.tell(kind, topic) for topic, kind in KINDS.items()}
-    scratch = {topic: g.probe.create_publisher(kind, f'nowhere/{topic}', 1)
-               for topic, kind in KINDS.items()}
+    scratch = {
+        topic: g.probe.create_publisher(kind, f'nowhere/{topic}', 1)
+        for topic, kind in KINDS.items()
+    }
 
     def sends(topic: str, data: bytes) -> bool:
         try:
@@ -38,9 +46,10 @@ def test_every_hostile_message_is_received_read_and_counted(graph: Callable[...,
         return True
 
     rng, sent, unusable = Random(5), Counter[str](), Counter[str]()
-    attacks = {topic: hostile.pool(topic, kind, 80, rng,
-                                   lambda data, topic=topic: sends(topic, data))
-               for topic, kind in KINDS.items()}
+    attacks = {
+        topic: hostile.pool(topic, kind, 80, rng, lambda data, topic=topic: sends(topic, data))
+        for topic, kind in KINDS.items()
+    }
     for stamp in range(1, 301):
         for topic, pool in attacks.items():
             attack = rng.choice(pool)
@@ -63,7 +72,7 @@ def test_every_hostile_message_is_received_read_and_counted(graph: Callable[...,
     for topic in ('scenario', 'true_pose'):
         unread = sent[topic] - int(told[f'{topic}: read'])
         assert 0 <= unusable[topic] - int(told[f'{topic}: dropped']) <= unread
-    (stamp, good), = hostile.good_sets(('',), 1, 10**9)
+    ((stamp, good),) = hostile.good_sets(('',), 1, 10**9)
     for topic, data in good:
         writers[topic].publish(data)
 

@@ -45,7 +45,8 @@ def moved(seconds: float) -> Pose:
 def points_message(pose: Pose, stamp: int) -> Any:
     image = project(LENS, pose.into_body(LANDMARKS.points))
     return messages.image_points_message(
-        LANDMARKS.ids[image.valid], image.uv[image.valid], stamp, 'camera')
+        LANDMARKS.ids[image.valid], image.uv[image.valid], stamp, 'camera'
+    )
 
 
 class Solving:
@@ -69,14 +70,15 @@ class Solving:
 
     def metrics(self, stamp: int) -> dict[str, float]:
         """Return the metrics of a set, once they are there."""
-        message = self.graph.until(lambda: next(
-            (m for m in self.results if stamp_of(m) == stamp), None))
+        message = self.graph.until(
+            lambda: next((m for m in self.results if stamp_of(m) == stamp), None)
+        )
         assert not message.status[0].message, message.status[0].message
         return {name: float(value) for name, value in read_key_values(message).items()}
 
 
 def test_true_poses_of_a_tracker_are_interpolated_without_delay(
-    graph: Callable[..., Graph]
+    graph: Callable[..., Graph],
 ) -> None:
     solving = Solving(graph('lens:=fish214', 'svp:=true', PATIENCE), Localizer)
     solving.tell_landmarks(0)
@@ -84,16 +86,15 @@ def test_true_poses_of_a_tracker_are_interpolated_without_delay(
     for stamp in poses:
         solving.tell_pose(moved(stamp / 1000), stamp * MS)
     for stamp in sets:
-        solving.points[0].publish(points_message(moved((stamp + 0.4) / 1000),
-                                                 stamp * MS + 400_000))
+        solving.points[0].publish(
+            points_message(moved((stamp + 0.4) / 1000), stamp * MS + 400_000)
+        )
     for stamp in sets:
         metrics = solving.metrics(stamp * MS + 400_000)
         assert metrics['position_error_m'] < 1e-6 and metrics['rotation_error_rad'] < 1e-6
 
 
-def test_a_true_pose_that_nobody_publishes_is_not_waited_for(
-    graph: Callable[..., Graph]
-) -> None:
+def test_a_true_pose_that_nobody_publishes_is_not_waited_for(graph: Callable[..., Graph]) -> None:
     g = graph('lens:=fish214', 'svp:=true', 'patience:=3600.0')
     results = g.hear(DiagnosticArray, 'localizer/result')
     g.start(Localizer)
@@ -109,8 +110,13 @@ def test_a_measured_camera_announces_true_poses_that_it_has(
     """A solver would wait for others, before its first set."""
     write_observations(tmp_path / 'seen.csv', simulate_scenario(Scenario()).observations)
     write_poses(tmp_path / 'poses.csv', np.array([0]), moved(0.0).reshape(1))
-    g = graph(f'observations:={tmp_path}/seen.csv', 'lens:=fish214', 'patience:=3600.0',
-              f'folder:={tmp_path}', 'rate:=20.0')
+    g = graph(
+        f'observations:={tmp_path}/seen.csv',
+        'lens:=fish214',
+        'patience:=3600.0',
+        f'folder:={tmp_path}',
+        'rate:=20.0',
+    )
     results = g.hear(DiagnosticArray, 'localizer/result')
     g.start(Localizer)
     camera = g.start(MeasuredCamera)
@@ -121,18 +127,20 @@ def test_a_measured_camera_announces_true_poses_that_it_has(
 
 
 def test_poses_that_are_too_far_apart_give_no_error_and_no_delay(
-    graph: Callable[..., Graph]
+    graph: Callable[..., Graph],
 ) -> None:
     solving = Solving(
-        graph('lens:=fish214', 'svp:=true', 'true_pose_gap:=0.005', PATIENCE), Localizer)
+        graph('lens:=fish214', 'svp:=true', 'true_pose_gap:=0.005', PATIENCE), Localizer
+    )
     solving.tell_landmarks(0)
     for stamp in range(1000, 1200, 10):
         solving.tell_pose(moved(stamp / 1000), stamp * MS)
     solving.points[0].publish(points_message(moved(1.104), 1104 * MS))
     metrics = solving.metrics(1104 * MS)
     assert metrics['rms_px'] < 1e-6 and 'position_error_m' not in metrics
-    solving.graph.until(lambda: any('the nearest stamp is 4.0 ms' in m.status[0].message
-                                    for m in solving.reports))
+    solving.graph.until(
+        lambda: any('the nearest stamp is 4.0 ms' in m.status[0].message for m in solving.reports)
+    )
 
 
 def test_a_true_pose_that_is_lost_is_not_made_up(graph: Callable[..., Graph]) -> None:
@@ -161,26 +169,39 @@ def rig_sets(solving: Solving, stamps: tuple[int, int], offset: Array) -> None:
 
 @pytest.mark.parametrize('apart', [0, 1 * MS, -1 * MS])
 def test_cameras_a_little_apart_are_paired(graph: Callable[..., Graph], apart: int) -> None:
-    solving = Solving(graph('lens:=fish214', 'svp:=true', 'approximate_sync:=true',
-                            'approximate_sync_tolerance_seconds:=0.001', PATIENCE),
-                      StereoDepth, RIG)
+    solving = Solving(
+        graph(
+            'lens:=fish214',
+            'svp:=true',
+            'approximate_sync:=true',
+            'approximate_sync_tolerance_seconds:=0.001',
+            PATIENCE,
+        ),
+        StereoDepth,
+        RIG,
+    )
     rig_sets(solving, (1000 * MS, 1000 * MS + apart), np.array([-0.15, 0, 0]))
     metrics = solving.metrics(1000 * MS)
     assert metrics['points'] > 10 and metrics['error3_m'] < 1e-6
 
 
-@pytest.mark.parametrize('parameters', [
-    (), ('approximate_sync:=true', 'approximate_sync_tolerance_seconds:=0.0009')])
+@pytest.mark.parametrize(
+    'parameters', [(), ('approximate_sync:=true', 'approximate_sync_tolerance_seconds:=0.0009')]
+)
 def test_cameras_too_far_apart_are_told_by_how_much(
     graph: Callable[..., Graph], parameters: tuple[str, ...]
 ) -> None:
-    solving = Solving(graph('lens:=fish214', 'svp:=true', 'patience:=0.2', *parameters),
-                      StereoDepth, RIG)
+    solving = Solving(
+        graph('lens:=fish214', 'svp:=true', 'patience:=0.2', *parameters), StereoDepth, RIG
+    )
     rig_sets(solving, (1000 * MS, 1001 * MS), np.array([-0.15, 0, 0]))
-    solving.graph.until(lambda: any(
-        'the nearest stamp on right/image_points is 1.0 ms off' in m.status[0].message
-        or 'the nearest stamp on left/image_points is 1.0 ms off' in m.status[0].message
-        for m in solving.reports))
+    solving.graph.until(
+        lambda: any(
+            'the nearest stamp on right/image_points is 1.0 ms off' in m.status[0].message
+            or 'the nearest stamp on left/image_points is 1.0 ms off' in m.status[0].message
+            for m in solving.reports
+        )
+    )
     assert not solving.results
 
 
@@ -195,7 +216,7 @@ def test_landmarks_that_came_once_hold_for_all_sets(graph: Callable[..., Graph])
 
 
 def test_landmarks_that_come_set_by_set_never_stand_in_for_others(
-    graph: Callable[..., Graph]
+    graph: Callable[..., Graph],
 ) -> None:
     solving = Solving(graph('lens:=fish214', 'svp:=true', 'patience:=0.2'), Localizer)
     for stamp in (1000, 1100):
@@ -203,8 +224,9 @@ def test_landmarks_that_come_set_by_set_never_stand_in_for_others(
         solving.points[0].publish(points_message(moved(1.0), stamp * MS))
     assert solving.metrics(1100 * MS)
     solving.points[0].publish(points_message(moved(1.0), 1150 * MS))
-    message = solving.graph.until(lambda: next(
-        (m for m in solving.results if stamp_of(m) == 1150 * MS), None))
+    message = solving.graph.until(
+        lambda: next((m for m in solving.results if stamp_of(m) == 1150 * MS), None)
+    )
     assert 'the nearest is 50.0 ms off' in message.status[0].message
     assert 'with stamp 0' in message.status[0].message
     solving.tell_landmarks(0)

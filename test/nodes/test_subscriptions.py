@@ -24,8 +24,15 @@ def test_what_several_subscriptions_bring_is_taken_once_and_in_order() -> None:
     heard: list[bytes] = []
     once = DuplicateFilter(heard.append, history=True)
     one, other = once.callback(), once.callback()
-    for hear, data in ((one, b'a'), (one, b'b'), (other, b'a'), (other, b'b'), (other, b'c'),
-                       (one, b'a'), (other, b'a')):
+    for hear, data in (
+        (one, b'a'),
+        (one, b'b'),
+        (other, b'a'),
+        (other, b'b'),
+        (other, b'c'),
+        (one, b'a'),
+        (other, b'a'),
+    ):
         hear(data)
     assert heard == [b'a', b'b', b'c', b'a']
 
@@ -82,8 +89,10 @@ def test_subscriptions_are_added_as_publishers_need_them(graph: Callable[..., Gr
     node = g.start(Localizer)
 
     def asked() -> list[tuple[str, str]]:
-        return [(one.reliability.name, one.durability.name)
-                for one in node._inputs['landmarks'].profiles]
+        return [
+            (one.reliability.name, one.durability.name)
+            for one in node._inputs['landmarks'].profiles
+        ]
 
     assert asked() == [('RELIABLE', 'VOLATILE')]
     g.probe.create_publisher(PointCloud2, 'landmarks', 1)
@@ -110,30 +119,36 @@ def test_landmarks_that_were_latched_by_two_are_all_heard(graph: Callable[..., G
 
 
 def test_an_override_stays_as_the_user_has_it(graph: Callable[..., Graph]) -> None:
-    g = graph('qos_overrides./landmarks.subscription.durability:=transient_local',
-              'qos_overrides./landmarks.subscription.depth:=7')
+    g = graph(
+        'qos_overrides./landmarks.subscription.durability:=transient_local',
+        'qos_overrides./landmarks.subscription.depth:=7',
+    )
     node = g.start(Localizer)
     g.probe.create_publisher(PointCloud2, 'landmarks', BEST_EFFORT)
     g.idle(1.5)
-    profile, = node._inputs['landmarks'].profiles
+    (profile,) = node._inputs['landmarks'].profiles
     assert profile.durability == DurabilityPolicy.TRANSIENT_LOCAL and profile.depth == 7
 
 
-@pytest.mark.parametrize(('remapped', 'topics'), [
-    ((), ('/image', '/image/compressed')),
-    (('image:=/camera/image_raw',), ('/camera/image_raw', '/camera/image_raw/compressed')),
-    (('image:=cam', '__ns:=/left'), ('/left/cam', '/left/cam/compressed')),
-    (('image:=/raw', 'image/compressed:=/small'), ('/raw', '/small')),
-    (('image/compressed:=/small',), ('/image', '/small')),
-])
+@pytest.mark.parametrize(
+    ('remapped', 'topics'),
+    [
+        ((), ('/image', '/image/compressed')),
+        (('image:=/camera/image_raw',), ('/camera/image_raw', '/camera/image_raw/compressed')),
+        (('image:=cam', '__ns:=/left'), ('/left/cam', '/left/cam/compressed')),
+        (('image:=/raw', 'image/compressed:=/small'), ('/raw', '/small')),
+        (('image/compressed:=/small',), ('/image', '/small')),
+    ],
+)
 def test_compressed_images_go_with_the_others(
     ros_domain: int, remapped: tuple[str, ...], topics: tuple[str, str]
 ) -> None:
     g = Graph(*(word for one in remapped for word in ('-r', one)))
     try:
         node = g.start(Detector)
-        assert tuple(node._inputs[name].resolved
-                     for name in ('image', 'image/compressed')) == topics
+        assert (
+            tuple(node._inputs[name].resolved for name in ('image', 'image/compressed')) == topics
+        )
         for kind, topic in ((Image, topics[0]), (CompressedImage, topics[1])):
             publisher = g.probe.create_publisher(kind, topic, BEST_EFFORT)
             g.until(lambda publisher=publisher: publisher.get_subscription_count())

@@ -58,9 +58,7 @@ def test_without_tf2_it_is_refused_at_the_start(
         g.start(kind)
 
 
-def test_the_camera_as_estimated_and_as_true(
-    graph: Callable[..., Graph], tf_message: Any
-) -> None:
+def test_the_camera_as_estimated_and_as_true(graph: Callable[..., Graph], tf_message: Any) -> None:
     g = graph('publish_tf:=true', 'svp:=false', 'rate:=50.0', 'world_frame:=map')
     heard = g.hear(tf_message, '/tf')
     estimated = g.hear(PoseWithCovarianceStamped, 'localizer/pose')
@@ -73,8 +71,9 @@ def test_the_camera_as_estimated_and_as_true(
     g.until(lambda: set(edges(heard)) == both and residuals and markers)
     for edge, poses in zip(sorted(both), (estimated, true), strict=True):
         one = edges(heard)[edge][0]
-        g.until(lambda one=one, poses=poses: any(p.header.stamp == one.header.stamp
-                                                 for p in poses))
+        g.until(
+            lambda one=one, poses=poses: any(p.header.stamp == one.header.stamp for p in poses)
+        )
         pose = next(p for p in poses if p.header.stamp == one.header.stamp)
         told = read_pose(pose if edge[1].endswith('_true') else pose.pose, 'pose')
         assert np.array_equal(read_transform(one).position, told.position)
@@ -84,8 +83,14 @@ def test_the_camera_as_estimated_and_as_true(
 
 
 def test_the_rig_and_its_points_resolve(graph: Callable[..., Graph], tf_message: Any) -> None:
-    g = graph('publish_tf:=true', 'svp:=false', 'rate:=20.0', 'style:=vergent', 'radius:=0.5',
-              'poses_file:=calibration')
+    g = graph(
+        'publish_tf:=true',
+        'svp:=false',
+        'rate:=20.0',
+        'style:=vergent',
+        'radius:=0.5',
+        'poses_file:=calibration',
+    )
     heard, static = g.hear(tf_message, '/tf'), g.hear(tf_message, '/tf_static', LATCHED)
     points = g.hear(PointCloud2, 'stereo_depth/points')
     landmarks = g.hear(PointCloud2, 'landmarks', LATCHED)
@@ -99,8 +104,7 @@ def test_the_rig_and_its_points_resolve(graph: Callable[..., Graph], tf_message:
     assert cloud.header.frame_id == right
 
     def at(edge: tuple[str, str], message: list[Any]) -> Pose:
-        return next(read_transform(one) for one in edges(message)[edge]
-                    if stamp_of(one) == stamp)
+        return next(read_transform(one) for one in edges(message)[edge] if stamp_of(one) == stamp)
 
     true = 'world', f'{right}_true'
     g.until(lambda: any(stamp_of(one) == stamp for one in edges(heard)[true]))
@@ -133,17 +137,25 @@ def test_a_frame_without_a_name_is_no_transform(
     assert not heard and "frame_id '' cannot be the parent" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize(('words', 'given', 'frames'), [
-    ((), (), ('left_camera_optical_frame', 'right_camera_optical_frame')),
-    (('__ns:=/front/low',), (), ('front_low_left_camera_optical_frame',
-                                 'front_low_right_camera_optical_frame')),
-    (('__ns:=/front',), ('camera_frame:=cam',), ('left_cam', 'right_cam')),
-])
+@pytest.mark.parametrize(
+    ('words', 'given', 'frames'),
+    [
+        ((), (), ('left_camera_optical_frame', 'right_camera_optical_frame')),
+        (
+            ('__ns:=/front/low',),
+            (),
+            ('front_low_left_camera_optical_frame', 'front_low_right_camera_optical_frame'),
+        ),
+        (('__ns:=/front',), ('camera_frame:=cam',), ('left_cam', 'right_cam')),
+    ],
+)
 def test_frames_follow_the_namespace_unless_they_are_named(
     ros_domain: int, words: tuple[str, ...], given: tuple[str, ...], frames: tuple[str, str]
 ) -> None:
-    g = Graph(*(w for one in words for w in ('-r', one)),
-              *(w for one in ('style:=parallel', *given) for w in ('-p', one)))
+    g = Graph(
+        *(w for one in words for w in ('-r', one)),
+        *(w for one in ('style:=parallel', *given) for w in ('-p', one)),
+    )
     try:
         node = g.start(SyntheticCamera)
         assert tuple(node.camera(name).frame for name in ('left', 'right')) == frames
@@ -165,7 +177,14 @@ def test_a_frame_that_another_node_tells_of_is_said(
 
     def said() -> Any:
         other.publish(tf_message(transforms=[transform]))
-        return next((m for m in reports if "/tf: another node also publishes 'camera_optical_"
-                     "frame', with parent 'base_link'" in m.status[0].message), None)
+        return next(
+            (
+                m
+                for m in reports
+                if "/tf: another node also publishes 'camera_optical_"
+                "frame', with parent 'base_link'" in m.status[0].message
+            ),
+            None,
+        )
 
     assert g.until(said).status[0].name == '/localizer: inputs'

@@ -19,9 +19,13 @@ from rich.console import Console
 from fisheye_svp_ros.commands import watch
 
 
-@pytest.mark.parametrize(('width', 'shown'), [
-    (24, 'the terminal must be 64 columns wide; this one has 24'),
-    (64, '-0.0123457 -0.0123457 0.0123457')])
+@pytest.mark.parametrize(
+    ('width', 'shown'),
+    [
+        (24, 'the terminal must be 64 columns wide; this one has 24'),
+        (64, '-0.0123457 -0.0123457 0.0123457'),
+    ],
+)
 def test_a_terminal_that_is_too_narrow_is_told_so(width: int, shown: str) -> None:
     from fisheye_svp_ros.nodes.watcher import MetricHistory, Results
 
@@ -47,9 +51,20 @@ def test_results_are_shown_with_their_metrics(
     start('run', 'localizer', '--ros-args', '-r', '__ns:=/here', '-p', 'wait_for_subscribers:=2')
     shown = start('watch')
     camera = start(
-        'run', 'synthetic_camera', '--ros-args', '-r', '__ns:=/here', '-p',
-        f'sweep.environment:=[whole, {few}]', '-p', 'wait_for_subscribers:=1', '-p',
-        'repeat:=false', '-p', 'lock_step:=localizer/result')
+        'run',
+        'synthetic_camera',
+        '--ros-args',
+        '-r',
+        '__ns:=/here',
+        '-p',
+        f'sweep.environment:=[whole, {few}]',
+        '-p',
+        'wait_for_subscribers:=1',
+        '-p',
+        'repeat:=false',
+        '-p',
+        'lock_step:=localizer/result',
+    )
     assert camera.finish() == 0
     shown.wait_for('2 sets, 1 not solved')
     assert shown.finish(signal.SIGINT) == 0

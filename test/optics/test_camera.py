@@ -44,11 +44,13 @@ def assert_equals_reference(lens, points):
 @pytest.mark.parametrize('lens', LENSES)
 def test_projection_equals_high_precision(lens):
     rng = np.random.default_rng(5)
-    points = np.concatenate([
-        points_on_rays(lens, rng, 24),
-        points_around(rng, 24, 0.05, 0.3, 125.0),
-        points_around(rng, 8, 0.3, 3.0, 180.0),
-    ])
+    points = np.concatenate(
+        [
+            points_on_rays(lens, rng, 24),
+            points_around(rng, 24, 0.05, 0.3, 125.0),
+            points_around(rng, 8, 0.3, 3.0, 180.0),
+        ]
+    )
     valid = assert_equals_reference(lens, points)
     assert valid[:24].all()
     assert 0 < (~valid[24:]).sum() < 32
@@ -76,8 +78,15 @@ def test_projection_at_the_edges_of_the_domain(lens):
     assert not assert_equals_reference(lens, outside).any()
     assert project(lens, place(lens, edge, azimuth, distance)).valid.all()
     assert project(lens, outside, limited=False).valid.all()
-    axis = np.array([[0, 0, 0.3], [0, 0, lens.viewpoint_shift.s0 + 1e-6], [1e-12, 0, 0.3],
-                     [0, 0, lens.viewpoint_shift.s0 - 1e-6], [0, 0, -0.3]])
+    axis = np.array(
+        [
+            [0, 0, 0.3],
+            [0, 0, lens.viewpoint_shift.s0 + 1e-6],
+            [1e-12, 0, 0.3],
+            [0, 0, lens.viewpoint_shift.s0 - 1e-6],
+            [0, 0, -0.3],
+        ]
+    )
     assert assert_equals_reference(lens, axis).tolist() == [True, True, True, False, False]
 
 
@@ -99,6 +108,7 @@ def test_jacobians_equal_high_order_differences(lens):
     assert image.valid.all()
     np.testing.assert_array_equal(image.uv, project(lens, points).uv)
     for axis in np.eye(3):
+
         def moved(step, axis=axis):
             return project(lens, points + step * axis, limited=False).uv
 
@@ -107,6 +117,7 @@ def test_jacobians_equal_high_order_differences(lens):
         step = 4e-3 * np.linalg.norm(points, axis=-1, keepdims=True)
         assert np.max(np.abs(column - derivative(moved, step)) / scale) < 1e-7
     for name, value in lens.parameters.items():
+
         def changed(step, name=name, value=value):
             return project(lens.with_parameters([name], [value + step]), points, False).uv
 
@@ -140,8 +151,13 @@ def test_back_projection_round_trips_up_to_the_edge_of_the_field(lens):
     edge = lens.image_height.value_and_slope(np.array(lens.max_incidence))[0]
     height = edge * np.concatenate([np.sqrt(rng.uniform(0, 1, 200)), [0.0, 1 - 1e-9, 1.0]])
     azimuth = rng.uniform(-np.pi, np.pi, len(height))
-    uv = np.stack([lens.cx + lens.fx * height * np.cos(azimuth),
-                   lens.cy + lens.fy * height * np.sin(azimuth)], axis=-1)
+    uv = np.stack(
+        [
+            lens.cx + lens.fx * height * np.cos(azimuth),
+            lens.cy + lens.fy * height * np.sin(azimuth),
+        ],
+        axis=-1,
+    )
     rays = back_project(lens, uv)
     assert rays.valid.all()
     np.testing.assert_allclose(np.linalg.norm(rays.direction, axis=-1), 1.0, rtol=0, atol=1e-15)
@@ -156,8 +172,11 @@ def test_back_projection_round_trips_up_to_the_edge_of_the_field(lens):
 
 def test_a_curve_that_turns_back_within_the_field_still_has_rays_up_to_there():
     """A fit to some of the frames may do that, while the field is that of all of them."""
-    lens = replace(KITA[1].svp(), max_incidence=2.4,
-                   image_height=KannalaBrandt(-0.02, 0.0015, 0.0003, -0.0008))
+    lens = replace(
+        KITA[1].svp(),
+        max_incidence=2.4,
+        image_height=KannalaBrandt(-0.02, 0.0015, 0.0003, -0.0008),
+    )
     assert lens.image_height.limit < lens.max_incidence
     theta = np.array([0.1, 0.7, 0.99 * lens.image_height.limit])
     points = np.stack([np.sin(theta), 0 * theta, np.cos(theta)], axis=-1)
@@ -166,8 +185,9 @@ def test_a_curve_that_turns_back_within_the_field_still_has_rays_up_to_there():
     np.testing.assert_allclose(rays.theta, theta, rtol=0, atol=1e-9)
 
 
-BOTH = replace(KITA[1], viewpoint_shift=KITA[1].viewpoint_shift.plus(FlatPort(0.01, 1.5)),
-               max_incidence=1.4)
+BOTH = replace(
+    KITA[1], viewpoint_shift=KITA[1].viewpoint_shift.plus(FlatPort(0.01, 1.5)), max_incidence=1.4
+)
 
 
 @pytest.mark.parametrize('lens', [KITA[1], KITA[1].svp(), BOTH], ids=['shiftvp', 'svp', 'both'])
@@ -193,8 +213,15 @@ def test_any_leading_shape(lens, shape):
 
 @pytest.mark.parametrize('lens', [KITA[1], KITA[1].svp()], ids=['shiftvp', 'svp'])
 def test_nan_in_is_nan_and_a_flag_out(lens):
-    points = np.array([[0.1, 0.2, 0.5], [np.nan, 0.2, 0.5], [0.1, np.nan, 0.5], [0.1, 0.2, np.nan],
-                       [0.1, 0.2, 0.5]])
+    points = np.array(
+        [
+            [0.1, 0.2, 0.5],
+            [np.nan, 0.2, 0.5],
+            [0.1, np.nan, 0.5],
+            [0.1, 0.2, np.nan],
+            [0.1, 0.2, 0.5],
+        ]
+    )
     image = project_with_jacobian(lens, points)
     assert image.valid.tolist() == [True, False, False, False, True]
     assert np.isnan(image.uv).all(axis=-1).tolist() == [False, True, True, True, False]

@@ -54,12 +54,25 @@ def both_equal(expected, found, scale=1.0):
 def points_of_all_kinds(lens):
     """Points on rays, near the lens, far, behind it, on its axis, at it, and no points at all."""
     rng = np.random.default_rng(91)
-    special = [[0, 0, 0.3], [1e-12, 0, 0.3], [0, 1e-5, 0.4], [0, 0, -0.3], [0, 0, 0],
-               [np.nan, 0.1, 0.2], [0.1, 0.2, np.inf], [0.3, 0, 0], [0, -0.2, 1e-9]]
-    return np.concatenate([
-        points_on_rays(lens, rng, 300), points_around(rng, 300, 0.01, 0.3, 180.0),
-        points_around(rng, 400, 0.3, 1e4, 180.0), special,
-    ])
+    special = [
+        [0, 0, 0.3],
+        [1e-12, 0, 0.3],
+        [0, 1e-5, 0.4],
+        [0, 0, -0.3],
+        [0, 0, 0],
+        [np.nan, 0.1, 0.2],
+        [0.1, 0.2, np.inf],
+        [0.3, 0, 0],
+        [0, -0.2, 1e-9],
+    ]
+    return np.concatenate(
+        [
+            points_on_rays(lens, rng, 300),
+            points_around(rng, 300, 0.01, 0.3, 180.0),
+            points_around(rng, 400, 0.3, 1e4, 180.0),
+            special,
+        ]
+    )
 
 
 @pytest.mark.parametrize('lens', LENSES)
@@ -67,10 +80,11 @@ def points_of_all_kinds(lens):
 def test_projection_and_derivatives_of_any_point(compiled, lens, limited):
     points = points_of_all_kinds(lens)
     projected, expected, found = (
-        numpy_engine.project(lens, points, limited), *(
+        numpy_engine.project(lens, points, limited),
+        *(
             [part[0] for part in engine.linearise_views(lens, *identity(1), points[None], limited)]
             for engine in (numpy_engine, compiled)
-        )
+        ),
     )
     both_equal(projected, compiled.project(lens, points, limited), scale=lens.fx)
     some = np.isfinite(points).all(axis=1)  # no rotation turns a point at infinity
@@ -97,11 +111,17 @@ def test_derivatives_by_the_pose_whatever_the_number_of_points(compiled, count):
 def test_any_number_of_threads(compiled, monkeypatch, threads):
     monkeypatch.setattr(compiled, '_threads', lambda: threads)
     points = points_on_rays(FISH214, np.random.default_rng(93), 100_001, nearest=0.3)
-    both_equal(numpy_engine.project(FISH214, points, True),
-               compiled.project(FISH214, points, True), scale=1e3)
+    both_equal(
+        numpy_engine.project(FISH214, points, True),
+        compiled.project(FISH214, points, True),
+        scale=1e3,
+    )
     views = *identity(1000), points[1:].reshape(1000, 100, 3)
-    both_equal(numpy_engine.linearise_views(FISH214, *views, True),
-               compiled.linearise_views(FISH214, *views, True), scale=1e3)
+    both_equal(
+        numpy_engine.linearise_views(FISH214, *views, True),
+        compiled.linearise_views(FISH214, *views, True),
+        scale=1e3,
+    )
 
 
 def views_and_poses(count, points=33, noise=0.3):
@@ -145,7 +165,8 @@ def test_exact_images_cost_nothing(compiled):
     views, pose = views_and_poses(5, noise=0.0)
     start = pose.retract(np.full((5, 6), 1e-3))
     found, remaining, _ = compiled.localize(
-        FISH214, views.solver_inputs, views.row, MIN_POINTS, start)
+        FISH214, views.solver_inputs, views.row, MIN_POINTS, start
+    )
     assert remaining == 0 and found.converged.all() and found.cost.max() < 1e-12
     assert np.abs(found.pose.difference(pose)).max() < 1e-9
 
@@ -157,8 +178,9 @@ def test_small_changes_of_poses_are_those_of_the_reference(compiled):
     pose = identity(1).retract(rng.normal(size=(1, 6)))
     for size in (1e-8, 1e-3, 1.0):
         change, found = size * rng.normal(size=(1, 6)), identity(1)
-        retract(pose.rotation[0], pose.position[0], change[0], found.rotation[0],
-                found.position[0])
+        retract(
+            pose.rotation[0], pose.position[0], change[0], found.rotation[0], found.position[0]
+        )
         assert np.abs(found.difference(pose.retract(change))).max() < 1e-14
 
 
@@ -188,8 +210,9 @@ def test_an_information_is_inverted_whatever_its_units_unless_it_is_nearly_singu
         hessian = columns.T @ columns * scale * scale[:, None]
         assert _inverse(hessian, np.empty((6, 6)), found) == determined
         if determined:
-            np.testing.assert_allclose(found @ hessian * scale[:, None] / scale, np.eye(6),
-                                       atol=1e-6)
+            np.testing.assert_allclose(
+                found @ hessian * scale[:, None] / scale, np.eye(6), atol=1e-6
+            )
 
 
 def test_both_take_the_same_steps(compiled, monkeypatch):
@@ -215,17 +238,23 @@ def test_both_take_the_same_steps(compiled, monkeypatch):
 
 def test_the_rules_of_damping_are_the_same_compiled(compiled):
     rng = np.random.default_rng(96)
-    damping, growth, cost, before, moved, moved_before = (
-        10.0 ** rng.uniform(-14, 6, (6, 400)))
+    damping, growth, cost, before, moved, moved_before = 10.0 ** rng.uniform(-14, 6, (6, 400))
     cost[::7] = np.inf
     moved[::11], cost[1::13] = 0.0, before[1::13]
-    quick = [njit_of(rule) for rule in (
-        marquardt.is_last, marquardt.is_better, marquardt.update_damping)]
+    quick = [
+        njit_of(rule)
+        for rule in (marquardt.is_last, marquardt.is_better, marquardt.update_damping)
+    ]
     better = marquardt.is_better(cost, before)
-    arguments = ((moved, moved_before, before, damping), (cost, before),
-                 (damping, growth, better, before - cost, moved))
+    arguments = (
+        (moved, moved_before, before, damping),
+        (cost, before),
+        (damping, growth, better, before - cost, moved),
+    )
     for rule, compiled_rule, given in zip(
-        (marquardt.is_last, marquardt.is_better, marquardt.update_damping), quick, arguments,
+        (marquardt.is_last, marquardt.is_better, marquardt.update_damping),
+        quick,
+        arguments,
         strict=True,
     ):
         want = np.stack(np.atleast_2d(rule(*given)), axis=-1)
@@ -238,8 +267,10 @@ def test_rigs_and_their_covariances(compiled, engine, monkeypatch):
     model, landmarks = ForwardModel(FISH214), points_around(rng, 33, 0.5, 2.0, 60.0) * [1, 1, -1]
     left, right = (
         views_of(landmarks, uv + 0.3 * rng.normal(size=uv.shape))
-        for uv in (project(FISH214, p.into_body(landmarks)).uv
-                   for p in (calibration_poses().compose(rig('vergent')), calibration_poses()))
+        for uv in (
+            project(FISH214, p.into_body(landmarks)).uv
+            for p in (calibration_poses().compose(rig('vergent')), calibration_poses())
+        )
     )
     for systems in (1, 2):
         expected, found = on_each(lambda n=systems: calibrate_stereo(model, model, left, right, n))
@@ -264,7 +295,8 @@ def test_points_near_the_lens_and_singular_systems_go_to_the_reference(compiled,
     assert expected.converged.tolist() == found.converged.tolist() == [True, False, True]
     changed = views._replace(points=near)
     quick, remaining, flat = compiled.localize(
-        FISH214, changed.solver_inputs, changed.row, MIN_POINTS, pose)
+        FISH214, changed.solver_inputs, changed.row, MIN_POINTS, pose
+    )
     assert quick.converged.tolist() == [True, False, False] and remaining == 2 and flat == 1
     both_equal(expected.pose, found.pose)
     assert np.isnan(found.covariance[1]).all()
@@ -293,8 +325,10 @@ def test_a_curve_without_a_formula_goes_to_the_reference(compiled):
     assert compiled.pack_lens(lens) is None
     both_equal(numpy_engine.project(lens, points, True), compiled.project(lens, points, True))
     views = *identity(1), points[None]
-    both_equal(numpy_engine.linearise_views(lens, *views, True),
-               compiled.linearise_views(lens, *views, True))
+    both_equal(
+        numpy_engine.linearise_views(lens, *views, True),
+        compiled.linearise_views(lens, *views, True),
+    )
 
 
 def test_many_lenses_in_turn_are_not_mixed_up(compiled):
@@ -312,10 +346,15 @@ def unsettled(monkeypatch):
     monkeypatch.setenv(engines.VARIABLE, 'auto')
 
 
-@pytest.mark.parametrize(('filled', 'points', 'chosen'), [
-    (True, engines.LOADING - 1, 'numpy'), (True, engines.LOADING, 'numba'),
-    (False, engines.LOADING, 'numpy'), (False, 1e10, 'numba'),
-])
+@pytest.mark.parametrize(
+    ('filled', 'points', 'chosen'),
+    [
+        (True, engines.LOADING - 1, 'numpy'),
+        (True, engines.LOADING, 'numba'),
+        (False, engines.LOADING, 'numpy'),
+        (False, 1e10, 'numba'),
+    ],
+)
 def test_the_compiled_engine_comes_where_it_pays(
     compiled, unsettled, monkeypatch, filled, points, chosen
 ):
@@ -346,14 +385,22 @@ def test_what_another_installation_compiled_is_not_there(tmp_path):
     pytest.importorskip('numba', reason='the engine numba comes with the extra `fast`')
     here, there = Path(engines.__file__).parents[3], tmp_path / 'elsewhere'
     shutil.copytree(here / 'fisheye_svp_ros', there / 'fisheye_svp_ros')
-    code = ('from fisheye_svp_ros.optics.engines import cache\n'
-            'cache.folder().mkdir(parents=True, exist_ok=True)\n'
-            '{} or print(cache.is_compiled())')
+    code = (
+        'from fisheye_svp_ros.optics.engines import cache\n'
+        'cache.folder().mkdir(parents=True, exist_ok=True)\n'
+        '{} or print(cache.is_compiled())'
+    )
 
     def run(where, line):
         environment = os.environ | {'XDG_CACHE_HOME': str(tmp_path), 'PYTHONPATH': str(where)}
-        return subprocess.run([sys.executable, '-c', code.format(line)], env=environment,
-                              cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+        return subprocess.run(
+            [sys.executable, '-c', code.format(line)],
+            env=environment,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
 
     assert run(here, 'cache.mark_filled()') == 'True\n'
     assert run(there, 'None') == 'False\n'
@@ -361,14 +408,17 @@ def test_what_another_installation_compiled_is_not_there(tmp_path):
 
 
 def test_small_work_never_loads_numba():
-    code = ('import sys, numpy as np\n'
-            'from fisheye_svp_ros.optics.camera import project\n'
-            'from fisheye_svp_ros.io.lens_files import load_lens\n'
-            f'project(load_lens({str(lens_path("fish214"))!r}), np.ones((1000, 3)))\n'
-            'print("numba" in sys.modules)')
+    code = (
+        'import sys, numpy as np\n'
+        'from fisheye_svp_ros.optics.camera import project\n'
+        'from fisheye_svp_ros.io.lens_files import load_lens\n'
+        f'project(load_lens({str(lens_path("fish214"))!r}), np.ones((1000, 3)))\n'
+        'print("numba" in sys.modules)'
+    )
     environment = {k: v for k, v in os.environ.items() if k != engines.VARIABLE}
-    ran = subprocess.run([sys.executable, '-c', code], env=environment, capture_output=True,
-                         text=True, check=True)
+    ran = subprocess.run(
+        [sys.executable, '-c', code], env=environment, capture_output=True, text=True, check=True
+    )
     assert ran.stdout.strip() == 'False'
 
 
@@ -384,5 +434,4 @@ def test_a_wrong_or_missing_engine_is_one_line(monkeypatch, capsys):
 def test_the_engine_changes_no_answer_of_the_camera(engine):
     points = points_around(np.random.default_rng(97), 200, 0.01, 1.0, 180.0)
     image = project_with_jacobian(FISH214, points)
-    both_equal(numpy_engine.project(FISH214, points, True), (image.uv, image.valid),
-               scale=1e3)
+    both_equal(numpy_engine.project(FISH214, points, True), (image.uv, image.valid), scale=1e3)

@@ -56,9 +56,13 @@ def seen_points(lens, count=200):
 def test_the_spline_equals_that_of_scipy():
     field, uv = warp(), np.random.default_rng(1).uniform(-100, 1300, (500, 2))
     place = ((uv - field.low) / field.pitch).T[::-1] + 4
-    expected = np.stack([
-        map_coordinates(np.pad(part, 4), place, order=3, prefilter=False)
-        for part in np.moveaxis(field.values, -1, 0)], axis=-1)
+    expected = np.stack(
+        [
+            map_coordinates(np.pad(part, 4), place, order=3, prefilter=False)
+            for part in np.moveaxis(field.values, -1, 0)
+        ],
+        axis=-1,
+    )
     np.testing.assert_allclose(field.displacement(uv), expected, rtol=0, atol=1e-13)
 
 
@@ -121,20 +125,28 @@ def test_derivatives(lens):
     own, points = bent(lens), seen_points(lens, 60)
     image = project_with_jacobian(own, points)
     for axis in range(3):
-        moved = derivative(lambda d, axis=axis: project(
-            own, points + d * np.eye(3)[axis], limited=False).uv, 1e-4)
+        moved = derivative(
+            lambda d, axis=axis: project(own, points + d * np.eye(3)[axis], limited=False).uv, 1e-4
+        )
         np.testing.assert_allclose(image.d_point[..., axis], moved, rtol=2e-7, atol=1e-5)
     names = [name for name in own.parameters if not name.startswith('port_')]
     columns = lens_columns(own, image, (*names, 'f', *own.port_names))
     for name, column in zip(names, np.moveaxis(columns, -1, 0), strict=False):
         step = 0.01 * STEPS.get(name, 0.5)  # the third derivative jumps at the nodes
-        moved = derivative(lambda d, name=name: project(own.with_parameters(
-            [name], [own.parameters[name] + d]), points, limited=False).uv, step)
+        moved = derivative(
+            lambda d, name=name: (
+                project(
+                    own.with_parameters([name], [own.parameters[name] + d]), points, limited=False
+                ).uv
+            ),
+            step,
+        )
         np.testing.assert_allclose(column, moved, rtol=1e-6, atol=1e-6 * np.abs(moved).max())
     uv = image.uv
     for axis in range(2):
-        moved = derivative(lambda d, axis=axis: own.image_field.displacement(
-            uv + d * np.eye(2)[axis]), 1e-3)
+        moved = derivative(
+            lambda d, axis=axis: own.image_field.displacement(uv + d * np.eye(2)[axis]), 1e-3
+        )
         np.testing.assert_allclose(own.image_field.slope(uv)[..., axis], moved, atol=1e-9)
 
 
@@ -156,8 +168,9 @@ def test_a_pose_is_solved_with_the_field(shift):
 def test_maps_follow_the_field():
     own = bent(make_lens('equidistant', 'gennery'))
     camera = RectifiedCamera('pinhole', 300, 200, 180.0, 149.5, 99.5)
-    with_field, bare = (Rectification(one, camera, 2.0) for one in (
-        own, replace(own, image_field=None)))
+    with_field, bare = (
+        Rectification(one, camera, 2.0) for one in (own, replace(own, image_field=None))
+    )
     uv = np.stack([bare.maps.u, bare.maps.v], axis=-1)[bare.maps.mask].astype(float)
     moved = np.stack([with_field.maps.u, with_field.maps.v], axis=-1)[bare.maps.mask]
     np.testing.assert_allclose(moved, own.image_field.apply(uv), atol=1e-3)
@@ -171,23 +184,32 @@ def test_a_lens_file_keeps_it(tmp_path):
     assert read.image_field == own.image_field
     assert read == own
     assert list(yaml.safe_load((tmp_path / 'lens.yaml').read_text())['corrections']) == [
-        'skew', 'image_field']
+        'skew',
+        'image_field',
+    ]
     assert 'image_field' not in lens_to_dict(make_lens('equidistant', 'svp'))['corrections']
     assert own.svp().image_field == own.image_field
 
 
-@pytest.mark.parametrize(('field', 'value', 'reason'), [
-    ('low', None, 'corrections.image_field.low is missing'),
-    ('low', [1.0], 'corrections.image_field.low must be two numbers, along u and v'),
-    ('pitch', [75.0, 0.0], 'pitch is [75.0, 0.0]; it must be above 0'),
-    ('u', [[0.0, 1.0], [0.0]], 'image_field.u must be lists of numbers, as long as each other'),
-    ('u', 'much', 'image_field.u must be lists of numbers'),
-    ('v', [[0.0] * 14] * 10, 'image_field.v must be rows of numbers, as many as those of u'),
-    ('v', [[float('nan')] * 14] * 11, 'image_field.v holds a number that is not finite'),
-    ('stderr', [[-1.0] * 14] * 11, 'image_field.stderr has a number below 0'),
-    ('width', 3, "image_field: unknown field 'width'; known are low, pitch, u, v, stderr"),
-    ('u', [[0.0] * 6 + [900.0] + [0.0] * 7] * 11, 'image_field folds the image at ('),
-])
+@pytest.mark.parametrize(
+    ('field', 'value', 'reason'),
+    [
+        ('low', None, 'corrections.image_field.low is missing'),
+        ('low', [1.0], 'corrections.image_field.low must be two numbers, along u and v'),
+        ('pitch', [75.0, 0.0], 'pitch is [75.0, 0.0]; it must be above 0'),
+        (
+            'u',
+            [[0.0, 1.0], [0.0]],
+            'image_field.u must be lists of numbers, as long as each other',
+        ),
+        ('u', 'much', 'image_field.u must be lists of numbers'),
+        ('v', [[0.0] * 14] * 10, 'image_field.v must be rows of numbers, as many as those of u'),
+        ('v', [[float('nan')] * 14] * 11, 'image_field.v holds a number that is not finite'),
+        ('stderr', [[-1.0] * 14] * 11, 'image_field.stderr has a number below 0'),
+        ('width', 3, "image_field: unknown field 'width'; known are low, pitch, u, v, stderr"),
+        ('u', [[0.0] * 6 + [900.0] + [0.0] * 7] * 11, 'image_field folds the image at ('),
+    ],
+)
 def test_a_broken_field_is_refused_with_its_reason(field, value, reason):
     document = lens_to_dict(bent(make_lens('equidistant', 'svp'), stderr=True))
     entry = document['corrections']['image_field']
@@ -206,6 +228,10 @@ def test_a_field_of_too_few_or_too_many_nodes_is_refused():
     for shape in ((3, 9), (4, 401)):
         flat = np.zeros(shape).tolist()
         document['corrections']['image_field'] = {
-            'low': [0, 0], 'pitch': [9, 9], 'u': flat, 'v': flat}
+            'low': [0, 0],
+            'pitch': [9, 9],
+            'u': flat,
+            'v': flat,
+        }
         with pytest.raises(LensError, match='4 to 400 are needed of each'):
             lens_from_dict(document, 'bent.yaml')

@@ -20,14 +20,25 @@ from fisheye_svp_ros.optics.curves import (
 DOCUMENT = {
     'name': 'trial',
     'image': {'width': 1280, 'height': 800},
-    'projection': {'model': 'kannala_brandt', 'fx': 453.1, 'fy': 452.9, 'cx': 640.2, 'cy': 399.7,
-                   'k': [0.01, -0.02, 0.003, -0.0004]},
+    'projection': {
+        'model': 'kannala_brandt',
+        'fx': 453.1,
+        'fy': 452.9,
+        'cx': 640.2,
+        'cy': 399.7,
+        'k': [0.01, -0.02, 0.003, -0.0004],
+    },
     'max_incidence_deg': 95.0,
     'viewpoint_shift': {'model': 'gennery', 's0': -0.001, 'e': [0.01, -0.003, 1e-05]},
     'corrections': {'skew': {'parameters': {'shear': 0.001}}},
-    'target': {'landmarks': [[3, 0, 0.1, 0.2, 0.0], [4, 1, 0.2, 0.2, 0.0]],
-               'landmark_scale': {'axes': 1, 'centre': [0.0, 0.0, 0.0],
-                                  'parameters': {'relative': 0.002}}},
+    'target': {
+        'landmarks': [[3, 0, 0.1, 0.2, 0.0], [4, 1, 0.2, 0.2, 0.0]],
+        'landmark_scale': {
+            'axes': 1,
+            'centre': [0.0, 0.0, 0.0],
+            'parameters': {'relative': 0.002},
+        },
+    },
     'calibration': {'rms_px': 0.2, 'observations': 100, 'frames': 5, 'source': 'train.csv'},
 }
 
@@ -95,8 +106,15 @@ def test_parameters_by_name():
     names = ['f', 'cx', 'k2', 's0', 'e1']
     moved = lens.with_parameters(names, [1.0, 2.0, 3.0, 4.0, 5.0])
     assert (moved.fx, moved.fy, moved.cx, moved.cy) == (1.0, 1.0, 2.0, lens.cy)
-    assert moved.parameters == {**lens.parameters, 'fx': 1.0, 'fy': 1.0, 'cx': 2.0, 'k2': 3.0,
-                                's0': 4.0, 'e1': 5.0}
+    assert moved.parameters == {
+        **lens.parameters,
+        'fx': 1.0,
+        'fy': 1.0,
+        'cx': 2.0,
+        'k2': 3.0,
+        's0': 4.0,
+        'e1': 5.0,
+    }
     assert moved.svp().viewpoint_shift is None
     assert moved.svp().corrections == lens.corrections
     with pytest.raises(LensError, match=r"no parameter 'k5'; it has fx, fy, .* e2"):
@@ -106,17 +124,22 @@ def test_parameters_by_name():
 
 
 def test_a_shift_of_several_kinds_is_a_list():
-    document = changed('viewpoint_shift', [
-        {'model': 'gennery', 's0': 0.0, 'e': [0.01, 0.0, 0.0]},
-        {'model': 'flat_port', 'thickness': 0.01, 'refractive_index': 1.5},
-    ])
+    document = changed(
+        'viewpoint_shift',
+        [
+            {'model': 'gennery', 's0': 0.0, 'e': [0.01, 0.0, 0.0]},
+            {'model': 'flat_port', 'thickness': 0.01, 'refractive_index': 1.5},
+        ],
+    )
     document['max_incidence_deg'] = 80.0
     lens = lens_from_dict(document)
     assert lens_to_dict(lens) == document
     theta = np.linspace(0.1, 1.4, 8)
     value, slope = lens.viewpoint_shift.value_and_slope(theta, np.tan(theta / 2))
-    parts = [p.value_and_slope(theta, np.tan(theta / 2)) for p in (Gennery(0, 0.01),
-                                                                  FlatPort(0.01, 1.5))]
+    parts = [
+        p.value_and_slope(theta, np.tan(theta / 2))
+        for p in (Gennery(0, 0.01), FlatPort(0.01, 1.5))
+    ]
     np.testing.assert_allclose([value, slope], np.sum(parts, axis=0), rtol=1e-14)
     moved = lens.with_parameters(['e0', 'thickness'], [0.02, 0.03])
     assert moved.viewpoint_shift.coefficients == (0.0, 0.02, 0.0, 0.0, 0.03, 1.5)
@@ -126,77 +149,115 @@ def test_a_shift_of_several_kinds_is_a_list():
     np.testing.assert_array_equal(columns[:, 4:], FlatPort(0.01, 1.5).columns(theta))
     assert lens.viewpoint_shift.limit == np.pi / 2
     two = FlatPort(0.01, 1.5).plus(FlatPort(0.02, 1.3))
-    assert two.coefficient_names == ('thickness', 'refractive_index', 'thickness_2',
-                                     'refractive_index_2')
+    assert two.coefficient_names == (
+        'thickness',
+        'refractive_index',
+        'thickness_2',
+        'refractive_index_2',
+    )
     assert two.plus(FlatPort(0.01, 1.3)).coefficients == (0.01, 1.5, 0.03, 1.3)
     assert Gennery(0.1).plus(two).parts == (Gennery(0.1), *two.parts)
     assert two.plus(two).coefficients == (0.02, 1.5, 0.04, 1.3)
     assert 'above 1' in two.with_values(refractive_index_2=0.9).check()
 
 
-@pytest.mark.parametrize(('model', 'degrees'), [
-    ('orthographic', 90.0), ('equidistant', np.degrees(np.hypot(240.5, 320.5) / 150.0)),
-    ('stereographic', np.degrees(2 * np.arctan(np.hypot(240.5, 320.5) / 300.0))),
-])
+@pytest.mark.parametrize(
+    ('model', 'degrees'),
+    [
+        ('orthographic', 90.0),
+        ('equidistant', np.degrees(np.hypot(240.5, 320.5) / 150.0)),
+        ('stereographic', np.degrees(2 * np.arctan(np.hypot(240.5, 320.5) / 300.0))),
+    ],
+)
 def test_a_field_that_is_left_out_ends_at_the_curve_or_the_farthest_corner(model, degrees):
-    lens = lens_from_dict({
-        'image': {'width': 640, 'height': 480},
-        'projection': {'model': model, 'f': 150.0, 'cx': 319.0, 'cy': 239.0},
-    })
+    lens = lens_from_dict(
+        {
+            'image': {'width': 640, 'height': 480},
+            'projection': {'model': model, 'f': 150.0, 'cx': 319.0, 'cy': 239.0},
+        }
+    )
     assert np.degrees(lens.max_incidence) == pytest.approx(degrees, rel=1e-5)
 
 
-@pytest.mark.parametrize(('path', 'value', 'reason'), [
-    ('image', None, 'image is missing; a mapping is needed'),
-    ('image', 640, 'image is missing; a mapping is needed'),
-    ('image.width', None, 'image: width is None; a number is needed'),
-    ('image.width', '640', "image: width is '640'; a number is needed"),
-    ('image.width', 640.5, 'image: width is 640.5; a whole number of pixels is needed'),
-    ('image.width', float('nan'), 'image: width is nan; a finite number is needed'),
-    ('image.height', 0, 'height is 0; it must be above 0'),
-    ('projection', None, 'projection is missing; a mapping is needed'),
-    ('projection.model', None, 'projection.model is None; known are orthographic, equidistant'),
-    ('projection.model', 'pinhole', "projection.model is 'pinhole'; known are"),
-    ('projection.model', ['x'], r"projection.model is \['x'\]; known are"),
-    ('projection.fx', None, 'projection: fx is None; a number is needed'),
-    ('projection.fx', True, 'projection: fx is True; a number is needed'),
-    ('projection.fx', -1.0, 'fx is -1.0; it must be above 0'),
-    ('projection.fy', float('inf'), 'fy is inf; a finite number is needed'),
-    ('projection.cx', float('nan'), 'cx is nan; a finite number is needed'),
-    ('projection.f', 400.0, 'projection has both f and fx or fy; keep one of them'),
-    ('projection.k', 0.1, 'projection.k must be a list of numbers, is 0.1'),
-    ('projection.k', ['a'], "projection.k: value is 'a'; a number is needed"),
-    ('projection.k', [0.0] * 5, 'projection.k has 5 values; this model takes 4'),
-    ('projection.k', [float('nan')], 'value is nan; a finite number is needed'),
-    ('projection.k', [-0.3], r'max_incidence_deg is 95; these curves allow .* up to 60\.39'),
-    ('projection.p1', 0.1, "projection: unknown field 'p1'; known are"),
-    ('max_incidence_deg', 'wide', "max_incidence_deg is 'wide'; a number is needed"),
-    ('max_incidence_deg', 0, 'max_incidence_deg is 0; these curves allow a value above 0'),
-    ('max_incidence_deg', 190, 'max_incidence_deg is 190; these curves allow'),
-    ('max_incidence_deg', float('nan'), 'max_incidence_deg is nan; a finite number is needed'),
-    ('viewpoint_shift', 0.001, 'viewpoint_shift must be a mapping with a model'),
-    ('viewpoint_shift.model', 'cahvore', "viewpoint_shift.model is 'cahvore'; known are gennery"),
-    ('viewpoint_shift.s0', 'x', "viewpoint_shift: s0 is 'x'; a number is needed"),
-    ('viewpoint_shift.e', [0.0] * 4, 'viewpoint_shift.e has 4 values; this model takes 3'),
-    ('viewpoint_shift', {'model': 'flat_port', 'thickness': 0.01},
-     'viewpoint_shift: incomplete; add refractive_index$'),
-    ('viewpoint_shift', {'model': 'flat_port', 'thickness': 0.01, 'refractive_index': 1.0},
-     'refractive_index is 1.0; it must be above 1'),
-    ('viewpoint_shift', {'model': 'flat_port', 'thickness': 0.01, 'refractive_index': 1.5},
-     'max_incidence_deg is 95; these curves allow .* up to 90'),
-    ('viewpoint_shift', [{'model': 'gennery'}, 1], 'viewpoint_shift must be a mapping with a'),
-    ('viewpoint_shift', [], 'viewpoint_shift must be a mapping with a model'),
-    ('corrections', [1], 'corrections must map each effect name to its parameters'),
-    ('corrections.skew', 0.001, r'corrections\.skew: corrections must map .*p1: 0\.001'),
-    ('corrections.skew', {'parameters': {}}, 'effect skew is incomplete'),
-    ('corrections.bend', {}, "effect 'bend' is unknown; known are"),
-    ('effects', {'skew': 1}, 'effects must map each effect name to its parameters'),
-    ('target.landmark_scale', 2, 'target must map each effect name to its parameters'),
-    ('target.landmark_scale', {}, 'target: effect landmark_scale is incomplete'),
-    ('target.landmarks', [[1, 2, 3]], 'target.landmarks must be a list of .landmark, board, x, y'),
-    ('calibration', [1], r'calibration must be a mapping, is \[1\]'),
-    ('distortion', {}, "unknown field 'distortion'; known are calibration, corrections, image"),
-])
+@pytest.mark.parametrize(
+    ('path', 'value', 'reason'),
+    [
+        ('image', None, 'image is missing; a mapping is needed'),
+        ('image', 640, 'image is missing; a mapping is needed'),
+        ('image.width', None, 'image: width is None; a number is needed'),
+        ('image.width', '640', "image: width is '640'; a number is needed"),
+        ('image.width', 640.5, 'image: width is 640.5; a whole number of pixels is needed'),
+        ('image.width', float('nan'), 'image: width is nan; a finite number is needed'),
+        ('image.height', 0, 'height is 0; it must be above 0'),
+        ('projection', None, 'projection is missing; a mapping is needed'),
+        (
+            'projection.model',
+            None,
+            'projection.model is None; known are orthographic, equidistant',
+        ),
+        ('projection.model', 'pinhole', "projection.model is 'pinhole'; known are"),
+        ('projection.model', ['x'], r"projection.model is \['x'\]; known are"),
+        ('projection.fx', None, 'projection: fx is None; a number is needed'),
+        ('projection.fx', True, 'projection: fx is True; a number is needed'),
+        ('projection.fx', -1.0, 'fx is -1.0; it must be above 0'),
+        ('projection.fy', float('inf'), 'fy is inf; a finite number is needed'),
+        ('projection.cx', float('nan'), 'cx is nan; a finite number is needed'),
+        ('projection.f', 400.0, 'projection has both f and fx or fy; keep one of them'),
+        ('projection.k', 0.1, 'projection.k must be a list of numbers, is 0.1'),
+        ('projection.k', ['a'], "projection.k: value is 'a'; a number is needed"),
+        ('projection.k', [0.0] * 5, 'projection.k has 5 values; this model takes 4'),
+        ('projection.k', [float('nan')], 'value is nan; a finite number is needed'),
+        ('projection.k', [-0.3], r'max_incidence_deg is 95; these curves allow .* up to 60\.39'),
+        ('projection.p1', 0.1, "projection: unknown field 'p1'; known are"),
+        ('max_incidence_deg', 'wide', "max_incidence_deg is 'wide'; a number is needed"),
+        ('max_incidence_deg', 0, 'max_incidence_deg is 0; these curves allow a value above 0'),
+        ('max_incidence_deg', 190, 'max_incidence_deg is 190; these curves allow'),
+        ('max_incidence_deg', float('nan'), 'max_incidence_deg is nan; a finite number is needed'),
+        ('viewpoint_shift', 0.001, 'viewpoint_shift must be a mapping with a model'),
+        (
+            'viewpoint_shift.model',
+            'cahvore',
+            "viewpoint_shift.model is 'cahvore'; known are gennery",
+        ),
+        ('viewpoint_shift.s0', 'x', "viewpoint_shift: s0 is 'x'; a number is needed"),
+        ('viewpoint_shift.e', [0.0] * 4, 'viewpoint_shift.e has 4 values; this model takes 3'),
+        (
+            'viewpoint_shift',
+            {'model': 'flat_port', 'thickness': 0.01},
+            'viewpoint_shift: incomplete; add refractive_index$',
+        ),
+        (
+            'viewpoint_shift',
+            {'model': 'flat_port', 'thickness': 0.01, 'refractive_index': 1.0},
+            'refractive_index is 1.0; it must be above 1',
+        ),
+        (
+            'viewpoint_shift',
+            {'model': 'flat_port', 'thickness': 0.01, 'refractive_index': 1.5},
+            'max_incidence_deg is 95; these curves allow .* up to 90',
+        ),
+        ('viewpoint_shift', [{'model': 'gennery'}, 1], 'viewpoint_shift must be a mapping with a'),
+        ('viewpoint_shift', [], 'viewpoint_shift must be a mapping with a model'),
+        ('corrections', [1], 'corrections must map each effect name to its parameters'),
+        ('corrections.skew', 0.001, r'corrections\.skew: corrections must map .*p1: 0\.001'),
+        ('corrections.skew', {'parameters': {}}, 'effect skew is incomplete'),
+        ('corrections.bend', {}, "effect 'bend' is unknown; known are"),
+        ('effects', {'skew': 1}, 'effects must map each effect name to its parameters'),
+        ('target.landmark_scale', 2, 'target must map each effect name to its parameters'),
+        ('target.landmark_scale', {}, 'target: effect landmark_scale is incomplete'),
+        (
+            'target.landmarks',
+            [[1, 2, 3]],
+            'target.landmarks must be a list of .landmark, board, x, y',
+        ),
+        ('calibration', [1], r'calibration must be a mapping, is \[1\]'),
+        (
+            'distortion',
+            {},
+            "unknown field 'distortion'; known are calibration, corrections, image",
+        ),
+    ],
+)
 def test_broken_lens_is_refused_with_its_reason(path, value, reason, tmp_path):
     file = tmp_path / 'broken.yaml'
     file.write_text(yaml.safe_dump(changed(path, value)))
@@ -206,12 +267,15 @@ def test_broken_lens_is_refused_with_its_reason(path, value, reason, tmp_path):
     assert '\n' not in str(caught.value)
 
 
-@pytest.mark.parametrize(('content', 'reason'), [
-    (b'', 'not a lens file: it has no projection'),
-    (b'- 1\n', 'not a lens file: it has no projection'),
-    (b'image: {width: 1\n', 'broken YAML at line 2: '),
-    (b'\xff\xfe\x00', 'not a text file; one in UTF-8 is expected'),
-])
+@pytest.mark.parametrize(
+    ('content', 'reason'),
+    [
+        (b'', 'not a lens file: it has no projection'),
+        (b'- 1\n', 'not a lens file: it has no projection'),
+        (b'image: {width: 1\n', 'broken YAML at line 2: '),
+        (b'\xff\xfe\x00', 'not a text file; one in UTF-8 is expected'),
+    ],
+)
 def test_broken_file_is_refused_with_its_reason(content, reason, tmp_path):
     file = tmp_path / 'broken.yaml'
     file.write_bytes(content)

@@ -40,8 +40,10 @@ def faces(port, a, b):
         one = np.cross(normal, [0.0, 1.0, 0.0])
         one /= np.linalg.norm(one)
         basis = np.stack([one, np.cross(normal, one)])
-        return (port.distance * normal + a @ basis,
-                (port.distance + port.thickness) * normal + b @ basis)
+        return (
+            port.distance * normal + a @ basis,
+            (port.distance + port.thickness) * normal + b @ basis,
+        )
     centre = np.array([port.x, port.y, port.z])
     found = []
     for place, radius in ((a, port.radius), (b, port.radius + port.thickness)):
@@ -61,11 +63,14 @@ def test_light_takes_the_shortest_way(port):
     """Fermat: of all ways through the two faces the one that is found is optically shortest."""
     lens = replace(AIR, viewpoint_shift=None, port=port)
     for point in points(3):
+
         def length(v, point=point):
             inner, outer = faces(port, v[:2], v[2:])
             parts = (inner, outer - inner, point - outer)
-            return sum(n * np.linalg.norm(part) for n, part in zip(
-                (1.0, port.glass_index, port.medium_index), parts, strict=True))
+            return sum(
+                n * np.linalg.norm(part)
+                for n, part in zip((1.0, port.glass_index, port.medium_index), parts, strict=True)
+            )
 
         start = 0.03 * np.tile(point[:2] / np.linalg.norm(point), 2)
         best = minimize(length, start, method='BFGS', options={'gtol': 1e-12})
@@ -97,8 +102,10 @@ def test_derivatives_are_those_of_differences(port):
     columns = camera.lens_columns(lens, linear, names)
     for i, name in enumerate(names):
         value = parameter_values(lens, [name])[0]
-        ends = [camera.project(lens.with_parameters([name], [value + d]), seen).uv
-                for d in (-step, step)]
+        ends = [
+            camera.project(lens.with_parameters([name], [value + d]), seen).uv
+            for d in (-step, step)
+        ]
         np.testing.assert_allclose(columns[..., i], (ends[1] - ends[0]) / (2 * step), atol=1e-4)
 
 
@@ -119,15 +126,17 @@ def test_a_window_in_air_is_the_viewpoint_shift_of_one():
     lens, seen = replace(AIR, viewpoint_shift=None), points()
     window = replace(lens, viewpoint_shift=FlatPort(0.01, 1.5))
     pane = replace(lens, port=FlatGlass(0.04, 1.0, thickness=0.01, glass_index=1.5))
-    np.testing.assert_allclose(camera.project(pane, seen).uv, camera.project(window, seen).uv,
-                               atol=1e-9)
+    np.testing.assert_allclose(
+        camera.project(pane, seen).uv, camera.project(window, seen).uv, atol=1e-9
+    )
 
 
 def test_a_dome_about_the_viewpoint_changes_nothing():
     lens, seen = replace(AIR, viewpoint_shift=None), points()
     dome = replace(lens, port=DomeGlass(0.06, 1.333, thickness=0.005))
-    np.testing.assert_allclose(camera.project(dome, seen).uv, camera.project(lens, seen).uv,
-                               atol=1e-9)
+    np.testing.assert_allclose(
+        camera.project(dome, seen).uv, camera.project(lens, seen).uv, atol=1e-9
+    )
 
 
 def test_what_no_ray_reaches_is_flagged():
@@ -158,14 +167,23 @@ def test_a_port_is_read_back(port):
     assert lens_from_dict(document) == replace(AIR, port=port)
 
 
-@pytest.mark.parametrize(('port', 'reason'), [
-    ({'model': 'flat', 'distance': 0.03}, 'port: incomplete; add medium_index$'),
-    ({'model': 'flat', 'distance': 0.03, 'medium_index': 0.7}, 'medium_index is 0.7; it must be'),
-    ({'model': 'flat', 'distance': -0.1, 'medium_index': 1.3}, 'distance is -0.1'),
-    ({'model': 'flat', 'distance': 0.03, 'medium_index': 1.3, 'tilt_x': -2.0}, 'tilt_x is -2.0'),
-    ({'model': 'dome', 'radius': 0.03, 'medium_index': 1.3, 'z': 0.04}, 'inside the dome'),
-    ({'model': 'oval'}, "corrections.port.model is 'oval'; known are flat, dome"),
-])
+@pytest.mark.parametrize(
+    ('port', 'reason'),
+    [
+        ({'model': 'flat', 'distance': 0.03}, 'port: incomplete; add medium_index$'),
+        (
+            {'model': 'flat', 'distance': 0.03, 'medium_index': 0.7},
+            'medium_index is 0.7; it must be',
+        ),
+        ({'model': 'flat', 'distance': -0.1, 'medium_index': 1.3}, 'distance is -0.1'),
+        (
+            {'model': 'flat', 'distance': 0.03, 'medium_index': 1.3, 'tilt_x': -2.0},
+            'tilt_x is -2.0',
+        ),
+        ({'model': 'dome', 'radius': 0.03, 'medium_index': 1.3, 'z': 0.04}, 'inside the dome'),
+        ({'model': 'oval'}, "corrections.port.model is 'oval'; known are flat, dome"),
+    ],
+)
 def test_an_impossible_port_is_refused(port, reason):
     document = lens_to_dict(AIR) | {'corrections': {'port': port}}
     with pytest.raises(LensError, match=reason):

@@ -35,9 +35,22 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Any:
     env = {name: value for name, value in os.environ.items() if name != 'ROS_DOMAIN_ID'}
     env['PYTHONPATH'] = os.pathsep.join([str(ROOT), env.get('PYTHONPATH', '')])
     done = subprocess.run(
-        [sys.executable, '-m', 'fisheye_svp_ros.cli', 'demo', '-o', str(folder),
-         '--lenses', 'fish180', '--radii', '0.5'],
-        env=env, capture_output=True, text=True, timeout=300,
+        [
+            sys.executable,
+            '-m',
+            'fisheye_svp_ros.cli',
+            'demo',
+            '-o',
+            str(folder),
+            '--lenses',
+            'fish180',
+            '--radii',
+            '0.5',
+        ],
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     assert done.returncode == 0, done.stderr
     return folder, done.stdout
@@ -113,8 +126,9 @@ def test_the_nodes_have_nothing_to_complain_of(demo: Any) -> None:
     folder, _ = demo
     for log in (folder / 'logs').glob('*.log'):
         # A camera that has published its sets ends, some seconds before those of other nodes.
-        text = '\n'.join(line for line in log.read_text().splitlines()
-                         if 'its publisher is gone' not in line)
+        text = '\n'.join(
+            line for line in log.read_text().splitlines() if 'its publisher is gone' not in line
+        )
         assert 'Traceback' not in text and 'WARN' not in text and 'dropped' not in text, log
 
 
@@ -134,8 +148,22 @@ def computed(
 ) -> Any:
     """Run the demo where there is no rclpy; return its folder and what it printed."""
     monkeypatch.setitem(sys.modules, 'rclpy', None)
-    assert main(['demo', '-o', str(tmp_path), '--lenses', 'fish180', 'fish180', '--radii', '0.5',
-                 '0.5']) == 0
+    assert (
+        main(
+            [
+                'demo',
+                '-o',
+                str(tmp_path),
+                '--lenses',
+                'fish180',
+                'fish180',
+                '--radii',
+                '0.5',
+                '0.5',
+            ]
+        )
+        == 0
+    )
     return tmp_path, capsys.readouterr().out
 
 
@@ -145,27 +173,36 @@ def test_without_ros_the_same_scenarios_are_computed(computed: Any) -> None:
     assert first.startswith('  ROS 2 is missing (') and 'in one process, without nodes' in first
     assert sum(line.startswith('  fish180 ') for line in others) == 9
     assert sorted(path.name for path in folder.iterdir() if path.suffix != '.parquet') == [
-        'demo.json', 'errors.png', 'rectified.png', 'residuals.png', 'table.csv']
+        'demo.json',
+        'errors.png',
+        'rectified.png',
+        'residuals.png',
+        'table.csv',
+    ]
     assert json.loads((folder / 'demo.json').read_text())['recording'] is None
     counts = read_columns(folder / 'table.csv')['namespace']
     assert [counts.count(f'/{task.name}') for task in TASKS] == [3, 3 * 10, 3 * 2]
 
 
 def test_the_graph_tells_what_is_computed_without_it(demo: Any, computed: Any) -> None:
-    recorded, offline = (json.loads((folder / 'demo.json').read_text())['rows']
-                         for folder, _ in (demo, computed))
+    recorded, offline = (
+        json.loads((folder / 'demo.json').read_text())['rows'] for folder, _ in (demo, computed)
+    )
     for told, mine in zip(recorded, offline, strict=True):
         numbers = {name for name, value in mine.items() if isinstance(value, float)}
         assert {k: v for k, v in told.items() if k not in numbers} == {
-            k: v for k, v in mine.items() if k not in numbers}
+            k: v for k, v in mine.items() if k not in numbers
+        }
         for name in numbers:
             assert told[name] == pytest.approx(mine[name], abs=1e-9, nan_ok=True), name
-    one, = residual_fields(Bag(demo[0] / 'recording').records(has_residuals))
-    other, = compute_demo(['fish180'], [0.5])[1]
+    (one,) = residual_fields(Bag(demo[0] / 'recording').records(has_residuals))
+    (other,) = compute_demo(['fish180'], [0.5])[1]
     for name in RESIDUALS.names or ():
         np.testing.assert_allclose(one.points[name], other.points[name], atol=1e-8)
     assert demo[1].splitlines() == [
-        *computed[1].splitlines()[1:-1], f'  recording, table, pictures: {demo[0]}']
+        *computed[1].splitlines()[1:-1],
+        f'  recording, table, pictures: {demo[0]}',
+    ]
 
 
 def test_a_process_that_fails_is_named_and_none_is_left(tmp_path: Path) -> None:

@@ -62,8 +62,11 @@ def key(cell):
 def test_every_cell_is_there_once_with_the_published_number(paper):
     expected = [
         (2 * kind + i + 1, lens, radius, row, quantity)
-        for kind, rows in enumerate((SPREADS, STYLE_NAMES)) for i, lens in enumerate(LENSES)
-        for radius in RADII for row in rows for quantity in QUANTITIES
+        for kind, rows in enumerate((SPREADS, STYLE_NAMES))
+        for i, lens in enumerate(LENSES)
+        for radius in RADII
+        for row in rows
+        for quantity in QUANTITIES
     ]
     assert [key(cell) for cell in paper['cells']] == expected
     np.testing.assert_array_equal(
@@ -74,8 +77,9 @@ def test_every_cell_is_there_once_with_the_published_number(paper):
 def test_every_cell_keeps_its_value(paper):
     with HELD.open(newline='', encoding='utf-8') as stream:
         held = {
-            (int(r['table']), r['lens'], float(r['radius']), r['row'], r['quantity']):
-                float(r['ours'])
+            (int(r['table']), r['lens'], float(r['radius']), r['row'], r['quantity']): float(
+                r['ours']
+            )
             for r in csv.DictReader(stream)
         }
     assert len(held) == 180
@@ -133,7 +137,7 @@ def test_empty_cells_are_filled_and_marked(paper):
 
 @pytest.mark.parametrize(('lens', 'start'), [('fish180', 0), ('fish214', 9)])
 def test_error2_and_error3(paper, lens, start):
-    panels = paper['panels'][start:start + 9]
+    panels = paper['panels'][start : start + 9]
     assert [(p['lens'], p['radius_m'], p['style']) for p in panels] == [
         (lens, *panel) for panel in PANELS
     ]
@@ -151,8 +155,9 @@ def test_error2_and_error3(paper, lens, start):
 
 
 def test_captions_keep_their_order_and_find_their_panels():
-    printed = np.array([[0.026, 6.43], [0.295, 41.97], [0.339, 43.38], [1.506, 14.20],
-                        [9.329, 13.07]])
+    printed = np.array(
+        [[0.026, 6.43], [0.295, 41.97], [0.339, 43.38], [1.506, 14.20], [9.329, 13.07]]
+    )
     ours = np.full((9, 2), 1e3)
     ours[[0, 2, 3, 5, 8]] = 1.1 * printed
     assert list(captions_of('fish214', *ours.T)) == [0, 2, 3, 5, 8]
@@ -163,9 +168,14 @@ def test_claims(paper):
     assert len(verdicts) == len(paper['claims']) >= 15
     assert set(verdicts.values()) <= {'holds', 'holds in part', 'does not hold'}
     for start in (
-        'Fish180: position errors in x', 'Fish214: position errors in x', 'Fish180: axis errors',
-        'The z errors of Fish214', 'The range of the landmarks', 'Vertical errors of epipolar',
-        'The vertical errors of Fish214', 'For a target close',
+        'Fish180: position errors in x',
+        'Fish214: position errors in x',
+        'Fish180: axis errors',
+        'The z errors of Fish214',
+        'The range of the landmarks',
+        'Vertical errors of epipolar',
+        'The vertical errors of Fish214',
+        'For a target close',
     ):
         assert [v for s, v in verdicts.items() if s.startswith(start)] == ['holds'], start
     # The axis error does depend on the distance, in the paper's own tables too.
@@ -200,8 +210,11 @@ def test_more_noise_hides_the_error_nearer(paper):
     for row in paper['noise']:
         assert row['noise_px'] == [0.1, 0.2, 0.3, 0.4, 0.5]
         assert np.all(np.diff(np.array(row['range_m'], dtype=float)) <= 0)
-    whole = {row['lens']: row['range_m'] for row in paper['noise']
-             if (row['quantity'], row['where']) == ('residual', 'whole')}
+    whole = {
+        row['lens']: row['range_m']
+        for row in paper['noise']
+        if (row['quantity'], row['where']) == ('residual', 'whole')
+    }
     # The residual falls with the range: it is 0.0411 px and 0.58 px at 2.0 m.
     assert whole['fish180'][0] == pytest.approx(2 * 0.0411 / 0.1, rel=0.02)
     assert whole['fish214'][4] == pytest.approx(2 * 0.5805 / 0.5, rel=0.02)
@@ -210,10 +223,17 @@ def test_more_noise_hides_the_error_nearer(paper):
 def test_a_solver_that_stops_early_explains_the_cell(paper):
     cell = paper['out_of_line_cell']
     assert 0 < cell['relative_excess_of_squares'] < 0.01
-    off = {(row['lens'], row['damping'], row['gain_px2'], row['radius_m'], row['range']):
-           row['median_off_z'] for row in cell['stopped_early']}
-    early = {where[3:]: value for where, value in off.items()
-             if where[:3] == ('fish180', 'levenberg', 1e-3)}
+    off = {
+        (row['lens'], row['damping'], row['gain_px2'], row['radius_m'], row['range']): row[
+            'median_off_z'
+        ]
+        for row in cell['stopped_early']
+    }
+    early = {
+        where[3:]: value
+        for where, value in off.items()
+        if where[:3] == ('fish180', 'levenberg', 1e-3)
+    }
     assert 0.15 < early.pop((2.0, 'whole')) < 0.40
     early.pop((2.0, 'outer'))
     assert max(early.values()) < 0.02
@@ -234,8 +254,11 @@ def test_all_that_a_person_reads(folder):
     for word in ('Table 1: Fish180', 'Table 4: Fish214', 'new', '-1.6713', 'Error3'):
         assert word in page
         assert word in text
-    widths = {line.replace(r'\|', '').count('|') for line in text.splitlines()
-              if line.startswith('| 0.5 m')}
+    widths = {
+        line.replace(r'\|', '').count('|')
+        for line in text.splitlines()
+        if line.startswith('| 0.5 m')
+    }
     assert widths == {18}  # radius, row, five times published, ours, per cent
 
 
@@ -256,7 +279,8 @@ def test_the_family_holds_the_lenses_in_use():
         np.testing.assert_allclose([lens.fx, *shift], numbers, rtol=1e-12)
     layout = yaml.safe_load(config_path('environments/kita.yaml').read_text(encoding='utf-8'))
     np.testing.assert_allclose(
-        np.radians(layout['inner'] + layout['outer']), best.layout, rtol=1e-12)
+        np.radians(layout['inner'] + layout['outer']), best.layout, rtol=1e-12
+    )
     assert 'benchmark.paper search' in layout['provenance']
     incidence = np.degrees(best.layout[:, 0])
     assert incidence[:15].max() < 62.1 < 65.9 < incidence[15:].min()
@@ -266,9 +290,13 @@ def test_the_family_holds_the_lenses_in_use():
     assert np.all(family.low <= family.high)
 
 
-@pytest.mark.parametrize(('load', 'what'), [
-    (load_family, 'family of fits'), (load_stopping, 'study of early stops'),
-])
+@pytest.mark.parametrize(
+    ('load', 'what'),
+    [
+        (load_family, 'family of fits'),
+        (load_stopping, 'study of early stops'),
+    ],
+)
 def test_a_study_that_is_none(load, what, tmp_path):
     path = tmp_path / 'study.yaml'
     path.write_text('members: [{seed: 1}]\n', encoding='utf-8')

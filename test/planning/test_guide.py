@@ -101,8 +101,9 @@ def test_a_view_that_cannot_be_had_is_given_up(first):
             guide.look(float(t), None)
         assert guide.outline is not outline
     assert guide.thinking and len(guide.session.room.taken) == ones
-    middles = [first.wanted.shots.camera.take(i).into_body(POINTS).mean(axis=0)
-               for i in range(ones)]
+    middles = [
+        first.wanted.shots.camera.take(i).into_body(POINTS).mean(axis=0) for i in range(ones)
+    ]
     again = evaluate_session(guide.session)
     for i in range(len(again.outline)):
         middle = again.wanted.shots.camera.take(i).into_body(POINTS).mean(axis=0)
@@ -116,7 +117,8 @@ def test_views_are_whole_with_the_squares_around_their_corners(first):
     for i in range(len(first.outline)):
         local = first.wanted.shots.camera.take(i).into_body(board.rim)
         assert np.degrees(np.arccos(local[:, 2] / np.linalg.norm(local, axis=1))).max() < (
-            np.degrees(SHEET.max_incidence))
+            np.degrees(SHEET.max_incidence)
+        )
         uv = ForwardModel(SHEET).project(local[None]).uv[0]
         assert (uv > 0).all() and (uv < [SHEET.width, SHEET.height]).all()
 

@@ -76,8 +76,7 @@ def test_a_candidate_is_what_it_says_and_can_be_detected(linear, board, shots):
 
 def test_the_side_said_to_be_away_is_away(board, shots):
     """Of a board tilted in the middle of the image, about the horizontal: its top or bottom."""
-    i = int(np.flatnonzero((shots.tilt > 0) & (shots.tilt_axis == 0)
-                           & (shots.angle < 0.3))[0])
+    i = int(np.flatnonzero((shots.tilt > 0) & (shots.tilt_axis == 0) & (shots.angle < 0.3))[0])
     local = shots.camera.take(i).into_body(board.points)
     assert 'bottom away' in instruction(shots, i)[2]
     bottom, top = local[local[:, 1].argmax()], local[local[:, 1].argmin()]
@@ -96,7 +95,8 @@ def test_the_board_is_turned_as_said(board, shots):
     for i in square:
         azimuth = shots.azimuth[i]
         aside = rotation_from_vector(
-            shots.angle[i] * np.array([-np.sin(azimuth), np.cos(azimuth), 0]))
+            shots.angle[i] * np.array([-np.sin(azimuth), np.cos(azimuth), 0])
+        )
         right = aside.T @ shots.camera.rotation[i].T @ board.facing[0]
         said = [np.cos(shots.roll[i]), np.sin(shots.roll[i]), 0]
         np.testing.assert_allclose(right, said, atol=1e-9)
@@ -109,11 +109,24 @@ def test_predicted_errors_are_those_of_noisy_refits(linear, board, shots):
     assert np.all(np.diff(answers) < 0)
     first, landmarks, pulls = linear.data.observations, Landmarks(board.landmark, board.points), []
     for seed in range(6):
-        more = simulate(ForwardModel(SHIFTED), landmarks, shots.camera.take(chosen), NOISE,
-                        np.random.default_rng(seed))
-        both = make_observations(*(np.concatenate(pair) for pair in (
-            (first.frame, more.frame + 100), (first.landmark, more.landmark),
-            (first.uv, more.uv), (first.xyz, more.xyz))))
+        more = simulate(
+            ForwardModel(SHIFTED),
+            landmarks,
+            shots.camera.take(chosen),
+            NOISE,
+            np.random.default_rng(seed),
+        )
+        both = make_observations(
+            *(
+                np.concatenate(pair)
+                for pair in (
+                    (first.frame, more.frame + 100),
+                    (first.landmark, more.landmark),
+                    (first.uv, more.uv),
+                    (first.xyz, more.xyz),
+                )
+            )
+        )
         again = fitted(both, ((ViewpointShiftEffect(1), np.zeros(1)),))
         pulls.append((again.state.terms[0][1][0] - 0.003) / answers[-1])
     assert np.abs(pulls).max() < 4
@@ -176,12 +189,17 @@ def test_what_cannot_be_planned_is_refused(linear, board):
         FlatBoard.from_observations(bent, linear.state.pose)
 
 
-@pytest.mark.parametrize(('options', 'said'), [
-    (['--next', '101'], "'101' photographs are too many; at most 100 can be planned at once"),
-    (['--next', '2', '--for', 'fx'], '--for fx: fx is fixed; add --free intrinsics'),
-    (['--next', '2', '--for', 'zz', '--free', 'intrinsics'], '--for zz: not a parameter of this '
-     'lens or of an effect; known are fx, '),
-])
+@pytest.mark.parametrize(
+    ('options', 'said'),
+    [
+        (['--next', '101'], "'101' photographs are too many; at most 100 can be planned at once"),
+        (['--next', '2', '--for', 'fx'], '--for fx: fx is fixed; add --free intrinsics'),
+        (
+            ['--next', '2', '--for', 'zz', '--free', 'intrinsics'],
+            '--for zz: not a parameter of this lens or of an effect; known are fx, ',
+        ),
+    ],
+)
 def test_what_cannot_be_planned_is_refused_before_the_diagnosis(
     tmp_path, capsys, monkeypatch, options, said
 ):
@@ -189,8 +207,15 @@ def test_what_cannot_be_planned_is_refused_before_the_diagnosis(
     save_lens(AIR, tmp_path / 'lens.yaml')
     write_observations(tmp_path / 'seen.csv', photographs(AIR, None, 3))
     try:
-        code = main(['diagnose', str(tmp_path / 'seen.csv'), '--lens',
-                     str(tmp_path / 'lens.yaml'), *options])
+        code = main(
+            [
+                'diagnose',
+                str(tmp_path / 'seen.csv'),
+                '--lens',
+                str(tmp_path / 'lens.yaml'),
+                *options,
+            ]
+        )
     except SystemExit as ended:
         code = ended.code
     assert code == 2 and said in capsys.readouterr().err
@@ -198,8 +223,14 @@ def test_what_cannot_be_planned_is_refused_before_the_diagnosis(
 
 def test_no_more_views_are_planned_than_there_are(board):
     """A large board in a small room: only a few places show it whole."""
-    shots = plan(load_lens(lens_path('fish180')), parse_pattern('chessboard:9x6:100mm').points,
-                 ViewLimits(0.15, 0.2), 100, None, NOISE).wanted.shots
+    shots = plan(
+        load_lens(lens_path('fish180')),
+        parse_pattern('chessboard:9x6:100mm').points,
+        ViewLimits(0.15, 0.2),
+        100,
+        None,
+        NOISE,
+    ).wanted.shots
     assert 1 < len(np.unique(shots.camera.position, axis=0)) <= len(shots.distance) < 100
 
 
@@ -207,8 +238,24 @@ def test_diagnose_says_which_photographs_to_take_next(tmp_path, capsys):
     save_lens(AIR, tmp_path / 'lens.yaml')
     write_observations(tmp_path / 'seen.csv', photographs(SHIFTED, None, 6))
     command = ['diagnose', str(tmp_path / 'seen.csv'), '--lens', str(tmp_path / 'lens.yaml')]
-    assert main([*command, '--quick', '--next', '2', '--for', 'e0', '--room', '0.2', '1.0', '-o',
-                 str(tmp_path / 'out')]) == 0
+    assert (
+        main(
+            [
+                *command,
+                '--quick',
+                '--next',
+                '2',
+                '--for',
+                'e0',
+                '--room',
+                '0.2',
+                '1.0',
+                '-o',
+                str(tmp_path / 'out'),
+            ]
+        )
+        == 0
+    )
     assert 'photographs to take next, for e0' in capsys.readouterr().out
     entries = json.loads((tmp_path / 'out/diagnosis.json').read_text())['next']
     assert len(entries) == 2 and entries[1]['stderr_after'] < entries[0]['stderr_before']
@@ -218,9 +265,27 @@ def test_diagnose_says_which_photographs_to_take_next(tmp_path, capsys):
 
 
 def test_no_planned_view_needs_more_than_the_field_of_view(tmp_path):
-    assert main(['plan', '--fov', '150', '--image-size', '640x480', '--board',
-                 'chessboard:6x4:25mm', '--room', '0.1', '0.6', '--count', '6', '-o',
-                 str(tmp_path)]) == 0
+    assert (
+        main(
+            [
+                'plan',
+                '--fov',
+                '150',
+                '--image-size',
+                '640x480',
+                '--board',
+                'chessboard:6x4:25mm',
+                '--room',
+                '0.1',
+                '0.6',
+                '--count',
+                '6',
+                '-o',
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
     camera = read_poses(tmp_path / 'poses.csv').pose
     points = camera.into_body(np.tile(parse_pattern('chessboard:6x4:25mm').points, (6, 1, 1)))
     angle = np.arccos(points[..., 2] / np.linalg.norm(points, axis=-1))
@@ -235,8 +300,21 @@ def test_a_board_that_never_fits_is_refused_by_its_corners(monkeypatch, capsys):
         return predict(model, pose, views)
 
     monkeypatch.setattr(ForwardModel, 'predict', counted)
-    assert main(['plan', '--lens', 'fish180', '--board', 'chessboard:40x30:100mm', '--room', '0.1',
-                 '0.5']) == 2
+    assert (
+        main(
+            [
+                'plan',
+                '--lens',
+                'fish180',
+                '--board',
+                'chessboard:40x30:100mm',
+                '--room',
+                '0.1',
+                '0.5',
+            ]
+        )
+        == 2
+    )
     assert 'does not see the whole board from 0.1 to 0.5 m' in capsys.readouterr().err
     assert sum(looked_at) < 100_000
 
@@ -249,33 +327,70 @@ def test_no_view_lies_far_beyond_what_was_seen_or_the_nearest_edge_of_the_image(
     wanted = next_photographs(linear, [], NOISE, 6, room=ROOM)
     limit = max_view_angle(wide, 0.0)
     assert limit == pytest.approx(wide.image_height.angle(AIR.height / AIR.fy), 0.02)
-    for shots in (wanted.shots, plan(replace(wide, calibration={'reached_deg': 30.0}),
-                                     board.points, ROOM, 6, None, NOISE).wanted.shots):
+    for shots in (
+        wanted.shots,
+        plan(
+            replace(wide, calibration={'reached_deg': 30.0}), board.points, ROOM, 6, None, NOISE
+        ).wanted.shots,
+    ):
         seen = shots.camera.into_body(board.points)
         assert np.arccos(seen[..., 2] / np.linalg.norm(seen, axis=-1)).max() < limit
 
 
 def test_views_past_what_a_lens_was_calibrated_for_are_named(tmp_path, capsys):
-    lens = {'name': 'narrow', 'image': {'width': 640, 'height': 480},
-            'projection': {'model': 'equidistant', 'f': 200.0, 'cx': 320.0, 'cy': 240.0}}
+    lens = {
+        'name': 'narrow',
+        'image': {'width': 640, 'height': 480},
+        'projection': {'model': 'equidistant', 'f': 200.0, 'cx': 320.0, 'cy': 240.0},
+    }
     for reached in (50, 115):
-        (tmp_path / 'lens.yaml').write_text(json.dumps(
-            {**lens, 'calibration': {'reached_deg': reached}}))
-        assert main(['plan', '--lens', str(tmp_path / 'lens.yaml'), '--board',
-                     'chessboard:9x6:25mm', '--room', '0.15', '0.8', '--count', '3']) == 0
+        (tmp_path / 'lens.yaml').write_text(
+            json.dumps({**lens, 'calibration': {'reached_deg': reached}})
+        )
+        assert (
+            main(
+                [
+                    'plan',
+                    '--lens',
+                    str(tmp_path / 'lens.yaml'),
+                    '--board',
+                    'chessboard:9x6:25mm',
+                    '--room',
+                    '0.15',
+                    '0.8',
+                    '--count',
+                    '3',
+                ]
+            )
+            == 0
+        )
         noted = 'calibrated up to 50 degrees off the axis; views ' in capsys.readouterr().err
         assert noted == (reached == 50)
 
 
 def test_a_plan_before_the_first_photograph(tmp_path, capsys):
-    command = ['plan', '--fov', '170', '--image-size', '640x480', '--board',
-               'chessboard:9x6:25mm', '--room', '0.15', '0.8', '--count', '4']
+    command = [
+        'plan',
+        '--fov',
+        '170',
+        '--image-size',
+        '640x480',
+        '--board',
+        'chessboard:9x6:25mm',
+        '--room',
+        '0.15',
+        '0.8',
+        '--count',
+        '4',
+    ]
     assert main([*command, '--for', 'e0', '-o', str(tmp_path)]) == 0
     assert 'photographs to take, for e0' in capsys.readouterr().out
     planned = json.loads((tmp_path / 'plan.json').read_text())
     assert len(planned['photographs']) == 4 and planned['stderr']['e0'] < 0.002
     assert (tmp_path / 'plan.pdf').read_bytes().startswith(b'%PDF')
     assert main([*command, '--lens', 'fish180']) == 2
-    assert main(['plan', '--lens', 'fish180', '--board', 'chessboard:9x6:25mm', '--room', '1',
-                 '0.5']) == 2
+    assert (
+        main(['plan', '--lens', 'fish180', '--board', 'chessboard:9x6:25mm', '--room', '1', '0.5'])
+        == 2
+    )
     assert '--room 1 0.5' in capsys.readouterr().err

@@ -19,13 +19,24 @@ from fisheye_svp_ros.rectify.cameras import PROJECTIONS, camera_for, rectified_c
 from fisheye_svp_ros.rectify.errors import image_error, search_ranges, tolerated_ranges
 from fisheye_svp_ros.rectify.maps import Rectification
 
-SVP = Lens('svp', 1280, 800, 420.0, 421.0, 633.3, 404.4,
-           KannalaBrandt(-0.02, 0.003, -0.001, 0.0001), np.radians(95.0))
+SVP = Lens(
+    'svp',
+    1280,
+    800,
+    420.0,
+    421.0,
+    633.3,
+    404.4,
+    KannalaBrandt(-0.02, 0.003, -0.001, 0.0001),
+    np.radians(95.0),
+)
 MOVING = replace(SVP, name='moving', viewpoint_shift=Gennery(e0=0.004, e1=0.001))
-CORRECTED = replace(SVP, name='corrected', corrections={
-    'decentering': {'parameters': {'p1': 1e-3, 'p2': -2e-3}}})
-STEREOGRAPHIC = replace(SVP, name='stereographic', image_height=Stereographic(),
-                        viewpoint_shift=Gennery(0.001, 0.003))
+CORRECTED = replace(
+    SVP, name='corrected', corrections={'decentering': {'parameters': {'p1': 1e-3, 'p2': -2e-3}}}
+)
+STEREOGRAPHIC = replace(
+    SVP, name='stereographic', image_height=Stereographic(), viewpoint_shift=Gennery(0.001, 0.003)
+)
 LENSES = [SVP, MOVING, CORRECTED, STEREOGRAPHIC]
 
 
@@ -36,7 +47,8 @@ def test_an_svp_lens_has_the_maps_of_opencv(degrees: float) -> None:
     k = np.array([[SVP.fx, 0, SVP.cx], [0, SVP.fy, SVP.cy], [0, 0, 1]])
     d = np.array(SVP.image_height.coefficients)
     theirs = cv2.fisheye.initUndistortRectifyMap(
-        k, d, np.eye(3), camera.k, (900, 700), cv2.CV_32FC1)
+        k, d, np.eye(3), camera.k, (900, 700), cv2.CV_32FC1
+    )
     assert maps.mask.any() and maps.u.dtype == maps.v.dtype == np.float32
     for own, other in zip(maps[:2], theirs, strict=True):
         assert np.abs(own - other)[maps.mask].max() < 1e-3
@@ -69,10 +81,15 @@ def test_a_whole_turn_and_what_lies_past_the_poles() -> None:
     assert np.abs(camera.directions(u, v) - [0, 0, -1]).max() == 0
 
 
-@pytest.mark.parametrize(('projection', 'along_baseline', 'degrees'), [
-    ('pinhole', True, 90.0), ('cylindrical', True, 90.0), ('cylindrical', False, 180.6),
-    ('equirectangular', True, 180.0),
-])
+@pytest.mark.parametrize(
+    ('projection', 'along_baseline', 'degrees'),
+    [
+        ('pinhole', True, 90.0),
+        ('cylindrical', True, 90.0),
+        ('cylindrical', False, 180.6),
+        ('equirectangular', True, 180.0),
+    ],
+)
 def test_where_u_is_a_tangent_the_field_of_view_is_90_degrees(
     projection: str, along_baseline: bool, degrees: float
 ) -> None:
@@ -92,9 +109,7 @@ def test_errors_near_the_poles_of_a_sphere_are_angles() -> None:
 
 @pytest.mark.parametrize('lens', LENSES, ids=lambda lens: lens.name)
 @pytest.mark.parametrize('projection', PROJECTIONS)
-def test_what_is_at_the_range_is_where_an_ideal_camera_has_it(
-    lens: Lens, projection: str
-) -> None:
+def test_what_is_at_the_range_is_where_an_ideal_camera_has_it(lens: Lens, projection: str) -> None:
     side = Rectification(lens, camera_for([lens], projection, (320, 200)), 0.7)
     rows, columns = np.nonzero(side.maps.mask)
     chosen = np.random.default_rng(0).choice(len(rows), 200)
@@ -176,8 +191,11 @@ def test_the_ranges_that_are_tolerated_end_where_the_error_is_half_a_pixel() -> 
 
 def test_impossible_cameras_and_ranges_are_refused() -> None:
     for projection, degrees, text in (
-        ('pinhole', 180.0, 'above 0 and at most 175'), ('fisheye', 361.0, 'at most 360'),
-        ('cylindrical', np.nan, 'field of view is nan'), ('round', 90.0, "'round' is unknown")):
+        ('pinhole', 180.0, 'above 0 and at most 175'),
+        ('fisheye', 361.0, 'at most 360'),
+        ('cylindrical', np.nan, 'field of view is nan'),
+        ('round', 90.0, "'round' is unknown"),
+    ):
         with pytest.raises(ParameterError, match=text):
             rectified_camera(projection, (640, 480), np.radians(degrees))
     with pytest.raises(ParameterError, match='size is 0x480'):

@@ -19,17 +19,21 @@ from fisheye_svp_ros.rectify.errors import pair_error
 from fisheye_svp_ros.rectify.maps import rectify_pair
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 
-LEFT = Lens('left', 640, 400, 210.0, 210.0, 318.3, 203.4, KannalaBrandt(-0.02, 0.003),
-            np.radians(95.0))
-RIGHT = Lens('right', 640, 400, 212.0, 211.0, 322.3, 197.4, KannalaBrandt(-0.025, 0.003),
-             np.radians(95.0))
+LEFT = Lens(
+    'left', 640, 400, 210.0, 210.0, 318.3, 203.4, KannalaBrandt(-0.02, 0.003), np.radians(95.0)
+)
+RIGHT = Lens(
+    'right', 640, 400, 212.0, 211.0, 322.3, 197.4, KannalaBrandt(-0.025, 0.003), np.radians(95.0)
+)
 SHIFT = Gennery(e0=0.006, e1=0.002)
 RIG = Pose(rotation_from_vector(np.array([0.02, 0.12, -0.05])), np.array([-0.15, 0.012, 0.02]))
 
 
 def opencv(lens: Lens) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return (np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]]),
-            np.array(lens.image_height.coefficients))
+    return (
+        np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]]),
+        np.array(lens.image_height.coefficients),
+    )
 
 
 def test_an_svp_pair_is_that_of_opencv() -> None:
@@ -41,8 +45,7 @@ def test_an_svp_pair_is_that_of_opencv() -> None:
     for side, lens, r, p in ((pair.left, LEFT, r1, p1), (pair.right, RIGHT, r2, p2)):
         assert side.rotation == pytest.approx(r, abs=1e-12)
         assert side.p[0, 3] / side.p[0, 0] == pytest.approx(p[0, 3] / p[0, 0], abs=1e-12)
-        theirs = cv2.fisheye.initUndistortRectifyMap(
-            *opencv(lens), r, side.p, size, cv2.CV_32FC1)
+        theirs = cv2.fisheye.initUndistortRectifyMap(*opencv(lens), r, side.p, size, cv2.CV_32FC1)
         assert side.maps.mask.mean() > 0.95
         for own, other in zip(side.maps[:2], theirs, strict=True):
             assert np.abs(own - other)[side.maps.mask].max() < 1e-3
@@ -95,8 +98,18 @@ class TestRendered:
     """Photographs of a board high above the axes, at one range, rectified; their corners."""
 
     BOARD = Print(8, 6, 0.03)
-    SIDES = tuple(replace(lens, width=1280, height=800, fx=2 * lens.fx, fy=2 * lens.fy,
-                          cx=2 * lens.cx, cy=2 * lens.cy) for lens in (LEFT, RIGHT))
+    SIDES = tuple(
+        replace(
+            lens,
+            width=1280,
+            height=800,
+            fx=2 * lens.fx,
+            fy=2 * lens.fy,
+            cx=2 * lens.cx,
+            cy=2 * lens.cy,
+        )
+        for lens in (LEFT, RIGHT)
+    )
 
     def corners(self) -> NDArray[np.float64]:
         """Return the corners of the board (N, 3), m, in the left camera, which it faces."""
@@ -112,10 +125,16 @@ class TestRendered:
 
     def photographs(self) -> list[NDArray[np.uint8]]:
         camera = self.place().inverse()
-        return [render(replace(lens, viewpoint_shift=SHIFT), self.BOARD, pose,
-                       Exposure(noise=0.5), np.random.default_rng(3))
-                for lens, pose in zip(
-                    self.SIDES, (camera, camera.compose(RIG.inverse())), strict=True)]
+        return [
+            render(
+                replace(lens, viewpoint_shift=SHIFT),
+                self.BOARD,
+                pose,
+                Exposure(noise=0.5),
+                np.random.default_rng(3),
+            )
+            for lens, pose in zip(self.SIDES, (camera, camera.compose(RIG.inverse())), strict=True)
+        ]
 
     def measured(
         self, photographs: list[NDArray[np.uint8]], shift: Gennery | None, range_m: float
@@ -125,14 +144,24 @@ class TestRendered:
         camera = rectified_camera('pinhole', (2000, 1600), np.radians(120.0), True)
         pair, points = rectify_pair(*believed, RIG, camera, range_m), self.corners()
         sides, locals_ = (pair.left, pair.right), (points, RIG.transform(points))
-        about = [side.rectified_points(project(replace(lens, viewpoint_shift=SHIFT), local).uv)
-                 for side, lens, local in zip(sides, self.SIDES, locals_, strict=True)]
+        about = [
+            side.rectified_points(project(replace(lens, viewpoint_shift=SHIFT), local).uv)
+            for side, lens, local in zip(sides, self.SIDES, locals_, strict=True)
+        ]
         inside = np.all([(uv > 20) & (uv < [1980, 1580]) for uv in about], axis=(0, 2))
         assert inside.sum() > 30
-        found = [cv2.cornerSubPix(
-            side.remap(image, cv2.INTER_CUBIC), uv[inside, None].astype(np.float32), (7, 7),
-            (-1, -1), (3, 100, 1e-4)).reshape(-1, 2).astype(float)
-            for side, image, uv in zip(sides, photographs, about, strict=True)]
+        found = [
+            cv2.cornerSubPix(
+                side.remap(image, cv2.INTER_CUBIC),
+                uv[inside, None].astype(np.float32),
+                (7, 7),
+                (-1, -1),
+                (3, 100, 1e-4),
+            )
+            .reshape(-1, 2)
+            .astype(float)
+            for side, image, uv in zip(sides, photographs, about, strict=True)
+        ]
         points = points[inside]
         true = np.hypot(*(points @ pair.left.rotation.T)[:, 1:].T)
         row, depth = found[1][:, 1] - found[0][:, 1], pair.depth(*found) - true

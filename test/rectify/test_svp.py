@@ -18,10 +18,12 @@ from fisheye_svp_ros.rectify.maps import nearest_svp_lens
 
 def image_error(lens: Lens, svp: Lens, range_m: float) -> float:
     """Return the rms difference, px, of image points at a range in and near the image."""
-    theta, azimuth = np.meshgrid(np.linspace(0.02, 0.97 * lens.max_incidence, 40),
-                                 np.linspace(0, 2 * np.pi, 24))
-    points = range_m * np.stack([np.sin(theta) * np.cos(azimuth),
-                                 np.sin(theta) * np.sin(azimuth), np.cos(theta)], axis=-1)
+    theta, azimuth = np.meshgrid(
+        np.linspace(0.02, 0.97 * lens.max_incidence, 40), np.linspace(0, 2 * np.pi, 24)
+    )
+    points = range_m * np.stack(
+        [np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)], axis=-1
+    )
     off = project(lens, points).uv - project(svp, points).uv
     return float(np.sqrt(np.nanmean(np.sum(off**2, axis=-1))))
 

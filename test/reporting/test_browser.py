@@ -15,8 +15,9 @@ from helpers.nodes import ROOT
 
 from fisheye_svp_ros import cli
 
-BROWSER = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))),
-               None)
+BROWSER = next(
+    filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), None
+)
 PHOTOGRAPHS = ROOT.parent / 'shared' / 'data' / 'photos' / 'chessboard'
 # One process makes both reports once.
 pytestmark = [pytest.mark.xdist_group('browser'), pytest.mark.slow]
@@ -45,8 +46,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     board = ['--board', 'chessboard:4x6:30mm']
     lens = str(found / 'lens.yaml')
     assert cli.main(['calibrate', str(PHOTOGRAPHS), *board, '-o', lens]) == 0
-    assert cli.main(['diagnose', str(PHOTOGRAPHS), *board, '--lens', lens, '--quick',
-                     '-o', str(found / 'out')]) == 0
+    assert (
+        cli.main(
+            [
+                'diagnose',
+                str(PHOTOGRAPHS),
+                *board,
+                '--lens',
+                lens,
+                '--quick',
+                '-o',
+                str(found / 'out'),
+            ]
+        )
+        == 0
+    )
     return found
 
 
@@ -61,9 +75,22 @@ def test_nothing_is_cut_and_what_matters_is_above_the_fold(
     page = html.escape(page.replace('</body>', _MEASURE))
     copy.write_text(_FRAME.format(width, height, page))
     shown = subprocess.run(
-        [str(BROWSER), '--headless', '--no-sandbox', '--disable-gpu', '--hide-scrollbars',
-         '--window-size=1400,1000', '--virtual-time-budget=10000', '--dump-dom', copy.as_uri()],
-        capture_output=True, text=True, timeout=120, check=True).stdout
+        [
+            str(BROWSER),
+            '--headless',
+            '--no-sandbox',
+            '--disable-gpu',
+            '--hide-scrollbars',
+            '--window-size=1400,1000',
+            '--virtual-time-budget=10000',
+            '--dump-dom',
+            copy.as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    ).stdout
     match = re.search('<pre>({.*?})</pre>', shown)
     assert match, shown[:500]
     found = json.loads(html.unescape(match[1]))

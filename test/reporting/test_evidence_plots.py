@@ -58,23 +58,38 @@ def test_no_tick_label_of_the_evidence_covers_another(
     statistics: tuple[float, ...], figures: list[Figure]
 ) -> None:
     fit = SimpleNamespace(heldout_rms_px=0.5)
-    evidence_plots.draw_evidence(Path(), SimpleNamespace(  # type: ignore[arg-type]
-        causes=[], figures=SimpleNamespace(base=fit, extended=fit), noise_px=0.1,
-        trace=[SimpleNamespace(effect=f'effect {n}', statistic=value, accepted=True)
-               for n, value in enumerate(statistics)]))
+    evidence_plots.draw_evidence(
+        Path(),
+        SimpleNamespace(  # type: ignore[arg-type]
+            causes=[],
+            figures=SimpleNamespace(base=fit, extended=fit),
+            noise_px=0.1,
+            trace=[
+                SimpleNamespace(effect=f'effect {n}', statistic=value, accepted=True)
+                for n, value in enumerate(statistics)
+            ],
+        ),
+    )
     canvas = FigureCanvasAgg(figures[0])
     canvas.draw()
     left, right = figures[0].axes
-    labels = [label.get_window_extent() for label in left.get_xticklabels(which='both')
-              if label.get_text()]
-    places = sorted((box.x0, box.x1) for box in labels
-                    if left.bbox.x0 - 1 <= (box.x0 + box.x1) / 2 <= left.bbox.x1 + 1)
+    labels = [
+        label.get_window_extent()
+        for label in left.get_xticklabels(which='both')
+        if label.get_text()
+    ]
+    places = sorted(
+        (box.x0, box.x1)
+        for box in labels
+        if left.bbox.x0 - 1 <= (box.x0 + box.x1) / 2 <= left.bbox.x1 + 1
+    )
     assert places and all(end < start for (_, end), (start, _) in pairwise(places))
     assert left.get_xlim()[0] < min(statistics)
-    line, = right.lines
+    (line,) = right.lines
     for number in right.texts:  # the line of the noise does not run through them
         box = number.get_bbox_patch()
         assert box is not None and number.get_zorder() > line.get_zorder()
-    legend, = figures[0].legends
-    assert not any(axis.get_tightbbox().overlaps(legend.get_window_extent())
-                   for axis in (left, right))
+    (legend,) = figures[0].legends
+    assert not any(
+        axis.get_tightbbox().overlaps(legend.get_window_extent()) for axis in (left, right)
+    )

@@ -44,26 +44,33 @@ from fisheye_svp_ros.reporting.next_steps import ReportInputs, command_to_go_on
 @pytest.fixture(scope='module')
 def found() -> Diagnosis:
     rng = np.random.default_rng(8)
-    return diagnose(observe(lens(), (), *scene(rng, frames=8), 0.2, rng), lens(),
-                    options=DiagnosisOptions(quick=True))
+    return diagnose(
+        observe(lens(), (), *scene(rng, frames=8), 0.2, rng),
+        lens(),
+        options=DiagnosisOptions(quick=True),
+    )
 
 
 @pytest.mark.parametrize(('ratio', 'warned'), [(0.9, False), (1.008, False), (1.02, True)])
-def test_a_rise_is_warned_of_where_it_is_one(
-    found: Diagnosis, ratio: float, warned: bool
-) -> None:
+def test_a_rise_is_warned_of_where_it_is_one(found: Diagnosis, ratio: float, warned: bool) -> None:
     """Nearly a percent more is what another weighting of the same points makes."""
     named = found.figures.named
-    risen = with_changes(found, named=type(named)(
-        ratio * found.figures.base.rms_px, named.heldout_rms_px, named.chi2_per_dof))
+    risen = with_changes(
+        found,
+        named=type(named)(
+            ratio * found.figures.base.rms_px, named.heldout_rms_px, named.chi2_per_dof
+        ),
+    )
     said = first_screen(risen, 'table').warning
     assert ('rms on the fitted frames, with the causes' in said) == warned
 
 
 def test_bounds_are_read_in_percent_and_millimetres(found: Diagnosis) -> None:
     """A decentering "up to 0.0012" told nobody anything."""
-    bounds = [EffectBound('decentering', 0.0012, '1', 0.7, 0.02, 0.05),
-              EffectBound('viewpoint_shift', 0.0004, 'm', 0.7, 0.02, 0.05)]
+    bounds = [
+        EffectBound('decentering', 0.0012, '1', 0.7, 0.02, 0.05),
+        EffectBound('viewpoint_shift', 0.0004, 'm', 0.7, 0.02, 0.05),
+    ]
     said = first_screen(_deciding(found, 'lens', bound=bounds), 'table').bound
     assert 'decentering up to 0.12 % (' in said
     assert 'viewpoint_shift up to 0.4 mm (' in said
@@ -72,11 +79,14 @@ def test_bounds_are_read_in_percent_and_millimetres(found: Diagnosis) -> None:
 def test_the_terminal_names_photographs_after_what_to_do(found: Diagnosis) -> None:
     screen = first_screen(found, 'table')
     action = screen.actions[2]._replace(
-        do='Take some again', why='2 of 26 scatter', sure='',
-        photographs=(Photo('10.jpg', ''), Photo('8.jpg', '')), more=1)
+        do='Take some again',
+        why='2 of 26 scatter',
+        sure='',
+        photographs=(Photo('10.jpg', ''), Photo('8.jpg', '')),
+        more=1,
+    )
     lines = terminal_lines(screen._replace(actions=(action,)), '')
-    assert ('Photographs: Take some again: 10.jpg, 8.jpg and 1 more. 2 of 26 scatter.'
-            in lines)
+    assert 'Photographs: Take some again: 10.jpg, 8.jpg and 1 more. 2 of 26 scatter.' in lines
 
 
 def test_a_size_within_its_error_is_called_so(found: Diagnosis) -> None:
@@ -88,11 +98,14 @@ def test_a_size_within_its_error_is_called_so(found: Diagnosis) -> None:
 def test_the_headline_says_that_the_target_is_imperfect_too(found: Diagnosis) -> None:
     """The decision was to measure the target again, and the headline spoke of the lens alone."""
     offsets = Figure('local_offsets', 0.38, 'px')
-    again = replace(_deciding(found, 'target', say='measure_again', figure=offsets),
-                    causes=[_tilt(0.005, 0.002)])
+    again = replace(
+        _deciding(found, 'target', say='measure_again', figure=offsets),
+        causes=[_tilt(0.005, 0.002)],
+    )
     assert headline(again).startswith(
         'The sensor is tilted (x = 0.29 ± 0.11 deg), and landmarks of the target are displaced '
-        '(0.38 px). ')
+        '(0.38 px). '
+    )
     assert 'landmarks' not in headline(_deciding(again, 'target', say='keep'))
 
 
@@ -102,18 +115,32 @@ def _deciding(found: Diagnosis, about: str, **changes: object) -> Diagnosis:
 
 
 def _tilt(value: float, error: float) -> Cause:
-    return Cause('sensor_tilt', {'x': {
-        'value': value, 'stderr': error, 'unit': 'rad'}}, 1e-9, 0.2, True, 0.1, 0.3, [], '')
+    return Cause(
+        'sensor_tilt',
+        {'x': {'value': value, 'stderr': error, 'unit': 'rad'}},
+        1e-9,
+        0.2,
+        True,
+        0.1,
+        0.3,
+        [],
+        '',
+    )
 
 
-@pytest.mark.parametrize(('parameter', 'words'), [
-    ('relative', 'The scale of the target is wrong'), ('x_over_y', 'The target is stretched')])
+@pytest.mark.parametrize(
+    ('parameter', 'words'),
+    [('relative', 'The scale of the target is wrong'), ('x_over_y', 'The target is stretched')],
+)
 def test_a_board_that_is_longer_one_way_is_not_one_of_another_scale(
     found: Diagnosis, parameter: str, words: str
 ) -> None:
     """Who reads that the scale is off by 0.47 % corrects the size of a square."""
-    scale = replace(_tilt(0.0, 0.0), form='landmark_scale', parameters={
-        parameter: {'value': 0.0047, 'stderr': 0.0002, 'unit': '1'}})
+    scale = replace(
+        _tilt(0.0, 0.0),
+        form='landmark_scale',
+        parameters={parameter: {'value': 0.0047, 'stderr': 0.0002, 'unit': '1'}},
+    )
     assert headline(replace(found, causes=[scale])).startswith(f'{words} ({parameter} = 0.47')
 
 
@@ -122,11 +149,12 @@ def test_only_a_bent_target_is_to_be_flattened(found: Diagnosis) -> None:
     assert target_words(replace(again, causes=[])) == 'Measure the target, or replace it'
     bent = replace(_tilt(0.0, 0.0), form='target_shape')
     assert target_words(replace(again, causes=[bent])) == (
-        'Measure the target, or flatten or replace it')
+        'Measure the target, or flatten or replace it'
+    )
 
 
 def test_an_undecided_lens_is_not_called_sure(found: Diagnosis) -> None:
-    """"Not significantly smaller (96 % sure)" read as if that were sure."""
+    """Once "Not significantly smaller (96 % sure)" read as if that were sure."""
     lens = _deciding(found, 'lens', say='undecided', confidence=0.96)
     assert first_screen(lens, 'table').actions[0].sure == ''
     unlikely = _deciding(found, 'lens', say='recalibrate', confidence=0.2)
@@ -139,14 +167,29 @@ def test_only_an_extended_lens_that_is_offered_is_warned_of(
 ) -> None:
     """Beside "Keep the lens" stood that the error rises with a lens nobody was to use."""
     worse = _deciding(found, 'lens', say=say)
-    worse = replace(worse, conclusion=replace(
-        worse.conclusion, file=found.file._replace(given_px=0.1, extended_px=0.2)))
+    worse = replace(
+        worse,
+        conclusion=replace(
+            worse.conclusion, file=found.file._replace(given_px=0.1, extended_px=0.2)
+        ),
+    )
     assert ('extended lens on one target' in first_screen(worse, 'table').warning) == warned
 
 
-@pytest.mark.parametrize(('share', 'words'), [
-    (0.5, '50 %'), (0.9963, '99.6 %'), (0.99996, '100 %'), (0.0042, '0.4 %'), (0.0003, '0.03 %'),
-    (-1e-9, '0 %'), (0.0, '0 %'), (-0.004, '-0.4 %'), (1.0, '100 %')])
+@pytest.mark.parametrize(
+    ('share', 'words'),
+    [
+        (0.5, '50 %'),
+        (0.9963, '99.6 %'),
+        (0.99996, '100 %'),
+        (0.0042, '0.4 %'),
+        (0.0003, '0.03 %'),
+        (-1e-9, '0 %'),
+        (0.0, '0 %'),
+        (-0.004, '-0.4 %'),
+        (1.0, '100 %'),
+    ],
+)
 def test_a_share_is_not_rounded_to_nothing_or_all(share: float, words: str) -> None:
     """Reports had "-0 % (-0 % to 0 %)", and gains of "100 % (100 % to 100 %)"."""
     assert percent(share) == words
@@ -157,7 +200,8 @@ def test_a_likely_shift_is_not_told_as_no_model_error(found: Diagnosis) -> None:
     likely = replace(_deciding(found, 'lens', say='use_extended'), causes=[], remaining=[])
     assert likely.verdict == 'adequate'
     assert headline(likely) == (
-        'No model error is confirmed in these data. Use extended_lens.yaml.')
+        'No model error is confirmed in these data. Use extended_lens.yaml.'
+    )
     assert verdict_words(likely) == 'Adequate: no model error is confirmed in these data'
     wrong, gained, _ = verdict_sentences(likely)
     assert wrong.startswith('Nothing is confirmed to be wrong in these data')
@@ -166,8 +210,9 @@ def test_a_likely_shift_is_not_told_as_no_model_error(found: Diagnosis) -> None:
 
 def test_a_lens_that_is_off_is_all_that_is_wrong(found: Diagnosis) -> None:
     """The verdict was explained, and the sentence below it "no effect explains them: ."."""
-    off = replace(_deciding(found, 'lens', say='recalibrate', why='the lens is off'), causes=[],
-                  remaining=[])
+    off = replace(
+        _deciding(found, 'lens', say='recalibrate', why='the lens is off'), causes=[], remaining=[]
+    )
     wrong, gained, _ = verdict_sentences(off)
     assert off.verdict == 'explained'
     assert wrong.startswith('Nothing but the intrinsics as given is wrong in these data')
@@ -176,14 +221,18 @@ def test_a_lens_that_is_off_is_all_that_is_wrong(found: Diagnosis) -> None:
     more = replace(off, remaining=[Structure('theta', 1e-9, 0.1)])
     assert 'intrinsics as given are wrong. Fitted' in verdict_sentences(more)[0]
     assert verdict_words(more) == (
-        'Partly explained: the lens as given is off; some of the residual error is unexplained')
+        'Partly explained: the lens as given is off; some of the residual error is unexplained'
+    )
 
 
 def test_an_imperfect_target_is_told_in_every_sentence(found: Diagnosis) -> None:
-    """"Only the target is imperfect", and below: nothing is wrong, without a pattern."""
+    """Once "Only the target is imperfect", and below: nothing is wrong, without a pattern."""
     figure = Figure('local_offsets', 0.38, 'px')
-    again = replace(_deciding(found, 'target', say='measure_again', figure=figure), causes=[],
-                    remaining=[Structure('landmark', 1e-9, 0.9)])
+    again = replace(
+        _deciding(found, 'target', say='measure_again', figure=figure),
+        causes=[],
+        remaining=[Structure('landmark', 1e-9, 0.9)],
+    )
     assert again.verdict == 'adequate'
     wrong, *_ = verdict_sentences(again)
     assert wrong.startswith('Nothing but the target is wrong in these data')
@@ -192,8 +241,9 @@ def test_an_imperfect_target_is_told_in_every_sentence(found: Diagnosis) -> None
 
 def test_outliers_alone_are_no_riddle_in_the_verdict(found: Diagnosis) -> None:
     gross = [{'frame': 4, 'landmark': 17, 'px': 12.3, 'why': 'far off'}]
-    clean = with_changes(found, causes=[], remaining=[Structure('outliers', 0.0, 0.5)],
-                         gross=gross)
+    clean = with_changes(
+        found, causes=[], remaining=[Structure('outliers', 0.0, 0.5)], gross=gross
+    )
     assert 'nothing else is wrong' in headline(clean)
     assert verdict_words(clean) == 'Unexplained: outliers; nothing else is wrong'
 
@@ -209,7 +259,7 @@ def test_words_about_the_target_agree_with_its_decision(found: Diagnosis) -> Non
 
 
 def test_without_a_cause_the_truth_is_told_once(found: Diagnosis) -> None:
-    """"1.55 mm → 1.55 mm" beside "Use extended_lens.yaml" read as if the lens gained nothing."""
+    """Once "1.55 mm → 1.55 mm" beside "Use extended_lens.yaml" read as if it gained nothing."""
     known = {'position_error_m': Comparison(0.002, 0.002, -1e-9, 0.0, 0.0)}
     assert first_screen(replace(found, causes=[]), 'table', known).truth == 'position error 2 mm'
     tilted = replace(found, causes=[_tilt(0.005, 0.002)])
@@ -218,16 +268,30 @@ def test_without_a_cause_the_truth_is_told_once(found: Diagnosis) -> None:
 
 def test_the_command_to_go_on_solves_the_same_problem(found: Diagnosis) -> None:
     """It left out the poses and the free intrinsics, and planned what was planned already."""
-    inputs = ReportInputs('a b.csv', ('l.yaml',), 'p.csv', None, Path('out'), True,
-                          settings=('--poses', 'p.csv', '--free', 'intrinsics'))
+    inputs = ReportInputs(
+        'a b.csv',
+        ('l.yaml',),
+        'p.csv',
+        None,
+        Path('out'),
+        True,
+        settings=('--poses', 'p.csv', '--free', 'intrinsics'),
+    )
     lens_open = {'lens': SimpleNamespace(say='undecided')}
-    open_ = SimpleNamespace(decision=lens_open, lenses={'': None}, offers_extended=False,
-                            problem=SimpleNamespace(plannable=True), is_lens_off=False)
+    open_ = SimpleNamespace(
+        decision=lens_open,
+        lenses={'': None},
+        offers_extended=False,
+        problem=SimpleNamespace(plannable=True),
+        is_lens_off=False,
+    )
     assert command_to_go_on(open_, inputs) == (
         "fisheye-svp diagnose 'a b.csv' --lens l.yaml --poses p.csv --free intrinsics --next 6 "
-        '-o next')
+        '-o next'
+    )
     assert command_to_go_on(open_, inputs._replace(planned=True)).startswith(
-        "fisheye-svp localize 'a b.csv' --lens l.yaml")
+        "fisheye-svp localize 'a b.csv' --lens l.yaml"
+    )
 
 
 def test_no_plan_is_promised_that_the_target_does_not_allow(found: Diagnosis) -> None:
@@ -238,7 +302,7 @@ def test_no_plan_is_promised_that_the_target_does_not_allow(found: Diagnosis) ->
 
 
 def test_photographs_are_named_only_beside_what_to_do_with_them(found: Diagnosis) -> None:
-    """"Enough: frame 3. 16 frames, ..." did not say what was to be done with frame 3."""
+    """Once "Enough: frame 3. 16 frames, ..." did not say what was to be done with frame 3."""
     bad = replace(found, advice=[Advice('take again', frames=[3], kind=RETAKE)])
     for say, names in (('enough', []), ('more', []), ('retake', ['frame 3'])):
         action = first_screen(_deciding(bad, 'photographs', say=say), 'table').actions[2]
@@ -246,17 +310,24 @@ def test_photographs_are_named_only_beside_what_to_do_with_them(found: Diagnosis
 
 
 def test_a_step_without_an_error_is_not_within_it(found: Diagnosis) -> None:
-    step = replace(_tilt(0.0, 0.0), form='quantisation', parameters={
-        'step': {'value': 0.25, 'stderr': 0.0, 'unit': 'px'}})
+    step = replace(
+        _tilt(0.0, 0.0),
+        form='quantisation',
+        parameters={'step': {'value': 0.25, 'stderr': 0.0, 'unit': 'px'}},
+    )
     assert size(found, step) == 'step = 0.25 px'
 
 
 def test_the_report_of_a_likely_shift_claims_no_causes(found: Diagnosis, tmp_path: Path) -> None:
-    """"The lens with its causes" stood below "Causes: none", and "1 points" among outliers."""
+    """Once "The lens with its causes" stood below "Causes: none", and "1 points" in outliers."""
     gross = [{'frame': 4, 'landmark': 17, 'px': 12.3, 'why': 'far off'}]
     likely = with_changes(_deciding(found, 'lens', say='use_extended'), causes=[], gross=gross)
-    write_report(likely, point_residuals(found.simulation, found.cause_fit), {},
-                 ReportInputs('obs.csv', ('l.yaml',), None, None, tmp_path, False))
+    write_report(
+        likely,
+        point_residuals(found.simulation, found.cause_fit),
+        {},
+        ReportInputs('obs.csv', ('l.yaml',), None, None, tmp_path, False),
+    )
     page = (tmp_path / 'report.html').read_text()
     assert 'is the lens as it was fitted; every command' in page
     assert 'fits and pictures: 1 point<' in page
@@ -269,20 +340,32 @@ def test_what_is_only_assumed_is_told_so(found: Diagnosis) -> None:
     assert 'assumed' not in headline(known)
     options = DiagnosisOptions(quick=True, included=('sensor_tilt',))
     selection = found.evaluation.selection
-    told = replace(known, evaluation=replace(found.evaluation, selection=replace(
-        selection, problem=replace(selection.problem, options=options))))
+    told = replace(
+        known,
+        evaluation=replace(
+            found.evaluation,
+            selection=replace(selection, problem=replace(selection.problem, options=options)),
+        ),
+    )
     assert headline(told).startswith(
-        'The sensor is tilted (x = 0.03 ± 0.11 deg) (assumed, not significant). ')
+        'The sensor is tilted (x = 0.03 ± 0.11 deg) (assumed, not significant). '
+    )
     assert 'sensor_tilt, assumed by --with' in verdict_sentences(told)[0]
 
 
 def test_one_frame_does_not_blame_the_target(found: Diagnosis) -> None:
-    """"Only the target is imperfect", beside: one frame does not tell lens from target."""
+    """Once "Only the target is imperfect", beside: one frame does not tell lens from target."""
     figure = Figure('local_offsets', 0.38, 'px')
-    one = Mock(wraps=found, frames=1, causes=[], candidates=[], remaining=[], verdict='adequate',
-               decision=_deciding(found, 'target', figure=figure).decision)
-    assert largest_cause(one) == (
-        'Errors show in one frame, which does not tell their cause')
+    one = Mock(
+        wraps=found,
+        frames=1,
+        causes=[],
+        candidates=[],
+        remaining=[],
+        verdict='adequate',
+        decision=_deciding(found, 'target', figure=figure).decision,
+    )
+    assert largest_cause(one) == ('Errors show in one frame, which does not tell their cause')
 
 
 def test_evidence_tells_what_was_not_confirmed_in_the_end(
@@ -292,10 +375,14 @@ def test_evidence_tells_what_was_not_confirmed_in_the_end(
     refuted = UnconfirmedCause('sensor_tilt', {}, 1e-9, 'held-out frames refute it')
     step = TraceStep('sensor_tilt', 99.0, 2, 1e-9, 1e-9, 93.0, 27.0, True, 'predicts better')
     table = with_changes(
-        found, causes=[], trace=[step],
-        conclusion=replace(found.conclusion, candidates=[refuted]))
-    write_report(table, point_residuals(found.simulation, found.cause_fit), {},
-                 ReportInputs('obs.csv', ('l.yaml',), None, None, tmp_path, False))
+        found, causes=[], trace=[step], conclusion=replace(found.conclusion, candidates=[refuted])
+    )
+    write_report(
+        table,
+        point_residuals(found.simulation, found.cause_fit),
+        {},
+        ReportInputs('obs.csv', ('l.yaml',), None, None, tmp_path, False),
+    )
     page = (tmp_path / 'report.html').read_text()
     assert '<td>predicts better; not confirmed: held-out frames refute it</td>' in page
 
@@ -303,14 +390,23 @@ def test_evidence_tells_what_was_not_confirmed_in_the_end(
 def test_an_extended_lens_that_held_out_frames_refute_is_not_offered(found: Diagnosis) -> None:
     """Beside "use the extended lenses" a warning said that their held-out error is larger."""
     off = _deciding(found, 'lens', say='recalibrate')
-    better = replace(off, conclusion=replace(
-        off.conclusion, file=found.file._replace(given_px=0.2, extended_px=0.1)))
+    better = replace(
+        off,
+        conclusion=replace(
+            off.conclusion, file=found.file._replace(given_px=0.2, extended_px=0.1)
+        ),
+    )
     assert headline(better).endswith('calibrate again, or use extended_lens.yaml.')
-    worse = replace(off, conclusion=replace(
-        off.conclusion, file=found.file._replace(given_px=0.1, extended_px=0.2)))
+    worse = replace(
+        off,
+        conclusion=replace(
+            off.conclusion, file=found.file._replace(given_px=0.1, extended_px=0.2)
+        ),
+    )
     assert headline(worse).endswith('Do not use the lens as given; calibrate again.')
     assert not first_screen(worse, 'table').warning and 'held-out frames' in refusal_reason(worse)
     inputs = ReportInputs('a.csv', ('l.yaml',), None, None, Path('out'), True)
     size = f'{found.lens.width}x{found.lens.height}'
     assert command_to_go_on(worse, inputs) == (
-        f'fisheye-svp calibrate a.csv --image-size {size} -o recalibrated.yaml')
+        f'fisheye-svp calibrate a.csv --image-size {size} -o recalibrated.yaml'
+    )

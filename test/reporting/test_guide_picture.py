@@ -38,12 +38,14 @@ def test_orange_until_the_board_is_there_then_green(guide):
 
 def test_what_is_settled_and_what_photographs_cannot_tell(guide):
     stand = evaluate_session(guide.session)._replace(
-        value=-0.003, stderr=0.0001, named=('viewpoint_shift',), alike=('flat_port',),
-        settled=True)
+        value=-0.003, stderr=0.0001, named=('viewpoint_shift',), alike=('flat_port',), settled=True
+    )
     guide.adopt(stand)
     assert guide_words(guide) == (
-        'settled', 'diagnosis: viewpoint_shift, or flat_port: photographs cannot separate them',
-        '0 photographs, e0 -3 +- 0.1 mm, goal +- 0.3')
+        'settled',
+        'diagnosis: viewpoint_shift, or flat_port: photographs cannot separate them',
+        '0 photographs, e0 -3 +- 0.1 mm, goal +- 0.3',
+    )
 
 
 def test_a_large_image_of_16_bits_makes_a_small_picture(guide):

@@ -6,8 +6,17 @@ from fisheye_svp_ros.reporting.cause_text import outlier_rows
 
 
 def test_many_outliers_of_one_view_are_one_row() -> None:
-    gross = [{'frame': 4, 'camera': 'left', 'photograph': 'left19.jpg', 'landmark': n,
-              'px': 10.0 + n, 'why': 'all points of the view are off'} for n in range(40)]
+    gross = [
+        {
+            'frame': 4,
+            'camera': 'left',
+            'photograph': 'left19.jpg',
+            'landmark': n,
+            'px': 10.0 + n,
+            'why': 'all points of the view are off',
+        }
+        for n in range(40)
+    ]
     gross += [{'frame': 7, 'landmark': 3, 'px': 99.0, 'why': 'far from its prediction'}]
     view, point = outlier_rows(gross)
     assert (view.where, view.camera, view.points, view.px) == ('left19.jpg', 'left', 40, 49.0)

@@ -26,9 +26,7 @@ def test_long_work_prints_a_line_every_few_seconds(
     assert capsys.readouterr().err == 'diagnosis: stage 0 (25%)\ndiagnosis: stage 1 (50%)\n'
 
 
-def test_short_work_prints_nothing(
-    clock: list[float], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_short_work_prints_nothing(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
     with terminal.progress('sweep', 10) as advance:
         for second in range(5):
             clock[0] = float(second)

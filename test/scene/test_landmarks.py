@@ -34,27 +34,36 @@ def test_lookup_by_id_in_any_order_and_shape():
     assert np.isnan(points[1, 0]).all()
 
 
-@pytest.mark.parametrize(('spread', 'radius', 'reason'), [
-    ('middle', 2.0, "environment 'middle' is unknown; known are whole, inner, outer"),
-    ('whole', 0.0, 'environment radius is 0.0 m; it must be above 0'),
-    ('whole', float('nan'), 'environment radius is nan m; it must be above 0'),
-    ('whole', float('inf'), 'environment radius is inf m; it must be above 0'),
-])
+@pytest.mark.parametrize(
+    ('spread', 'radius', 'reason'),
+    [
+        ('middle', 2.0, "environment 'middle' is unknown; known are whole, inner, outer"),
+        ('whole', 0.0, 'environment radius is 0.0 m; it must be above 0'),
+        ('whole', float('nan'), 'environment radius is nan m; it must be above 0'),
+        ('whole', float('inf'), 'environment radius is inf m; it must be above 0'),
+    ],
+)
 def test_impossible_environment(spread, radius, reason):
     with pytest.raises(ObservationError, match=reason):
         environment(spread, radius)
 
 
-@pytest.mark.parametrize(('content', 'reason'), [
-    ('inner: [[0, 0]]\n', 'inner and outer must each be a list of'),
-    ('inner: [[0, 0]]\nouter: []\n', 'inner and outer must each be a list of'),
-    ('inner: [[0, 0]]\nouter: [[1, 2], [3]]\n', 'inner and outer must each be a list of'),
-    ('inner: [[0]]\nouter: [[1]]\n', 'inner and outer must each be a list of'),
-    ('inner: [[0, 0]]\nouter: [[a, b]]\n', 'inner and outer must each be a list of'),
-    ('inner: 3\nouter: 4\n', 'inner and outer must each be a list of'),
-    ('inner: [[0, 0]]\nouter: [[.nan, 0]]\n', 'landmark 1 has a coordinate that is not a finite'),
-    ('- 1\n', 'a YAML mapping is expected'),
-])
+@pytest.mark.parametrize(
+    ('content', 'reason'),
+    [
+        ('inner: [[0, 0]]\n', 'inner and outer must each be a list of'),
+        ('inner: [[0, 0]]\nouter: []\n', 'inner and outer must each be a list of'),
+        ('inner: [[0, 0]]\nouter: [[1, 2], [3]]\n', 'inner and outer must each be a list of'),
+        ('inner: [[0]]\nouter: [[1]]\n', 'inner and outer must each be a list of'),
+        ('inner: [[0, 0]]\nouter: [[a, b]]\n', 'inner and outer must each be a list of'),
+        ('inner: 3\nouter: 4\n', 'inner and outer must each be a list of'),
+        (
+            'inner: [[0, 0]]\nouter: [[.nan, 0]]\n',
+            'landmark 1 has a coordinate that is not a finite',
+        ),
+        ('- 1\n', 'a YAML mapping is expected'),
+    ],
+)
 def test_broken_layout(content, reason, tmp_path):
     file = tmp_path / 'layout.yaml'
     file.write_text(content)
@@ -91,17 +100,20 @@ def test_landmarks_of_a_spreadsheet_begin_with_a_byte_order_mark(tmp_path):
 WHOLE = 'a whole number from 0 to 4294967295 is needed'
 
 
-@pytest.mark.parametrize(('content', 'reason'), [
-    ('', 'it is empty; a header with landmark,x,y,z is needed'),
-    ('landmark,x,y\n', "column 'z' is missing"),
-    ('landmark,x,y,z\n', 'no row below the header; at least one is needed'),
-    ('landmark,x,y,z\n1,0,0,0\n1,1,1,1\n', 'landmark 1 is listed twice'),
-    ('landmark,x,y,z\n1,0,nan,0\n', "line 2: y is 'nan'; a finite number is needed"),
-    ('landmark,x,y,z\n1,0,0,0\n2,0,abc,0\n', "line 3: y is 'abc'; a number is needed"),
-    ('landmark,x,y,z\n1,0,0\n', 'line 2: 3 fields where the header has 4'),
-    ('landmark,x,y,z\n1.5,0,0,0\n', f"line 2: landmark is '1.5'; {WHOLE}"),
-    (f'landmark,x,y,z\n{2**70},0,0,0\n', f'line 2: landmark is .*; {WHOLE}'),
-])
+@pytest.mark.parametrize(
+    ('content', 'reason'),
+    [
+        ('', 'it is empty; a header with landmark,x,y,z is needed'),
+        ('landmark,x,y\n', "column 'z' is missing"),
+        ('landmark,x,y,z\n', 'no row below the header; at least one is needed'),
+        ('landmark,x,y,z\n1,0,0,0\n1,1,1,1\n', 'landmark 1 is listed twice'),
+        ('landmark,x,y,z\n1,0,nan,0\n', "line 2: y is 'nan'; a finite number is needed"),
+        ('landmark,x,y,z\n1,0,0,0\n2,0,abc,0\n', "line 3: y is 'abc'; a number is needed"),
+        ('landmark,x,y,z\n1,0,0\n', 'line 2: 3 fields where the header has 4'),
+        ('landmark,x,y,z\n1.5,0,0,0\n', f"line 2: landmark is '1.5'; {WHOLE}"),
+        (f'landmark,x,y,z\n{2**70},0,0,0\n', f'line 2: landmark is .*; {WHOLE}'),
+    ],
+)
 def test_broken_landmark_file(content, reason, tmp_path):
     file = tmp_path / 'landmarks.csv'
     file.write_text(content)

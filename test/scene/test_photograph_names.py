@@ -19,13 +19,22 @@ from fisheye_svp_ros.scene.observations import (
 def rig(*photographs: tuple[int, str, str]) -> Observations:
     """Return two frames of two cameras, of one point each."""
     table = make_observations(
-        np.array([0, 0, 1, 1]), np.zeros(4, dtype=int), np.zeros((4, 2)), np.zeros((4, 3)),
-        camera=np.array([0, 1, 0, 1]), cameras=('left', 'right'))
+        np.array([0, 0, 1, 1]),
+        np.zeros(4, dtype=int),
+        np.zeros((4, 2)),
+        np.zeros((4, 3)),
+        camera=np.array([0, 1, 0, 1]),
+        cameras=('left', 'right'),
+    )
     return replace(table, photographs=photographs)
 
 
-FOLDERS = rig((0, 'left', 'rig/left/19.jpg'), (0, 'right', 'rig/right/19.jpg'),
-              (1, 'left', 'rig/left/20.jpg'), (1, 'right', 'rig/right/20.jpg'))
+FOLDERS = rig(
+    (0, 'left', 'rig/left/19.jpg'),
+    (0, 'right', 'rig/right/19.jpg'),
+    (1, 'left', 'rig/left/20.jpg'),
+    (1, 'right', 'rig/right/20.jpg'),
+)
 
 
 def test_one_file_name_in_two_folders_keeps_its_folder() -> None:
@@ -38,8 +47,11 @@ def test_one_file_name_in_two_folders_keeps_its_folder() -> None:
 
 
 def test_all_keep_their_folder_where_one_needs_it() -> None:
-    table = rig((0, 'left', 'rig/left/19.jpg'), (0, 'right', 'rig/right/19.jpg'),
-                (1, 'right', 'rig/right/20.jpg'))
+    table = rig(
+        (0, 'left', 'rig/left/19.jpg'),
+        (0, 'right', 'rig/right/19.jpg'),
+        (1, 'right', 'rig/right/20.jpg'),
+    )
     assert frame_name(table, 1) == 'right/20.jpg'
 
 

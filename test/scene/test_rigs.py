@@ -13,8 +13,9 @@ from fisheye_svp_ros.scene.observations import RADII, rig_cameras
 from fisheye_svp_ros.scene.rigs import BASELINE, STYLES, calibration_poses, paper_pose, rig
 
 
-@pytest.mark.parametrize(('style', 'inward'), [('parallel', 0), ('vergent', 10),
-                                               ('divergent', -10)])
+@pytest.mark.parametrize(
+    ('style', 'inward'), [('parallel', 0), ('vergent', 10), ('divergent', -10)]
+)
 def test_styles(style, inward):
     left = rig(style)
     np.testing.assert_array_equal(left.position, [-BASELINE, 0, 0])
@@ -24,11 +25,14 @@ def test_styles(style, inward):
     assert axis[1] == 0
 
 
-@pytest.mark.parametrize(('style', 'baseline', 'reason'), [
-    ('crossed', 0.15, "style 'crossed' is unknown; known are parallel, vergent, divergent"),
-    ('parallel', 0.0, 'baseline is 0.0 m; it must be above 0'),
-    ('parallel', float('nan'), 'baseline is nan m; it must be above 0'),
-])
+@pytest.mark.parametrize(
+    ('style', 'baseline', 'reason'),
+    [
+        ('crossed', 0.15, "style 'crossed' is unknown; known are parallel, vergent, divergent"),
+        ('parallel', 0.0, 'baseline is 0.0 m; it must be above 0'),
+        ('parallel', float('nan'), 'baseline is nan m; it must be above 0'),
+    ],
+)
 def test_impossible_rig(style, baseline, reason):
     with pytest.raises(ParameterError, match=reason):
         rig(style, baseline)
@@ -64,9 +68,15 @@ def test_calibration_poses_differ_in_place_and_turn():
     assert np.linalg.matrix_rank(pose.position - pose.position.mean(axis=0), 1e-3) == 3
 
 
-@pytest.mark.parametrize(('cameras', 'pair'), [
-    (('left', 'right'), ('left', 'right')), (('right', 'left', 'top'), ('left', 'right')),
-    (('cam1', 'cam0'), ('cam0', 'cam1')), (('',), None), (('a', 'b', 'c'), None),
-])
+@pytest.mark.parametrize(
+    ('cameras', 'pair'),
+    [
+        (('left', 'right'), ('left', 'right')),
+        (('right', 'left', 'top'), ('left', 'right')),
+        (('cam1', 'cam0'), ('cam0', 'cam1')),
+        (('',), None),
+        (('a', 'b', 'c'), None),
+    ],
+)
 def test_which_cameras_are_a_rig(cameras, pair):
     assert rig_cameras(cameras) == pair

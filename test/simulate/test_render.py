@@ -35,11 +35,15 @@ def bow(height: float) -> Field:
     return lambda place: height * ((place[..., 0] - 0.075) / 0.075) ** 2
 
 
-@pytest.mark.parametrize('printed', [
-    PRINTED,
-    replace(PRINTED, bow=bow(0.002)),
-    replace(PRINTED, shift=lambda place: 0.01 * place[..., ::-1]),
-], ids=['flat', 'bowed', 'sheared print'])
+@pytest.mark.parametrize(
+    'printed',
+    [
+        PRINTED,
+        replace(PRINTED, bow=bow(0.002)),
+        replace(PRINTED, shift=lambda place: 0.01 * place[..., ::-1]),
+    ],
+    ids=['flat', 'bowed', 'sheared print'],
+)
 def test_corners_are_where_the_lens_projects_them(printed: Print) -> None:
     errors = corner_errors(printed, QUIET)
     assert np.abs(errors.mean(axis=0)).max() < 0.01
@@ -62,19 +66,28 @@ def test_rolling_shutter_shears_the_picture() -> None:
     assert not isinstance(points, str)
     true = true_corners(pose)[points.ids]
     late = 3e-5 * (true[:, 1] - (LENS.height - 1) / 2)
-    expected = np.stack([
-        project(LENS, (PRINTED.corners[corner] - place) @ pose.rotation).uv
-        for corner, place in zip(
-            points.ids, pose.position + late[:, None] * [0.3, 0, 0], strict=True)
-    ])
+    expected = np.stack(
+        [
+            project(LENS, (PRINTED.corners[corner] - place) @ pose.rotation).uv
+            for corner, place in zip(
+                points.ids, pose.position + late[:, None] * [0.3, 0, 0], strict=True
+            )
+        ]
+    )
     assert np.abs(expected - true).max() > 0.2
     assert np.abs(points.uv - expected).max() < 0.03
 
 
 def test_effects_given_in_the_image_move_the_corners() -> None:
     pose = poses(1, 7).take(0)
-    image = render(LENS, PRINTED, pose, QUIET, np.random.default_rng(0),
-                   moved=lambda place: np.stack([8 * place[..., 1], 0 * place[..., 0]], axis=-1))
+    image = render(
+        LENS,
+        PRINTED,
+        pose,
+        QUIET,
+        np.random.default_rng(0),
+        moved=lambda place: np.stack([8 * place[..., 1], 0 * place[..., 0]], axis=-1),
+    )
     points = find_points(image, PATTERN, 'saddle')
     assert not isinstance(points, str)
     expected = true_corners(pose) + np.stack([8 * PRINTED.corners[:, 1], np.zeros(30)], axis=-1)
@@ -85,8 +98,10 @@ def test_rays_computed_once_give_the_same_photographs() -> None:
     rays = pixel_rays(LENS)
     shutter = replace(QUIET, line_time=3e-5, twist=(0.3, 0.0, 0.0, 0.0, 0.0, 0.0))
     for pose, exposure in ((poses(2).take(0), QUIET), (poses(2).take(1), shutter)):
-        first, second = (render(LENS, PRINTED, pose, exposure, np.random.default_rng(0), rays=one)
-                         for one in (None, rays))
+        first, second = (
+            render(LENS, PRINTED, pose, exposure, np.random.default_rng(0), rays=one)
+            for one in (None, rays)
+        )
         np.testing.assert_array_equal(first, second)
 
 

@@ -42,8 +42,9 @@ def rng():
 def test_one_row_an_image_point():
     landmarks = environment('outer', 0.5)
     times, boards = np.arange(10) * 0.1, np.arange(18) // 8
-    table = simulate(ForwardModel(FISH214), landmarks, calibration_poses(), 0.0, rng(),
-                     t=times, board=boards)
+    table = simulate(
+        ForwardModel(FISH214), landmarks, calibration_poses(), 0.0, rng(), t=times, board=boards
+    )
     assert len(table) == 180
     assert table.frames.tolist() == list(range(10))
     np.testing.assert_array_equal(table.landmark, np.tile(landmarks.ids, 10))
@@ -58,23 +59,33 @@ def test_one_row_an_image_point():
 
 
 def test_what_has_no_image_is_absent():
-    points = np.array([[0, 0, 1.0], [0, 0.1, -1.0], [0.1, 0, 0.1],
-                       [np.sin(1.8), 0, -np.cos(1.8)]])
+    points = np.array([[0, 0, 1.0], [0, 0.1, -1.0], [0.1, 0, 0.1], [np.sin(1.8), 0, -np.cos(1.8)]])
     landmarks = Landmarks(np.array([3, 1, 4, 5]), points)
     table = simulate(ForwardModel(FISH214), landmarks, paper_pose(1), 0.0, rng())
     assert table.landmark.tolist() == [1, 5]
     narrow = replace(FISH214, width=800, height=1536)
     table = simulate(ForwardModel(narrow), landmarks, paper_pose(1), 0.0, rng())
     assert table.landmark.tolist() == [1]
-    empty = simulate(ForwardModel(FISH214), Landmarks(np.array([3]), points[:1]), paper_pose(2),
-                     0.0, rng())
+    empty = simulate(
+        ForwardModel(FISH214), Landmarks(np.array([3]), points[:1]), paper_pose(2), 0.0, rng()
+    )
     assert len(empty) == 0
 
 
 def test_the_image_ends_half_a_pixel_beyond_the_outer_centres():
     lens = replace(FISH214, viewpoint_shift=None, width=400, height=300, cx=200.0, cy=150.0)
-    edges = np.array([[-0.45, 10.0], [399.45, 10.0], [10.0, -0.45], [10.0, 299.45],
-                      [-0.55, 10.0], [399.55, 10.0], [10.0, -0.55], [10.0, 299.55]])
+    edges = np.array(
+        [
+            [-0.45, 10.0],
+            [399.45, 10.0],
+            [10.0, -0.45],
+            [10.0, 299.45],
+            [-0.55, 10.0],
+            [399.55, 10.0],
+            [10.0, -0.55],
+            [10.0, 299.55],
+        ]
+    )
     points = back_project(lens, edges).direction
     table = simulate(ForwardModel(lens), Landmarks(np.arange(8), points), identity(1), 0.0, rng())
     assert table.landmark.tolist() == [0, 1, 2, 3]
@@ -103,8 +114,16 @@ def test_impossible_noise(sigma):
 def test_stereo_is_one_table_of_two_cameras():
     landmarks, right = environment('whole', 2.0), calibration_poses()
     left_in_right = rig('vergent')
-    table = simulate_stereo(ForwardModel(FISH180), ForwardModel(FISH214), landmarks, left_in_right,
-                            right, 0.0, rng(), t=np.arange(10.0))
+    table = simulate_stereo(
+        ForwardModel(FISH180),
+        ForwardModel(FISH214),
+        landmarks,
+        left_in_right,
+        right,
+        0.0,
+        rng(),
+        t=np.arange(10.0),
+    )
     assert table.cameras == ('left', 'right')
     views = group_views(table)
     assert views.frame.tolist() == [frame for frame in range(10) for _ in range(2)]
@@ -168,8 +187,29 @@ def test_the_image_ends_half_a_pixel_beyond_the_outer_pixel_centres():
 
 @pytest.mark.parametrize('steps', [0, 1, 7])
 def test_pieces_are_the_whole(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
-    poses = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0,
-             0.1, 0.2, 0.0, 1.0, 0.0, 0.0, 0.0)
+    poses = (
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+        0.0,
+        0.0,
+        0.0,
+        0.1,
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+        0.0,
+        0.0,
+        0.1,
+        0.2,
+        0.0,
+        1.0,
+        0.0,
+        0.0,
+        0.0,
+    )
     one = Scenario(poses=poses, trajectory_steps=steps, noise_px=0.3)
     whole = simulate_scenario(one)
     monkeypatch.setattr(scenario, '_SETS_PER_BLOCK', 4)
@@ -199,8 +239,10 @@ def four_cameras(folder):
     """Write the lenses and the rig of four cameras; return their places in the first one."""
     rig = surround_rig(4, 0.1)
     for number in range(4):
-        save_lens(replace(FISH180, name=f'cam{number}', cx=FISH180.cx + number),
-                  folder / f'cam{number}.yaml')
+        save_lens(
+            replace(FISH180, name=f'cam{number}', cx=FISH180.cx + number),
+            folder / f'cam{number}.yaml',
+        )
     steps = [rig.take(i + 1).inverse().compose(rig.take(i)) for i in range(3)]
     save_rig(steps, folder / 'rig.yaml', tuple(f'cam{i}' for i in range(4)))
     return rig
@@ -208,8 +250,9 @@ def four_cameras(folder):
 
 def test_cameras_of_a_file_see_what_they_would_alone(tmp_path):
     rig = four_cameras(tmp_path)
-    seen = simulate_scenario(Scenario(rig_file=str(tmp_path), radius=0.5,
-                                      poses=(0.01, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)))
+    seen = simulate_scenario(
+        Scenario(rig_file=str(tmp_path), radius=0.5, poses=(0.01, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    )
     table = seen.observations
     assert table.cameras == ('cam0', 'cam1', 'cam2', 'cam3') and seen.rig is None
     for number, pose in enumerate(seen.poses):

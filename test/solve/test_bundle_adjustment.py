@@ -46,7 +46,7 @@ def prior_rows(prior, state):
     """Return the residuals of a prior, written down anew."""
     rows = []
     if prior.mean is not None:
-        rows.append(prior.root @ (state.shared_values(FREE)[-len(prior.mean):] - prior.mean))
+        rows.append(prior.root @ (state.shared_values(FREE)[-len(prior.mean) :] - prior.mean))
     for known, pose in ((prior.pose, state.pose), (prior.rig, state.rig.take(np.s_[1:]))):
         if known is not None:
             off = pose.difference(known.mean)
@@ -68,15 +68,26 @@ def by_scipy(data, state, prior):
 
     count = 6 * frames + turned + len(state.shared_values(FREE))
     # Central differences: with those of one side MINPACK stops short.
-    return after(least_squares(rows, np.zeros(count), jac='3-point', x_scale='jac', xtol=1e-14,
-                               ftol=1e-14, gtol=1e-14, max_nfev=60).x)
+    return after(
+        least_squares(
+            rows,
+            np.zeros(count),
+            jac='3-point',
+            x_scale='jac',
+            xtol=1e-14,
+            ftol=1e-14,
+            gtol=1e-14,
+            max_nfev=60,
+        ).x
+    )
 
 
 def assert_alike(first, second, free=FREE):
     assert np.abs(first.pose.difference(second.pose)).max() < 1e-6
     assert np.abs(first.rig.difference(second.rig)).max() < 1e-6
     np.testing.assert_allclose(
-        first.shared_values(free), second.shared_values(free), rtol=1e-5, atol=1e-6)
+        first.shared_values(free), second.shared_values(free), rtol=1e-5, atol=1e-6
+    )
 
 
 def pose_prior(pose, rng, sigma):
@@ -92,8 +103,10 @@ def test_the_minimum_is_scipys_with_a_prior_on_any_part(kind):
     state = with_shift(initial_state(data, lens()))
     prior = Prior()
     if kind in ('values', 'all'):
-        prior = prior._replace(mean=state.shared_values(FREE) + np.array([3, -2, 0.001]),
-                               root=np.diag([2.0, 1.0, 1e4]) + 0.1)
+        prior = prior._replace(
+            mean=state.shared_values(FREE) + np.array([3, -2, 0.001]),
+            root=np.diag([2.0, 1.0, 1e4]) + 0.1,
+        )
     if kind == 'last values':
         prior = Prior(state.shared_values(FREE)[1:] + np.array([-2, 0.001]), np.diag([1.0, 1e4]))
     if kind in ('poses', 'all'):
@@ -160,8 +173,12 @@ def two_lenses():
 def rig_state(data):
     """Return a state of two lenses that share one effect and have another each for itself."""
     state = initial_state(data, *([two_lenses()[0], two_lenses()[1:]]))
-    own = combine_cameras([by_camera(i, label, [DecenteringEffect()])[0]
-                    for i, label in enumerate(('left', 'right'))])
+    own = combine_cameras(
+        [
+            by_camera(i, label, [DecenteringEffect()])[0]
+            for i, label in enumerate(('left', 'right'))
+        ]
+    )
     values = np.array([1e-4, -2e-4, 3e-4, 1e-4])
     return replace(state, terms=((own, values), (SkewEffect(), np.array([1e-3]))))
 
@@ -176,8 +193,10 @@ def test_columns_of_a_rig_of_two_lenses_are_those_of_differences():
     for i in range(count):
         step = 1e-5 * np.eye(count)[i]
         zero = np.zeros((data.frames, 6))
-        after, before = (Linearization(data, state.retract(free, zero, s * step), free).residual
-                         for s in (1, -1))
+        after, before = (
+            Linearization(data, state.retract(free, zero, s * step), free).residual
+            for s in (1, -1)
+        )
         column = linear.shared_columns[..., i]
         # Derivatives leave out that the decentering varies over the image.
         assert np.abs((before - after) / 2e-5 - column).max() < 2e-3 * np.abs(column).max()
@@ -198,8 +217,9 @@ def test_a_rig_predicts_each_view_by_its_camera():
         whole = state.model.transform_columns(linear, views, linear.d_pose)
         np.testing.assert_allclose(whole[rows], columns, rtol=1e-14)
         image = state.model.predict(pose, views)
-        assert np.array_equal(image.uv[rows], own.predict(pose.take(rows), views.take(rows)).uv,
-                              equal_nan=True)
+        assert np.array_equal(
+            image.uv[rows], own.predict(pose.take(rows), views.take(rows)).uv, equal_nan=True
+        )
     assert not state.model.is_lens_only and not ForwardModel(two_lenses()).is_lens_only
 
 
@@ -213,14 +233,20 @@ def test_gauss_newton_under_white_noise_is_the_adjustment():
     def solve(residual, _):
         flat = shared.reshape(residual.size, -1)
         equations = ArrowEquations(
-            (turned @ frame)[None], (turned @ shared)[None], (flat.T @ flat)[None],
-            -(turned @ residual[..., None])[None, ..., 0], -(flat.T @ residual.ravel())[None])
+            (turned @ frame)[None],
+            (turned @ shared)[None],
+            (flat.T @ flat)[None],
+            -(turned @ residual[..., None])[None, ..., 0],
+            -(flat.T @ residual.ravel())[None],
+        )
         (block, common), _ = arrow_step(tuple(equations), np.zeros(1))
         return block[0], common[0]
 
     fitted, whole = gauss_newton(linear, solve, 1e-9), adjust(data, state, FREE)
-    start, found, least = (float((Linearization(data, one, FREE).residual ** 2).sum())
-                           for one in (state, fitted, whole))
+    start, found, least = (
+        float((Linearization(data, one, FREE).residual ** 2).sum())
+        for one in (state, fitted, whole)
+    )
     assert found - least < 1e-6 * (start - least)
 
 
@@ -235,8 +261,14 @@ def test_a_step_out_of_sight_is_shortened_or_not_taken():
     kept, residual = shorten_step(data, (), after, 1.5 * before)
     assert (residual**2).sum() <= 1.5 * before
     assert np.abs(kept.pose.difference(state.pose)).max() < 0.02
-    backwards = shorten_step(data, (), lambda part: replace(state, pose=Pose(
-        state.pose.rotation, state.pose.position + part * 1e3)), before)[0]
+    backwards = shorten_step(
+        data,
+        (),
+        lambda part: replace(
+            state, pose=Pose(state.pose.rotation, state.pose.position + part * 1e3)
+        ),
+        before,
+    )[0]
     assert np.array_equal(backwards.pose.position, state.pose.position)
 
 

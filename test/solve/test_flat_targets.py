@@ -29,6 +29,7 @@ def views_of(model, target, count, sigma):
 @pytest.fixture
 def one_sided(monkeypatch):
     """Return a localization that tries one side alone."""
+
     def run(*arguments):
         with monkeypatch.context() as patch:
             patch.setattr(localization, 'PLANARITY', 0.0)

@@ -34,8 +34,13 @@ def fit(seed: int, **settings) -> tuple[RigState, HandEye]:
 
 
 def errors(found: HandEye) -> np.ndarray:
-    return np.concatenate([found.camera.difference(TRUTH.camera),
-                           found.target.difference(TRUTH.target), [found.scale - TRUTH.scale]])
+    return np.concatenate(
+        [
+            found.camera.difference(TRUTH.camera),
+            found.target.difference(TRUTH.target),
+            [found.scale - TRUTH.scale],
+        ]
+    )
 
 
 def test_exact_poses_give_the_transforms() -> None:
@@ -73,14 +78,21 @@ def test_derivatives() -> None:
     frame, shared = one.columns(TRUTH, camera)
 
     def moved(change: np.ndarray) -> np.ndarray:
-        there = Transforms(TRUTH.camera.retract(change[:6]), TRUTH.target.retract(change[6:12]),
-                           TRUTH.scale + change[12])
+        there = Transforms(
+            TRUTH.camera.retract(change[:6]),
+            TRUTH.target.retract(change[6:12]),
+            TRUTH.scale + change[12],
+        )
         return one.residual(there, camera)
 
     np.testing.assert_allclose(shared, jacobian(moved)(np.zeros(13)), atol=1e-6)
-    np.testing.assert_allclose(frame, jacobian(
-        lambda change: one.residual(TRUTH, camera.retract(np.tile(change, (5, 1)))))(
-            np.zeros(6)), atol=1e-6)
+    np.testing.assert_allclose(
+        frame,
+        jacobian(lambda change: one.residual(TRUTH, camera.retract(np.tile(change, (5, 1)))))(
+            np.zeros(6)
+        ),
+        atol=1e-6,
+    )
     assert not frame[2].any() and not shared[2].any()
 
 
@@ -94,16 +106,22 @@ def test_a_robot_holds_the_lens() -> None:
         off.append([abs(one.adjusted.lens.cx - LENS.cx) for one in (alone, both)])
         written = both.adjusted.lens.calibration['hand_eye']
         assert written['noise_m'] == found.noise_m and len(written['covariance']) == 13
-        assert both.adjusted.lens.calibration['rms_px'] >= (
-            alone.adjusted.lens.calibration['rms_px'])
+        assert (
+            both.adjusted.lens.calibration['rms_px'] >= (alone.adjusted.lens.calibration['rms_px'])
+        )
     before, after = np.mean(off, axis=0)
     assert after < 0.7 * before
 
 
-@pytest.mark.parametrize(('scale', 'said'), [
-    (0.9, ''), (2.5, 'a factor of 2.5; both'), (0.001, 'a factor of 1000: the poses may be in mm'),
-    (1001.0, 'a factor of 1001: the target may be in mm; both are needed in m'),
-])
+@pytest.mark.parametrize(
+    ('scale', 'said'),
+    [
+        (0.9, ''),
+        (2.5, 'a factor of 2.5; both'),
+        (0.001, 'a factor of 1000: the poses may be in mm'),
+        (1001.0, 'a factor of 1001: the target may be in mm; both are needed in m'),
+    ],
+)
 def test_lengths_in_other_units_are_told(scale: float, said: str) -> None:
     warnings = hand_eye_warnings(replace(fit(1)[1], scale=scale))
     assert [said in one for one in warnings] == [True] * bool(said)

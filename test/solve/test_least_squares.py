@@ -12,10 +12,42 @@ from fisheye_svp_ros.solve.least_squares import (
 )
 
 # NIST StRD, Misra1a (lower difficulty): y = b1 (1 - exp(-b2 x)), certified values.
-MISRA_X = np.array([77.6, 114.9, 141.1, 190.8, 239.9, 289.0, 332.8, 378.4, 434.8, 477.3, 536.8,
-                    593.1, 689.1, 760.0])
-MISRA_Y = np.array([10.07, 14.73, 17.94, 23.93, 29.61, 35.18, 40.02, 44.82, 50.76, 55.05, 61.01,
-                    66.40, 75.47, 81.78])
+MISRA_X = np.array(
+    [
+        77.6,
+        114.9,
+        141.1,
+        190.8,
+        239.9,
+        289.0,
+        332.8,
+        378.4,
+        434.8,
+        477.3,
+        536.8,
+        593.1,
+        689.1,
+        760.0,
+    ]
+)
+MISRA_Y = np.array(
+    [
+        10.07,
+        14.73,
+        17.94,
+        23.93,
+        29.61,
+        35.18,
+        40.02,
+        44.82,
+        50.76,
+        55.05,
+        61.01,
+        66.40,
+        75.47,
+        81.78,
+    ]
+)
 MISRA_B = np.array([2.3894212918e2, 5.5015643181e-4])
 
 
@@ -128,7 +160,8 @@ def test_rounded_residuals_do_not_stop_the_iteration():
     rng = np.random.default_rng(42)
     angle = rng.uniform(0, 2 * np.pi, 400)
     target = 600 + (100 + rng.normal(size=(400, 1)) * 0.01) * np.stack(
-        [np.cos(angle), np.sin(angle)], axis=-1)
+        [np.cos(angle), np.sin(angle)], axis=-1
+    )
 
     def circle(a, index):
         c, s = np.cos(a[:, 0]), np.sin(a[:, 0])
@@ -143,8 +176,12 @@ def test_rounded_residuals_do_not_stop_the_iteration():
 def test_damping_falls_with_a_good_step_and_grows_ever_faster_with_bad_ones():
     """A step that gains what was predicted, half of it, and two that gain nothing."""
     damping, growth = update_damping(
-        np.full(4, 1e-3), np.array([2.0, 8.0, 2.0, 8.0]), np.array([True, True, False, False]),
-        gained=np.array([1.0, 0.5, -1.0, -1.0]), moved=np.ones(4))
+        np.full(4, 1e-3),
+        np.array([2.0, 8.0, 2.0, 8.0]),
+        np.array([True, True, False, False]),
+        gained=np.array([1.0, 0.5, -1.0, -1.0]),
+        moved=np.ones(4),
+    )
     np.testing.assert_allclose(damping, [1e-4, 1e-3, 2e-3, 8e-3])
     np.testing.assert_allclose(growth, [FIRST_GROWTH, FIRST_GROWTH, 4.0, 16.0])
 

@@ -27,8 +27,13 @@ SIZE = (1280, 960)
 SAMPLES = 120
 CURVED = (-0.05, 0.01, -0.003, 0.0002)
 MODELS = [
-    ('orthographic', 80), ('equidistant', 30), ('equidistant', 110), ('equisolid', 100),
-    ('stereographic', 95), ('kannala_brandt', 25), ('kannala_brandt', 110),
+    ('orthographic', 80),
+    ('equidistant', 30),
+    ('equidistant', 110),
+    ('equisolid', 100),
+    ('stereographic', 95),
+    ('kannala_brandt', 25),
+    ('kannala_brandt', 110),
 ]
 TARGETS = {'plane': plane, 'cube': cube}
 
@@ -95,10 +100,13 @@ def test_points_beyond_90_degrees_are_used(target):
     np.testing.assert_allclose(found, (lens.fx, lens.fy, lens.cx, lens.cy), rtol=1e-9)
 
 
-@pytest.mark.parametrize(('shift', 'names'), [
-    (Gennery(0.0, 0.006, 0.003, 0.0), ('e0', 'e1')),
-    (FlatPort(0.02, 1.5), ('thickness', 'refractive_index')),
-])
+@pytest.mark.parametrize(
+    ('shift', 'names'),
+    [
+        (Gennery(0.0, 0.006, 0.003, 0.0), ('e0', 'e1')),
+        (FlatPort(0.02, 1.5), ('thickness', 'refractive_index')),
+    ],
+)
 def test_finds_a_viewpoint_shift(shift, names):
     lens = replace(make_lens('equidistant', 80), viewpoint_shift=shift)
     lens = replace(lens, max_incidence=field_of_view(lens))
@@ -106,9 +114,7 @@ def test_finds_a_viewpoint_shift(shift, names):
     free = ('fx', 'fy', 'cx', 'cy', *names)
     adjusted = calibrate(table, 'equidistant', SIZE, free).adjusted
     assert adjusted.names == free
-    np.testing.assert_allclose(
-        parameters(adjusted.lens, free), parameters(lens, free), rtol=1e-6
-    )
+    np.testing.assert_allclose(parameters(adjusted.lens, free), parameters(lens, free), rtol=1e-6)
 
 
 def test_one_focal_length_and_fixed_parameters():
@@ -131,16 +137,17 @@ def test_covariances_hold():
     lens_nees, pose_nees = [], []
     for _ in range(SAMPLES):
         noisy = replace(
-            truth, uv=truth.uv + rng.normal(0, 0.2, truth.uv.shape),
+            truth,
+            uv=truth.uv + rng.normal(0, 0.2, truth.uv.shape),
             sigma=np.full(len(truth), 0.2),
         )
         fit = adjust_lens(lens, group_views(noisy), poses, names)
         off = parameters(fit.lens, names) - true_values
         lens_nees.append(off @ np.linalg.solve(fit.covariance, off))
         moved = fit.pose.difference(poses)
-        pose_nees.append(np.einsum(
-            'si,sij,sj->s', moved, np.linalg.inv(fit.pose_covariance), moved
-        ))
+        pose_nees.append(
+            np.einsum('si,sij,sj->s', moved, np.linalg.inv(fit.pose_covariance), moved)
+        )
     # Four standard errors of the means of chi-squared variables; the poses share the lens.
     assert np.mean(lens_nees) == pytest.approx(8, abs=4 * np.sqrt(16 / SAMPLES))
     assert np.mean(pose_nees) == pytest.approx(6, abs=4 * np.sqrt(12 / SAMPLES))
@@ -148,8 +155,7 @@ def test_covariances_hold():
 
 def test_no_view_fits_better_when_it_is_posed_afresh():
     """The lens that is begun with takes one of these views for the other pose of a plane."""
-    table = make_table(
-        make_lens('equidistant', 110), plane, 8, 13, sigma=0.5, distance=(0.8, 2.5))
+    table = make_table(make_lens('equidistant', 110), plane, 8, 13, sigma=0.5, distance=(0.8, 2.5))
     found = calibrate(table, 'equidistant', SIZE)
     afresh = localize(ForwardModel(found.adjusted.lens), found.views)
     np.testing.assert_allclose(found.adjusted.cost, afresh.cost, rtol=1e-6)
@@ -197,9 +203,7 @@ class TestMaxIncidence:
     def test_reaches_the_farthest_image_corner(self):
         lens = make_lens('equidistant', 60)
         found = calibrate(make_table(lens, plane, 8, 8, sigma=0.0), 'equidistant', SIZE)
-        corner = back_project(
-            replace(lens, max_incidence=np.pi), np.array([-0.5, 959.5])
-        ).theta
+        corner = back_project(replace(lens, max_incidence=np.pi), np.array([-0.5, 959.5])).theta
         assert found.adjusted.lens.max_incidence == pytest.approx(float(corner), rel=1e-8)
         assert found.beyond == 0
 
@@ -245,15 +249,18 @@ class TestBadInput:
     def table(cls):
         return make_table(make_lens('equidistant', 60), plane, 6, 12)
 
-    @pytest.mark.parametrize(('free', 'says'), [
-        (('cx', 'cy'), 'must name f'),
-        (('fx', 'cx'), 'must name f'),
-        (('f', 'fx', 'fy'), 'must name f'),
-        (('f', 'f'), 'twice'),
-        (('f', 'k1'), "no parameter 'k1'"),
-        (('f', 'e0', 'thickness'), "no parameter 'thickness'"),
-        ((), 'must name f'),
-    ])
+    @pytest.mark.parametrize(
+        ('free', 'says'),
+        [
+            (('cx', 'cy'), 'must name f'),
+            (('fx', 'cx'), 'must name f'),
+            (('f', 'fx', 'fy'), 'must name f'),
+            (('f', 'f'), 'twice'),
+            (('f', 'k1'), "no parameter 'k1'"),
+            (('f', 'e0', 'thickness'), "no parameter 'thickness'"),
+            ((), 'must name f'),
+        ],
+    )
     def test_names_that_cannot_be_freed(self, table, free, says):
         with pytest.raises(LensError, match=says):
             calibrate(table, 'equidistant', SIZE, free)
@@ -296,16 +303,20 @@ class TestBadInput:
 
     def test_the_error_of_the_focal_length_is_said_in_percent(self):
         adjusted = SimpleNamespace(
-            names=('cx', 'fx'), covariance=np.diag([0.01, (0.75 * 400) ** 2]),
-            lens=SimpleNamespace(fx=400.0), residual=np.full((1, 5, 2), 0.3))
+            names=('cx', 'fx'),
+            covariance=np.diag([0.01, (0.75 * 400) ** 2]),
+            lens=SimpleNamespace(fx=400.0),
+            residual=np.full((1, 5, 2), 0.3),
+        )
         with pytest.raises(GeometryError, match=r'known only to 75 %, rms 0\.424 px'):
             _check_focal(adjusted, 'table.csv')
 
     def test_frames_that_cannot_be_posed_are_named(self, table):
         on_a_line = (table.frame == 1) & (table.landmark // 9 != 3)
         three_points = (table.frame == 4) & (table.landmark > 20)
-        three_points |= (table.frame == 4) & ~np.isin(table.landmark, table.landmark[
-            table.frame == 4][:3])
+        three_points |= (table.frame == 4) & ~np.isin(
+            table.landmark, table.landmark[table.frame == 4][:3]
+        )
         found = calibrate(table.take(~on_a_line & ~three_points), 'equidistant', SIZE)
         assert found.left_out == (1, 4)
         assert found.adjusted.lens.calibration['frames'] == 4

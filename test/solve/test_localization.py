@@ -22,12 +22,16 @@ pytestmark = pytest.mark.usefixtures('engine')
 LENSES = {name: load_lens(lens_path(name)) for name in ('fish180', 'fish214')}
 # Kita, tables 1 and 2: z error in mm, residual in px; by radius for whole, inner, outer.
 PUBLISHED = {
-    'fish180': {2.0: [(-0.1148, 0.0399), (0.2372, 0.0281), (-1.5733, 0.0176)],
-                0.5: [(-0.1614, 0.1642), (0.2363, 0.1131), (-1.6713, 0.0759)],
-                0.2: [(-0.1631, 0.4136), (0.2369, 0.2847), (-1.6894, 0.1914)]},
-    'fish214': {2.0: [(-5.4709, 0.5764), (0.2148, 0.1052), (-7.1621, 0.5007)],
-                0.5: [(-5.6004, 2.3892), (0.2195, 0.4237), (-7.3370, 2.0930)],
-                0.2: [(-5.8982, 6.4501), (0.2195, 1.0735), (-7.7370, 5.7515)]},
+    'fish180': {
+        2.0: [(-0.1148, 0.0399), (0.2372, 0.0281), (-1.5733, 0.0176)],
+        0.5: [(-0.1614, 0.1642), (0.2363, 0.1131), (-1.6713, 0.0759)],
+        0.2: [(-0.1631, 0.4136), (0.2369, 0.2847), (-1.6894, 0.1914)],
+    },
+    'fish214': {
+        2.0: [(-5.4709, 0.5764), (0.2148, 0.1052), (-7.1621, 0.5007)],
+        0.5: [(-5.6004, 2.3892), (0.2195, 0.4237), (-7.3370, 2.0930)],
+        0.2: [(-5.8982, 6.4501), (0.2195, 1.0735), (-7.7370, 5.7515)],
+    },
 }
 ALL = [(lens, radius, spread) for lens in LENSES for radius in RADII for spread in SPREADS]
 
@@ -65,8 +69,9 @@ def test_errors_vanish_with_the_true_lens(name, radius, spread):
 @pytest.mark.parametrize(('name', 'radius', 'spread'), ALL)
 def test_svp_errors_have_the_papers_signs_and_sizes(name, radius, spread):
     lens = LENSES[name]
-    solved = localize(ForwardModel(lens.svp()), seen(lens, environment(spread, radius).points,
-                                                     paper_pose(1)))
+    solved = localize(
+        ForwardModel(lens.svp()), seen(lens, environment(spread, radius).points, paper_pose(1))
+    )
     z_mm, residual_px = PUBLISHED[name][radius][SPREADS.index(spread)]
     assert solved.converged.all()
     assert solved.pose.position[0, 2] * 1e3 == pytest.approx(z_mm, rel=0.45)
@@ -85,6 +90,7 @@ def test_derivatives_by_pose_and_target_equal_high_order_differences():
         linear = model.linearise(pose, views)
         derivatives = np.concatenate([linear.d_pose, linear.d_target], axis=-1)
         for axis, step in zip(np.eye(9), [1e-3] * 3 + [2e-3] * 3 + [1e-3] * 3, strict=True):
+
             def moved(size, axis=axis, model=model, views=views):
                 camera = pose.retract(np.tile(size * axis[:6], (10, 1)))
                 target = views._replace(points=views.points + size * axis[6:])
@@ -129,17 +135,28 @@ def test_equals_scipy(shift):
             uv = model.predict(start.retract(change[None]), view, limited=False).uv
             return np.where(view.weight[..., None] > 0, uv - view.uv, 0.0).ravel()
 
-        found = least_squares(residual, np.zeros(6), jacobian(residual), method='lm',
-                              xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        found = least_squares(
+            residual,
+            np.zeros(6),
+            jacobian(residual),
+            method='lm',
+            xtol=1e-14,
+            ftol=1e-14,
+            gtol=1e-14,
+        )
         expected = start.retract(found.x[None])
         assert np.abs(solved.pose.position[i] - expected.position[0]).max() < 1e-10
         assert np.abs(solved.pose.rotation[i] - expected.rotation[0]).max() < 1e-10
 
 
 CORRECTIONS = [
-    ('sensor_tilt', {}, 0.003), ('decentering', {}, 0.003), ('aspect', {}, 0.003),
-    ('skew', {}, 0.003), ('dot_centroid', {}, 1e-3),
-    ('detector_bias', {'order': 1}, -0.006), ('detector_bias', {'order': 2}, -0.006),
+    ('sensor_tilt', {}, 0.003),
+    ('decentering', {}, 0.003),
+    ('aspect', {}, 0.003),
+    ('skew', {}, 0.003),
+    ('dot_centroid', {}, 1e-3),
+    ('detector_bias', {'order': 1}, -0.006),
+    ('detector_bias', {'order': 2}, -0.006),
 ]
 
 
@@ -150,14 +167,26 @@ def test_no_correction_keeps_a_pose_from_being_found(name, form, size):
     effect = CATALOGUE[name](**form)
     values = np.full(len(effect.parameters), size)
     model = ForwardModel(lens, [(effect, values)])
-    true = Pose(rotation_from_vector(rng.normal(scale=0.3, size=(20, 3))),
-                rng.normal(scale=0.02, size=(20, 3)))
-    points = np.stack([*np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.4, 0.4, 5)),
-                       np.full((5, 7), 0.6)], axis=-1).reshape(1, -1, 3).repeat(20, 0)
+    true = Pose(
+        rotation_from_vector(rng.normal(scale=0.3, size=(20, 3))),
+        rng.normal(scale=0.02, size=(20, 3)),
+    )
+    points = (
+        np.stack(
+            [
+                *np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.4, 0.4, 5)),
+                np.full((5, 7), 0.6),
+            ],
+            axis=-1,
+        )
+        .reshape(1, -1, 3)
+        .repeat(20, 0)
+    )
     views = views_of(points)
     uv = model.predict(true, views).uv
-    views = views._replace(uv=uv + rng.normal(scale=0.2, size=uv.shape),
-                           weight=np.full((20, 35), 5.0))
+    views = views._replace(
+        uv=uv + rng.normal(scale=0.2, size=uv.shape), weight=np.full((20, 35), 5.0)
+    )
     found = localize(model, views)
     assert found.converged.all()
     error = found.pose.difference(true)
@@ -174,6 +203,7 @@ def test_a_solvers_derivatives_have_how_corrections_vary_over_the_image(name):
     views = seen(LENSES['fish180'], environment('inner', 0.5).points, pose)
     found = model.d_pose(model.linearise(pose, views), views)
     for axis in np.eye(6):
+
         def moved(size, axis=axis):
             camera = pose.retract(np.tile(size * axis, (10, 1)))
             return model.predict(camera, views, limited=False).uv
@@ -238,8 +268,10 @@ def test_weights_and_missing_points():
     noisy = views.uv + rng.normal(size=views.uv.shape)
     heavy = np.where(np.arange(33) == 5, np.sqrt(2), 1.0)[None]
     once = localize(ForwardModel(lens), views_of(points, noisy, heavy))
-    twice = localize(ForwardModel(lens), views_of(
-        np.vstack([points, points[5]]), np.concatenate([noisy, noisy[:, 5:6]], axis=1)))
+    twice = localize(
+        ForwardModel(lens),
+        views_of(np.vstack([points, points[5]]), np.concatenate([noisy, noisy[:, 5:6]], axis=1)),
+    )
     assert np.abs(once.pose.difference(twice.pose)).max() < 1e-10
     np.testing.assert_allclose(once.covariance, twice.covariance, rtol=1e-6, atol=1e-12)
 
@@ -257,13 +289,17 @@ def test_too_few_points_and_points_out_of_the_field_name_the_frame():
         localize(ForwardModel(lens), outside)
 
 
-@pytest.mark.parametrize('points', [
-    np.array([0.1, 0.2, -1]) + np.linspace(-1, 1, 9)[:, None] * [1, 0.3, 0.2],
-    np.tile([0.1, 0.2, -1.0], (6, 1)),
-], ids=['on one line', 'all the same'])
+@pytest.mark.parametrize(
+    'points',
+    [
+        np.array([0.1, 0.2, -1]) + np.linspace(-1, 1, 9)[:, None] * [1, 0.3, 0.2],
+        np.tile([0.1, 0.2, -1.0], (6, 1)),
+    ],
+    ids=['on one line', 'all the same'],
+)
 def test_points_that_do_not_fix_a_pose_are_reported(points):
     lens = LENSES['fish214']
-    sound = environment('whole', 1.0).points[:len(points)]
+    sound = environment('whole', 1.0).points[: len(points)]
     views = seen(lens, np.stack([points, sound]), paper_pose(2))
     solved = localize(ForwardModel(lens), views)
     assert solved.converged.tolist() == [False, True]
@@ -282,8 +318,9 @@ def test_a_rolling_shutter_in_a_lens_follows_from_neighbouring_poses():
     seen = views._replace(uv=uv, weight=np.where(np.isfinite(uv).all(axis=-1), 10.0, 0.0))
     found, ignored = localize(model, seen), localize(model.without_motion(), seen)
     assert found.converged.all()
-    off, otherwise = (np.linalg.norm(one.pose.position - pose.position, axis=1)
-                      for one in (found, ignored))
+    off, otherwise = (
+        np.linalg.norm(one.pose.position - pose.position, axis=1) for one in (found, ignored)
+    )
     assert np.median(off) < 0.5 * np.median(otherwise)
     chi2 = np.nansum((found.residual / 0.1) ** 2) / (2 * (seen.weight > 0).sum() - 6 * 30)
     assert chi2 == pytest.approx(1.0, abs=0.1)

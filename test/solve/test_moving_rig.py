@@ -40,8 +40,10 @@ def test_transforms_lie_within_their_stated_errors() -> None:
         assert found.boards == (0, 1, 2, 3)
         assert found.sigma_px == pytest.approx(NOISE, rel=0.05)
         off = found.rig.difference(RIG)[1:]
-        errors += [one @ np.linalg.solve(covariance, one)
-                   for one, covariance in zip(off, found.covariance, strict=True)]
+        errors += [
+            one @ np.linalg.solve(covariance, one)
+            for one, covariance in zip(off, found.covariance, strict=True)
+        ]
     low, high = chi2.ppf([0.001, 0.999], 6 * len(errors)) / len(errors)
     assert low < np.mean(errors) < high
     assert found.rig.position == pytest.approx(RIG.position, abs=1.5e-3)
@@ -51,8 +53,12 @@ def test_derivatives_by_boards_and_rig() -> None:
     table, _ = moving_rig(1, frames=3, cameras=2)
     data = group_by_frame(table)
     state = replace(initial_state(data, LENS, [LENS]), boards=(0, 1))
-    state = replace(state, rig=Pose.concatenate([state.rig, identity(1)]).retract(
-        np.random.default_rng(0).normal(0, 0.02, (3, 6)) * [[0], [1], [1]]))
+    state = replace(
+        state,
+        rig=Pose.concatenate([state.rig, identity(1)]).retract(
+            np.random.default_rng(0).normal(0, 0.02, (3, 6)) * [[0], [1], [1]]
+        ),
+    )
 
     def residual(change: Array) -> Array:
         moved = state.retract((), np.tile(change[:6], (data.frames, 1)), change[6:])
@@ -87,11 +93,14 @@ def test_photographs_of_other_moments_are_left_out() -> None:
     assert found.sigma_px == pytest.approx(NOISE, rel=0.05)
 
 
-@pytest.mark.parametrize(('motion', 'said'), [
-    ({'turn': (0.0, 0.0, 0.0), 'move': 0.2}, 'the rig does not turn'),
-    ({'turn': (0.0, 0.35, 0.0)}, 'the rig turns about one axis only; turn it about two axes'),
-    ({'frames': 3}, '3 frames show two of them; take 4 or more'),
-])
+@pytest.mark.parametrize(
+    ('motion', 'said'),
+    [
+        ({'turn': (0.0, 0.0, 0.0), 'move': 0.2}, 'the rig does not turn'),
+        ({'turn': (0.0, 0.35, 0.0)}, 'the rig turns about one axis only; turn it about two axes'),
+        ({'frames': 3}, '3 frames show two of them; take 4 or more'),
+    ],
+)
 def test_what_a_motion_lacks_is_said(motion: dict, said: str) -> None:
     with pytest.raises(ObservationError, match=f'of their own, {said}'):
         calibrated(moving_rig(5, cameras=2, **motion)[0])

@@ -19,9 +19,13 @@ def pulls(result, port):
     """Errors of what was fitted of the port, over their standard errors."""
     errors = np.sqrt(np.diag(result.adjusted.covariance))
     return [
-        (getattr(result.adjusted.lens.port, name.removeprefix('port_'))
-         - getattr(port, name.removeprefix('port_'))) / errors[i]
-        for i, name in enumerate(result.adjusted.names) if name.startswith('port_')
+        (
+            getattr(result.adjusted.lens.port, name.removeprefix('port_'))
+            - getattr(port, name.removeprefix('port_'))
+        )
+        / errors[i]
+        for i, name in enumerate(result.adjusted.names)
+        if name.startswith('port_')
     ]
 
 
@@ -33,7 +37,8 @@ def test_a_port_is_found_for_a_lens_calibrated_in_air(port):
     assert result.adjusted.converged
     assert np.abs(pulls(result, port)).max() < 4
     assert result.adjusted.lens.svp() == replace(
-        AIR, calibration=result.adjusted.lens.calibration, max_incidence=AIR.max_incidence)
+        AIR, calibration=result.adjusted.lens.calibration, max_incidence=AIR.max_incidence
+    )
 
 
 @pytest.mark.slow
@@ -60,8 +65,9 @@ def test_the_index_is_fitted_on_demand():
 
 
 def test_lens_and_port_come_from_photographs_under_water_alone():
-    result = calibrate(photographs(AIR, FLAT, 14), 'kannala_brandt', (1280, 960),
-                       port=FlatGlass(0.0, 1.333))
+    result = calibrate(
+        photographs(AIR, FLAT, 14), 'kannala_brandt', (1280, 960), port=FlatGlass(0.0, 1.333)
+    )
     assert result.adjusted.converged
     assert result.adjusted.lens.calibration['rms_px'] < 0.15
     assert np.abs(pulls(result, FLAT)).max() < 4

@@ -18,8 +18,9 @@ from fisheye_svp_ros.solve.ray_errors import (
 )
 
 LENS = Lens('made', 1280, 960, 400.0, 400.0, 640.0, 480.0, Equidistant(), 1.5)
-UV = np.stack(np.meshgrid(np.linspace(250, 1030, 12), np.linspace(90, 870, 12)),
-              axis=-1).reshape(-1, 2)
+UV = np.stack(np.meshgrid(np.linspace(250, 1030, 12), np.linspace(90, 870, 12)), axis=-1).reshape(
+    -1, 2
+)
 
 
 def focal(step: np.ndarray) -> Lens:
@@ -29,8 +30,10 @@ def focal(step: np.ndarray) -> Lens:
 def test_points_lie_at_their_ranges_also_where_the_viewpoint_moves() -> None:
     shifted = replace(LENS, viewpoint_shift=Gennery(0.0, 0.005, 0.0, 0.0))
     points = points_on_rays(shifted, UV)
-    np.testing.assert_allclose(np.linalg.norm(points, axis=-1),
-                               np.broadcast_to(np.array(RANGES)[:, None], points.shape[:2]))
+    np.testing.assert_allclose(
+        np.linalg.norm(points, axis=-1),
+        np.broadcast_to(np.array(RANGES)[:, None], points.shape[:2]),
+    )
 
 
 def test_a_motion_of_the_camera_frame_is_no_error() -> None:

@@ -54,7 +54,7 @@ def test_gross_errors_are_named_and_change_no_metrics_but_their_own():
     views.uv[0, [3, 11]] += [[40.0, -5.0], [3.0, 30.0]]
     kept = views._replace(weight=np.where(np.isin(views.landmark, [3, 11]), 0.0, views.weight))
     found, want = localize_sets(model, views, true, examined=True), localize(model, kept)
-    reason, = found.reasons
+    (reason,) = found.reasons
     assert reason.startswith('outliers rejected: landmarks 3 (4') and ', 11 (3' in reason
     np.testing.assert_allclose(found.solution.pose.position, want.pose.position, atol=1e-8)
     np.testing.assert_allclose(found.solution.covariance, want.covariance, rtol=1e-4)
@@ -79,7 +79,8 @@ def test_a_point_is_a_gross_error_beyond_five_standard_deviations(off, gross):
     off_now = np.linalg.norm(found.residual[0, 3]) / SIGMA
     assert (off_now > 4) and (off_now > 5) == gross
     assert examine(model, views, found).gross[0].tolist() == [
-        gross and i == 3 for i in range(views.uv.shape[1])]
+        gross and i == 3 for i in range(views.uv.shape[1])
+    ]
 
 
 def test_a_misfit_that_no_point_is_to_blame_for_scales_the_covariance():
@@ -95,13 +96,22 @@ def test_a_misfit_that_no_point_is_to_blame_for_scales_the_covariance():
 def table_of(views, frames):
     rows = np.flatnonzero(np.isin(views.frame, frames))
     frame = np.repeat(views.frame[rows], views.uv.shape[1])
-    return make_observations(frame, views.landmark[rows].ravel(), views.uv[rows].reshape(-1, 2),
-                             views.points[rows].reshape(-1, 3))
+    return make_observations(
+        frame,
+        views.landmark[rows].ravel(),
+        views.uv[rows].reshape(-1, 2),
+        views.points[rows].reshape(-1, 3),
+    )
 
 
-@pytest.mark.parametrize(('frames', 'sigma'), [
-    ([4], SIGMA), ([1, 2, 3, 4, 5, 6], SIGMA), ([1, 2, 3, 4, 5, 6], 0.01),
-])
+@pytest.mark.parametrize(
+    ('frames', 'sigma'),
+    [
+        ([4], SIGMA),
+        ([1, 2, 3, 4, 5, 6], SIGMA),
+        ([1, 2, 3, 4, 5, 6], 0.01),
+    ],
+)
 def test_without_sigma_frames_are_held_against_each_other(frames, sigma):
     model, views, true = spoilt('clean', 'board', 8, np.random.default_rng(7))
     exact = model.predict(true, views).uv
@@ -191,8 +201,10 @@ class TestStereoDepth:
         model, rng = ForwardModel(load_lens(lens_path('fish180'))), np.random.default_rng(seed)
         d = np.stack([rng.uniform(-1, 1, 40), rng.uniform(-1, 1, 40), np.ones(40)], axis=-1)
         points, left = d * rng.uniform(0.5, 3.0, (40, 1)), rig('parallel')
-        uv = [project(model.lens, seen).uv + noise * rng.normal(size=(40, 2))
-              for seen in (left.into_body(points), points)]
+        uv = [
+            project(model.lens, seen).uv + noise * rng.normal(size=(40, 2))
+            for seen in (left.into_body(points), points)
+        ]
         return (model, model), left, uv
 
     def doubt(self, models, left, uv, sigma=SIGMA):

@@ -30,8 +30,10 @@ def test_transforms_lie_within_their_stated_errors() -> None:
         assert found.cameras == CAMERAS
         assert found.sigma_px == pytest.approx(NOISE, rel=0.05)
         off = found.rig.difference(RIG)[1:]
-        errors += [one @ np.linalg.solve(covariance, one)
-                   for one, covariance in zip(off, found.covariance, strict=True)]
+        errors += [
+            one @ np.linalg.solve(covariance, one)
+            for one, covariance in zip(off, found.covariance, strict=True)
+        ]
     low, high = chi2.ppf([0.001, 0.999], 6 * len(errors)) / len(errors)
     assert low < np.mean(errors) < high
     assert found.rig.position[1] == pytest.approx([0.1, 0.0, -0.1], abs=5e-4)
@@ -79,8 +81,12 @@ def test_lenses_are_fitted_with_the_rig_as_far_as_they_are_unsure() -> None:
     def fit(lens: Lens) -> RigCalibration:
         return calibrate_rig(table, dict.fromkeys(CAMERAS, lens), CAMERAS)
 
-    off = replace(LENS, cx=LENS.cx + 0.8, fx=LENS.fx + 1.0, calibration={
-        'stderr': {'cx': 0.5, 'fx': 1.0}, 'covariance': [[0.25, 0.0], [0.0, 1.0]]})
+    off = replace(
+        LENS,
+        cx=LENS.cx + 0.8,
+        fx=LENS.fx + 1.0,
+        calibration={'stderr': {'cx': 0.5, 'fx': 1.0}, 'covariance': [[0.25, 0.0], [0.0, 1.0]]},
+    )
     unsure, known = fit(off), fit(LENS)
     assert known.lenses == (LENS,) * 4
     sigma = [np.sqrt(np.diagonal(one.covariance, axis1=1, axis2=2)) for one in (unsure, known)]

@@ -42,8 +42,9 @@ def test_several_cameras_are_better_than_one() -> None:
     first = np.unique(table.frame[table.camera == 1])
     alone = localize_rig(table.take(table.camera == 1), LENSES, CAMERAS, RIG)
     assert alone.frame.tolist() == first.tolist()
-    ratio = (np.trace(both.covariance[np.isin(both.frame, first)][:, :3, :3], axis1=1, axis2=2)
-             / np.trace(alone.covariance[:, :3, :3], axis1=1, axis2=2))
+    ratio = np.trace(
+        both.covariance[np.isin(both.frame, first)][:, :3, :3], axis1=1, axis2=2
+    ) / np.trace(alone.covariance[:, :3, :3], axis1=1, axis2=2)
     assert np.median(ratio) < 0.7
 
 

@@ -22,14 +22,23 @@ MODELS = {name: ForwardModel(load_lens(lens_path(name))) for name in ('fish180',
 SVP = {name: ForwardModel(model.lens.svp()) for name, model in MODELS.items()}
 # Kita, tables 3 and 4: mean residual, px, by radius; parallel, vergent, divergent.
 RESIDUALS = {
-    ('fish180', 2.0): (0.0430, 0.0429, 0.0430), ('fish180', 0.5): (0.1428, 0.1418, 0.1463),
-    ('fish214', 2.0): (None, 0.5903, 0.5814), ('fish214', 0.5): (2.3258, 2.2687, 2.3784),
+    ('fish180', 2.0): (0.0430, 0.0429, 0.0430),
+    ('fish180', 0.5): (0.1428, 0.1418, 0.1463),
+    ('fish214', 2.0): (None, 0.5903, 0.5814),
+    ('fish214', 0.5): (2.3258, 2.2687, 2.3784),
 }
 
 
 def observed(left, right, style='parallel', radius=0.5, spread='whole', sigma=0.0, seed=61):
-    table = simulate_stereo(left, right, environment(spread, radius), rig(style),
-                            calibration_poses(), sigma, np.random.default_rng(seed))
+    table = simulate_stereo(
+        left,
+        right,
+        environment(spread, radius),
+        rig(style),
+        calibration_poses(),
+        sigma,
+        np.random.default_rng(seed),
+    )
     return stereo_views(table)
 
 
@@ -84,7 +93,8 @@ def test_two_different_lenses():
 def noisy_systems(model, systems, sigma, rng):
     """Views of many random rigs: 4 views of the 15 inner landmarks each."""
     true_rig = Pose(*(a[None] for a in rig('vergent'))).retract(
-        rng.normal(size=(systems, 6)) * 0.02)
+        rng.normal(size=(systems, 6)) * 0.02
+    )
     chosen = calibration_poses().take([0, 2, 5, 7])
     right = Pose(*(np.broadcast_to(a, (systems, *a.shape)) for a in chosen))
     left = right.compose(true_rig.take(np.s_[:, None]))
@@ -135,13 +145,16 @@ def test_equals_scipy():
     def residual(change):
         pose = calibration_poses().retract(change[6:].reshape(10, 6))
         place = pose.compose(rig('divergent').retract(change[:6]))
-        return np.concatenate([
-            ((model.predict(p, v, False).uv - v.uv) * v.weight[..., None]).ravel()
-            for p, v in ((place, left), (pose, right))
-        ])
+        return np.concatenate(
+            [
+                ((model.predict(p, v, False).uv - v.uv) * v.weight[..., None]).ravel()
+                for p, v in ((place, left), (pose, right))
+            ]
+        )
 
-    found = least_squares(residual, np.zeros(66), jacobian(residual), method='lm',
-                          xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    found = least_squares(
+        residual, np.zeros(66), jacobian(residual), method='lm', xtol=1e-14, ftol=1e-14, gtol=1e-14
+    )
     expected = rig('divergent').retract(found.x[:6])
     assert np.abs(solved.rig.position[0] - expected.position).max() < 1e-10
     assert np.abs(solved.rig.rotation[0] - expected.rotation).max() < 1e-10
@@ -187,8 +200,15 @@ def test_views_that_cannot_be_posed_are_named():
 
 def test_stereo_views_share_frames_and_slots():
     model = MODELS['fish180']
-    table = simulate_stereo(model, model, environment('outer', 0.5), rig('divergent'),
-                            calibration_poses(), 0.2, np.random.default_rng(65))
+    table = simulate_stereo(
+        model,
+        model,
+        environment('outer', 0.5),
+        rig('divergent'),
+        calibration_poses(),
+        0.2,
+        np.random.default_rng(65),
+    )
     kept = np.flatnonzero(~((table.frame == 4) & (table.camera == 0)))
     left, right = stereo_views(table.take(np.random.default_rng(66).permutation(kept)))
     assert left.frame.tolist() == right.frame.tolist() == list(range(10))
@@ -203,12 +223,20 @@ def test_stereo_views_share_frames_and_slots():
 
 def test_stereo_views_refuse_what_is_not_stereo():
     model = MODELS['fish180']
-    mono = simulate(model, environment('inner', 0.5), calibration_poses(), 0.0,
-                    np.random.default_rng(0))
+    mono = simulate(
+        model, environment('inner', 0.5), calibration_poses(), 0.0, np.random.default_rng(0)
+    )
     with pytest.raises(ObservationError, match=r'left and right .* holds one camera, without a'):
         stereo_views(mono)
-    table = simulate_stereo(model, model, environment('inner', 0.5), rig('parallel'),
-                            calibration_poses(), 0.0, np.random.default_rng(0))
+    table = simulate_stereo(
+        model,
+        model,
+        environment('inner', 0.5),
+        rig('parallel'),
+        calibration_poses(),
+        0.0,
+        np.random.default_rng(0),
+    )
     with pytest.raises(ObservationError, match='it holds no observation'):
         stereo_views(table.take(np.arange(0)))
     twice = table.take(np.array([0, 1, 2, 1]))

@@ -55,14 +55,18 @@ def test_errors_vanish_with_the_true_lens(name, style, radius):
     offset = epipolar_offset(model, model, rig(style), uv_left, uv_right)
     assert offset.distance.max() < 1e-8
     assert np.abs(offset.vertical).max() < 1e-8
-    for solved in (triangulate(model, model, rig(style), uv_left, uv_right),
-                   triangulate_optimally(model, model, rig(style), uv_left, uv_right)):
+    for solved in (
+        triangulate(model, model, rig(style), uv_left, uv_right),
+        triangulate_optimally(model, model, rig(style), uv_left, uv_right),
+    ):
         assert solved.valid.all()
         assert np.abs(solved.points - points).max() < 1e-9
 
 
-@pytest.mark.parametrize(('name', 'published', 'depth_mm'), [
-    ('fish180', (0.004, 0.61), (1.6, 8.6)), ('fish214', (0.03, 9.3), (6.4, 43.4))])
+@pytest.mark.parametrize(
+    ('name', 'published', 'depth_mm'),
+    [('fish180', (0.004, 0.61), (1.6, 8.6)), ('fish214', (0.03, 9.3), (6.4, 43.4))],
+)
 def test_svp_errors_have_the_papers_size(name, published, depth_mm):
     svp, error2, error3 = SVP[name], {}, []
     for radius in RADII:
@@ -99,6 +103,7 @@ def test_offsets_equal_a_search_along_the_curve(style):
     offset = epipolar_offset(model, model, rig(style), uv_left, uv_right)
     rays = back_project(lens, uv_right)
     for i in range(40):
+
         def seen(inverse, i=i):
             points = rays.origin[i] + rays.direction[i] / np.reshape(inverse, (-1, 1))
             return project(lens, rig(style).into_body(points), limited=False).uv
@@ -107,8 +112,12 @@ def test_offsets_equal_a_search_along_the_curve(style):
         off = np.linalg.norm(seen(grid) - uv_left[i], axis=-1)
         best = np.nanargmin(off)
         low, high = grid[max(best - 1, 0)], grid[best + 1]
-        found = minimize_scalar(lambda w, i=i: np.linalg.norm(seen(w)[0] - uv_left[i]),
-                                bounds=(low, high), method='bounded', options={'xatol': 1e-12})
+        found = minimize_scalar(
+            lambda w, i=i: np.linalg.norm(seen(w)[0] - uv_left[i]),
+            bounds=(low, high),
+            method='bounded',
+            options={'xatol': 1e-12},
+        )
         assert offset.distance[i] == pytest.approx(min(found.fun, off[best]), abs=1e-7)
         assert np.linalg.norm(offset.foot[i] - uv_left[i]) == pytest.approx(offset.distance[i])
         u = seen(grid)[:, 0] - uv_left[i, 0]
@@ -117,8 +126,9 @@ def test_offsets_equal_a_search_along_the_curve(style):
             assert np.isnan(offset.vertical[i])
             continue
         k = columns[np.argmin(np.abs(columns - best))]
-        root = brentq(lambda w, i=i: seen(w)[0, 0] - uv_left[i, 0], grid[k], grid[k + 1],
-                      xtol=1e-15)
+        root = brentq(
+            lambda w, i=i: seen(w)[0, 0] - uv_left[i, 0], grid[k], grid[k + 1], xtol=1e-15
+        )
         assert offset.vertical[i] == pytest.approx(uv_left[i, 1] - seen(root)[0, 1], abs=1e-6)
 
 
@@ -137,8 +147,9 @@ def test_curves_pass_through_the_matches_and_have_no_offset():
     drawn = np.isfinite(curves[..., 0])
     assert drawn.mean() > 0.5
     assert offset.distance[drawn].max() < 1e-7
-    infinity = project(left.lens, rig('vergent').into_body(
-        1e6 * back_project(right.lens, uv_right).direction)).uv
+    infinity = project(
+        left.lens, rig('vergent').into_body(1e6 * back_project(right.lens, uv_right).direction)
+    ).uv
     np.testing.assert_allclose(curves[:, 0], infinity, atol=1e-3)
 
 
@@ -164,8 +175,9 @@ def test_midpoint_is_halfway_between_the_nearest_points_of_the_rays():
     a, b = back_project(lens, uv_left), back_project(lens, uv_right)
     for i in np.flatnonzero(solved.valid):
         start, along = pose.transform(a.origin[i]), pose.rotation @ a.direction[i]
-        depths = np.linalg.lstsq(np.stack([along, -b.direction[i]], axis=1),
-                                 b.origin[i] - start, rcond=None)[0]
+        depths = np.linalg.lstsq(
+            np.stack([along, -b.direction[i]], axis=1), b.origin[i] - start, rcond=None
+        )[0]
         one, two = start + depths[0] * along, b.origin[i] + depths[1] * b.direction[i]
         np.testing.assert_allclose(solved.points[i], (one + two) / 2, rtol=0, atol=1e-9)
         assert solved.gap[i] == pytest.approx(np.linalg.norm(one - two), abs=1e-12)
@@ -182,18 +194,28 @@ def test_optimal_points_equal_scipy_and_beat_the_midpoint():
     midpoint = triangulate(left, right, pose, uv_left, uv_right)
     assert solved.valid.sum() >= 9
     for i in np.flatnonzero(solved.valid):
-        def residual(x, i=i):
-            return np.concatenate([
-                uv_left[i] - project(left.lens, pose.into_body(x[None]), limited=False).uv[0],
-                uv_right[i] - project(right.lens, x, limited=False).uv,
-            ])
 
-        found = least_squares(residual, points[i], jacobian(residual), method='lm',
-                              xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        def residual(x, i=i):
+            return np.concatenate(
+                [
+                    uv_left[i] - project(left.lens, pose.into_body(x[None]), limited=False).uv[0],
+                    uv_right[i] - project(right.lens, x, limited=False).uv,
+                ]
+            )
+
+        found = least_squares(
+            residual,
+            points[i],
+            jacobian(residual),
+            method='lm',
+            xtol=1e-14,
+            ftol=1e-14,
+            gtol=1e-14,
+        )
         np.testing.assert_allclose(solved.points[i], found.x, rtol=0, atol=1e-7)
         own = np.concatenate([solved.left_residual[i], solved.right_residual[i]])
         np.testing.assert_allclose(own, residual(solved.points[i]), atol=1e-9)
-        assert np.sum(own**2) < np.sum(residual(midpoint.points[i])**2)
+        assert np.sum(own**2) < np.sum(residual(midpoint.points[i]) ** 2)
 
 
 @pytest.mark.parametrize('name', ['sensor_tilt', 'decentering', 'detector_bias'])
@@ -202,8 +224,10 @@ def test_no_correction_of_a_lens_keeps_a_point_from_being_found(name):
     effect = CATALOGUE[name]()
     model = ForwardModel(SVP['fish180'].lens, [(effect, np.full(len(effect.parameters), 0.005))])
     points, pose = random_points(rng, 300), rig('parallel')
-    left, right = (model.project(seen).uv + rng.normal(scale=0.3, size=(300, 2))
-                   for seen in (pose.into_body(points), points))
+    left, right = (
+        model.project(seen).uv + rng.normal(scale=0.3, size=(300, 2))
+        for seen in (pose.into_body(points), points)
+    )
     solved = triangulate_optimally(model, model, pose, left, right, 0.3)
     assert np.array_equal(solved.valid, triangulate(model, model, pose, left, right).valid)
     off = (solved.points - points)[solved.valid]
@@ -220,8 +244,9 @@ def test_covariance_of_optimal_points_holds(style):
     shape = (10, 200)
     uv_right = project(lens, points).uv + 0.1 * rng.normal(size=(2000, 2))
     uv_left = project(lens, pose.into_body(points)).uv + 0.1 * rng.normal(size=(2000, 2))
-    solved = triangulate_optimally(model, model, pose, uv_left.reshape(*shape, 2),
-                                   uv_right.reshape(*shape, 2), sigma=0.1)
+    solved = triangulate_optimally(
+        model, model, pose, uv_left.reshape(*shape, 2), uv_right.reshape(*shape, 2), sigma=0.1
+    )
     assert solved.valid.all()
     assert solved.covariance.shape == (*shape, 3, 3)
     error = solved.points - points.reshape(*shape, 3)
@@ -235,8 +260,10 @@ def test_covariance_of_optimal_points_holds(style):
 def test_any_leading_shape(shape):
     model, lens = MODELS['fish214'], MODELS['fish214'].lens
     points = np.broadcast_to([0.1, 0.2, 0.8], (*shape, 3))
-    uv_left, uv_right = project(lens, rig('parallel').into_body(
-        points.reshape(-1, 3))).uv.reshape(*shape, 2), project(lens, points).uv
+    uv_left, uv_right = (
+        project(lens, rig('parallel').into_body(points.reshape(-1, 3))).uv.reshape(*shape, 2),
+        project(lens, points).uv,
+    )
     assert epipolar_curves(model, model, rig('parallel'), uv_right, 7).shape == (*shape, 7, 2)
     offset = epipolar_offset(model, model, rig('parallel'), uv_left, uv_right)
     assert offset.distance.shape == offset.vertical.shape == shape
@@ -257,7 +284,8 @@ def test_a_rig_for_every_system():
     solved = triangulate_optimally(model, model, many, uv_left, project(lens, points).uv)
     assert solved.points.shape == (3, 6, 3)
     np.testing.assert_allclose(
-        solved.points[solved.valid], np.broadcast_to(points, (3, 6, 3))[solved.valid], atol=1e-9)
+        solved.points[solved.valid], np.broadcast_to(points, (3, 6, 3))[solved.valid], atol=1e-9
+    )
     assert solved.valid.sum() >= 15
 
 
@@ -268,8 +296,10 @@ def test_what_cannot_be_seen_is_flagged():
     uv_right = np.stack([good, [np.nan, 5.0], [9000.0, 0.0], good])
     uv_left = np.stack([left, left, left, [np.nan, np.nan]])
     expected = [True, False, False, False]
-    for solved in (triangulate(model, model, rig('parallel'), uv_left, uv_right),
-                   triangulate_optimally(model, model, rig('parallel'), uv_left, uv_right)):
+    for solved in (
+        triangulate(model, model, rig('parallel'), uv_left, uv_right),
+        triangulate_optimally(model, model, rig('parallel'), uv_left, uv_right),
+    ):
         assert solved.valid.tolist() == expected
         assert np.isfinite(solved.points).all(axis=-1).tolist() == expected
     offset = epipolar_offset(model, model, rig('parallel'), uv_left, uv_right)
@@ -305,6 +335,7 @@ def test_rays_that_are_parallel_to_the_last_digit_measure_nothing():
         one = Pose(np.eye(3), np.array([10.0 ** -rng.integers(1, 20), 0, 0]))
         for off in (0.0, 1e-13, 1e-9):
             found = triangulate_optimally(
-                model, model, one, uv, uv + off * rng.standard_normal(uv.shape))
+                model, model, one, uv, uv + off * rng.standard_normal(uv.shape)
+            )
             assert np.isfinite(found.covariance[found.valid]).all()
             assert np.isnan(found.points[~found.valid]).all()

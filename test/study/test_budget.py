@@ -35,8 +35,10 @@ def budget():
     return make_budget(Setup(LENS, rig('parallel'), 0.3), spreads=6, ranges=12)
 
 
-@pytest.mark.parametrize(('reached', 'spread'), [
-    (80.0, 80.0), (80, 80.0), (300.0, 106.0), ('far', 106.0), (None, 106.0)])
+@pytest.mark.parametrize(
+    ('reached', 'spread'),
+    [(80.0, 80.0), (80, 80.0), (300.0, 106.0), ('far', 106.0), (None, 106.0)],
+)
 def test_where_no_spread_is_named_a_calibration_says_how_far_it_reached(reached, spread):
     calibrated = replace(LENS, calibration={'reached_deg': reached} if reached else None)
     assert np.degrees(default_spread(calibrated)) == pytest.approx(spread, abs=0.1)
@@ -82,10 +84,14 @@ def test_noise_is_the_scatter_of_noisy_solves(budget):
     azimuth = spiral * np.pi * (3 - np.sqrt(5))
     sine = np.sqrt(1 - cap**2)
     points = budget.ranges[j] * np.stack(
-        [sine * np.cos(azimuth), sine * np.sin(azimuth), cap], axis=-1)
+        [sine * np.cos(azimuth), sine * np.sin(azimuth), cap], axis=-1
+    )
     count = 400
-    uv = ForwardModel(LENS.svp()).predict(
-        identity(count), views_of(points, np.zeros((count, 48, 2)))).uv
+    uv = (
+        ForwardModel(LENS.svp())
+        .predict(identity(count), views_of(points, np.zeros((count, 48, 2))))
+        .uv
+    )
     noisy = views_of(points, uv + rng.normal(0, 0.3, uv.shape))
     solved = localize(ForwardModel(LENS.svp()), noisy, identity(count))
     scatter = np.sqrt((solved.pose.position**2).sum(axis=-1).mean())
@@ -127,12 +133,15 @@ def test_noise_is_the_limit_where_none_is_stated(budget):
     assert found.noise == pytest.approx(2 / np.sqrt(np.pi) * 0.3)
 
 
-@pytest.mark.parametrize(('spread', 'working_range', 'limits', 'reason'), [
-    (np.radians(120), 0.5, {}, 'spread is 120 degrees; this lens and budget allow 15 to 106'),
-    (SPREAD, 0.001, {}, 'range is 0.001 m; this lens and budget allow'),
-    (SPREAD, 0.5, {'axis': -1.0}, 'limit of axis is -1 rad; it must be above 0'),
-    (SPREAD, 0.5, {'depth': float('nan')}, 'limit of depth is nan m; it must be above 0'),
-])
+@pytest.mark.parametrize(
+    ('spread', 'working_range', 'limits', 'reason'),
+    [
+        (np.radians(120), 0.5, {}, 'spread is 120 degrees; this lens and budget allow 15 to 106'),
+        (SPREAD, 0.001, {}, 'range is 0.001 m; this lens and budget allow'),
+        (SPREAD, 0.5, {'axis': -1.0}, 'limit of axis is -1 rad; it must be above 0'),
+        (SPREAD, 0.5, {'depth': float('nan')}, 'limit of depth is nan m; it must be above 0'),
+    ],
+)
 def test_impossible_questions(budget, spread, working_range, limits, reason):
     with pytest.raises(ParameterError, match=reason):
         at_point(budget, spread, working_range, limits)
@@ -154,8 +163,24 @@ def test_the_command_says_yes_and_no(tmp_path, capsys):
     said = ' '.join(capsys.readouterr().out.split())
     assert 'Yes: for landmarks within 106 degrees of the axis at 0.5 m SVP keeps every' in said
     folder = tmp_path / 'out'
-    assert main(['budget', '--lens', 'fish214', '--spread', '80', '--max-position', '1',
-                 '--max-residual', '0.5', '-o', str(folder)]) == 0
+    assert (
+        main(
+            [
+                'budget',
+                '--lens',
+                'fish214',
+                '--spread',
+                '80',
+                '--max-position',
+                '1',
+                '--max-residual',
+                '0.5',
+                '-o',
+                str(folder),
+            ]
+        )
+        == 0
+    )
     said = ' '.join(capsys.readouterr().out.split())
     assert 'No: for landmarks within 80 degrees of the axis at 0.5 m SVP breaks 2 of 2' in said
     written = json.loads((folder / 'budget.json').read_text(encoding='utf-8'))
@@ -171,15 +196,37 @@ def test_the_command_says_yes_and_no(tmp_path, capsys):
     assert (folder / 'budget.png').read_bytes().startswith(b'\x89PNG')
 
 
-@pytest.mark.parametrize(('limits', 'negligible', 'answer'), [
-    ([], None, 'Not known: {} SVP keeps 3 of 5 limits; epipolar distance and stereo'),
-    (['--max-axis', '1e-9', '--max-depth', '1'], False, 'No: {} SVP breaks 1 of 2 limits; the'),
-    (['--max-axis', '1'], True, 'Yes: {} SVP keeps every limit.'),
-])
+@pytest.mark.parametrize(
+    ('limits', 'negligible', 'answer'),
+    [
+        ([], None, 'Not known: {} SVP keeps 3 of 5 limits; epipolar distance and stereo'),
+        (
+            ['--max-axis', '1e-9', '--max-depth', '1'],
+            False,
+            'No: {} SVP breaks 1 of 2 limits; the',
+        ),
+        (['--max-axis', '1'], True, 'Yes: {} SVP keeps every limit.'),
+    ],
+)
 def test_what_no_camera_pair_sees_breaks_no_limit(limits, negligible, answer, tmp_path, capsys):
     """Left and right look away from each other, 5 m apart."""
-    assert main(['budget', '--lens', 'fish180', '--style', 'divergent', '--baseline', '5', *limits,
-                 '-o', str(tmp_path)]) == 0
+    assert (
+        main(
+            [
+                'budget',
+                '--lens',
+                'fish180',
+                '--style',
+                'divergent',
+                '--baseline',
+                '5',
+                *limits,
+                '-o',
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
     said = ' '.join(capsys.readouterr().out.split())
     where = 'for landmarks within 89 degrees of the axis at 0.5 m'
     assert answer.format(where) in said and 'nan' not in said
@@ -188,13 +235,19 @@ def test_what_no_camera_pair_sees_breaks_no_limit(limits, negligible, answer, tm
     assert [row['kept'] for row in written['at_point']][-1] is None
 
 
-@pytest.mark.parametrize(('arguments', 'reason'), [
-    (['--lens', 'none.yaml'], 'none.yaml: cannot be read'),
-    (['--lens', 'fish180', '--style', 'crossed'], "style 'crossed' is unknown"),
-    (['--lens', 'fish180', '--baseline', '0'], 'baseline is 0.0 m; it must be above 0'),
-    (['--lens', 'fish180', '--baseline', '1e9'], 'baseline is 1e+09 m; a budget covers 0.001 to'),
-    (['--lens', 'fish180', '--noise', 'much'], 'invalid float value'),
-])
+@pytest.mark.parametrize(
+    ('arguments', 'reason'),
+    [
+        (['--lens', 'none.yaml'], 'none.yaml: cannot be read'),
+        (['--lens', 'fish180', '--style', 'crossed'], "style 'crossed' is unknown"),
+        (['--lens', 'fish180', '--baseline', '0'], 'baseline is 0.0 m; it must be above 0'),
+        (
+            ['--lens', 'fish180', '--baseline', '1e9'],
+            'baseline is 1e+09 m; a budget covers 0.001 to',
+        ),
+        (['--lens', 'fish180', '--noise', 'much'], 'invalid float value'),
+    ],
+)
 def test_bad_input_is_one_line(arguments, reason, capsys):
     try:
         code = main(['budget', *arguments])
@@ -237,7 +290,8 @@ def test_a_calibration_in_air_is_not_for_water(tmp_path, capsys):
     """Behind a flat port nothing is seen beyond the critical angle, and all seems nearer."""
     wet = replace(LENS, port=FlatGlass(0.03, 1.333), max_incidence=np.radians(85.0))
     assert np.sin(widest_spread(wet) + np.radians(1.0)) == pytest.approx(
-        np.sin(np.radians(85.0)) / 1.333)
+        np.sin(np.radians(85.0)) / 1.333
+    )
     table = make_budget(Setup(wet, rig('parallel'), 0.3), spreads=4, ranges=6)
     far = table.error['position'][0, -1] / table.ranges[-1]
     assert far == pytest.approx(1 - 1 / 1.333, abs=0.02)

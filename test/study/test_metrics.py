@@ -30,11 +30,16 @@ def test_localization_metrics_by_hand():
     metrics = localization_metrics(true.retract(change), RESIDUAL, true)
     assert tuple(metrics) == LOCALIZATION_METRICS
     expected = {
-        'points': [2, 0], 'rms_px': [np.sqrt(12.5), np.nan], 'mean_residual_px': [2.5, np.nan],
-        'position_error_m': [3e-3, 0], 'position_error_x_m': [1e-3, 0],
-        'position_error_y_m': [-2e-3, 0], 'position_error_z_m': [2e-3, 0],
+        'points': [2, 0],
+        'rms_px': [np.sqrt(12.5), np.nan],
+        'mean_residual_px': [2.5, np.nan],
+        'position_error_m': [3e-3, 0],
+        'position_error_x_m': [1e-3, 0],
+        'position_error_y_m': [-2e-3, 0],
+        'position_error_z_m': [2e-3, 0],
         # A turn about the viewing axis, the world's z, leaves that axis where it is.
-        'rotation_error_rad': [0, 5e-3], 'axis_error_rad': [0, 3e-3],
+        'rotation_error_rad': [0, 5e-3],
+        'axis_error_rad': [0, 3e-3],
     }
     for name, values in expected.items():
         np.testing.assert_allclose(metrics[name], values, rtol=2e-6, atol=1e-12, err_msg=name)
@@ -58,9 +63,16 @@ def test_stereo_calibration_metrics_pool_both_cameras():
     metrics = stereo_calibration_metrics(off, left, right, true)
     assert tuple(metrics) == STEREO_CALIBRATION_METRICS
     expected = {
-        'views': 2, 'points': 2, 'mean_residual_px': 1.0, 'rms_px': np.sqrt(1.25),
-        'position_error_m': 5e-4, 'position_error_x_m': 0, 'position_error_y_m': 3e-4,
-        'position_error_z_m': 4e-4, 'rotation_error_rad': 1e-3, 'axis_error_rad': 1e-3,
+        'views': 2,
+        'points': 2,
+        'mean_residual_px': 1.0,
+        'rms_px': np.sqrt(1.25),
+        'position_error_m': 5e-4,
+        'position_error_x_m': 0,
+        'position_error_y_m': 3e-4,
+        'position_error_z_m': 4e-4,
+        'rotation_error_rad': 1e-3,
+        'axis_error_rad': 1e-3,
     }
     for name, value in expected.items():
         assert metrics[name] == pytest.approx(value, abs=1e-12), name
@@ -75,8 +87,12 @@ def test_stereo_depth_metrics_by_hand():
     metrics = stereo_depth_metrics(distance, vertical, points, true)
     assert tuple(metrics) == STEREO_DEPTH_METRICS
     expected = {
-        'points': [2, 0], 'error2_px': [2, nan], 'error2_vertical_px': [3, nan],
-        'error2_max_px': [3, nan], 'error3_m': [2.5e-3, nan], 'error3_max_m': [5e-3, nan],
+        'points': [2, 0],
+        'error2_px': [2, nan],
+        'error2_vertical_px': [3, nan],
+        'error2_max_px': [3, nan],
+        'error3_m': [2.5e-3, nan],
+        'error3_max_m': [5e-3, nan],
     }
     for name, values in expected.items():
         np.testing.assert_allclose(metrics[name], values, rtol=1e-12, err_msg=name)
@@ -84,12 +100,20 @@ def test_stereo_depth_metrics_by_hand():
 
 def test_metrics_of_a_whole_calibration_vanish_with_the_true_lens():
     model = ForwardModel(load_lens(lens_path('fish214')))
-    table = simulate_stereo(model, model, environment('whole', 0.5), rig('divergent'),
-                            calibration_poses(), 0.0, np.random.default_rng(0))
+    table = simulate_stereo(
+        model,
+        model,
+        environment('whole', 0.5),
+        rig('divergent'),
+        calibration_poses(),
+        0.0,
+        np.random.default_rng(0),
+    )
     solved = calibrate_stereo(model, model, *stereo_views(table))
     true = Pose(*(array[None] for array in rig('divergent')))
     metrics = stereo_calibration_metrics(
-        solved.rig, solved.left_residual, solved.right_residual, true)
+        solved.rig, solved.left_residual, solved.right_residual, true
+    )
     assert metrics['views'] == 10
     assert metrics['points'] == len(table)
     assert all(metrics[name] < 1e-9 for name in metrics if name not in ('views', 'points'))

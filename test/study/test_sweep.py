@@ -74,6 +74,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def write(tmp_path: Path) -> Callable[[str], Path]:
     """Return a function that writes a sweep file."""
+
     def file(text: str) -> Path:
         path = tmp_path / 'file.yaml'
         path.write_text(text)
@@ -90,8 +91,9 @@ def start(*arguments: Any) -> subprocess.Popen[str]:
     """Start a sweep in a process of its own."""
     env = os.environ | {'PYTHONPATH': str(ROOT), engines.VARIABLE: 'numpy'}
     command = [sys.executable, '-m', 'fisheye_svp_ros.cli', 'sweep', *map(str, arguments)]
-    return subprocess.Popen(command, env=env, text=True, stderr=subprocess.PIPE,
-                            stdout=subprocess.DEVNULL)
+    return subprocess.Popen(
+        command, env=env, text=True, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
+    )
 
 
 def finish(*arguments: Any) -> None:
@@ -110,12 +112,16 @@ def files_of(folder: Path) -> list[bytes]:
 def workers_of(process: subprocess.Popen[str]) -> list[Any]:
     """Return the processes that work on a sweep."""
     psutil = pytest.importorskip('psutil', reason='psutil finds the workers')
-    return [child for child in psutil.Process(process.pid).children()
-            if 'spawn_main' in ' '.join(child.cmdline())]
+    return [
+        child
+        for child in psutil.Process(process.pid).children()
+        if 'spawn_main' in ' '.join(child.cmdline())
+    ]
 
 
 def at_rest(process: Any) -> bool:
     """Say whether a process waits for something, as often as one looks."""
+
     def waits() -> bool:
         time.sleep(0.05)
         return bool(process.status() == 'sleeping')
@@ -132,9 +138,7 @@ def test_rows_are_those_of_scenarios_one_by_one(
 ) -> None:
     sweep(write(SMALL), '-o', tmp_path / 'out')
     columns = read_columns(tmp_path / 'out' / FILES[-1])
-    assert read_columns(tmp_path / 'out' / 'sweep.csv') == columns | {
-        'poses_file': [None] * 8
-    }
+    assert read_columns(tmp_path / 'out' / 'sweep.csv') == columns | {'poses_file': [None] * 8}
     assert columns['scenario'] == list(range(8))
     assert columns['environment'] == ['whole'] * 4 + ['inner'] * 4
     assert columns['radius'] == [2.0, 2.0, 0.3, 0.3] * 2
@@ -158,14 +162,18 @@ def test_each_scenario_has_noise_of_its_own_and_always_the_same() -> None:
 
 
 def test_every_set_of_a_rig_is_a_row() -> None:
-    plan = plan_sweep({
-        'synthetic_camera': {
-            'sweep.style': ['parallel', 'divergent'], 'sweep.radius': [0.5, 2.0],
-            'poses_file': 'calibration',
-        },
-        'stereo_calibrator': {'svp': False, 'views': 4}, 'stereo_depth': {'svp': False},
-    })
-    (numbers, columns), = solve_sweep(plan, tasks(plan), 'numpy', InProcess(), 1)
+    plan = plan_sweep(
+        {
+            'synthetic_camera': {
+                'sweep.style': ['parallel', 'divergent'],
+                'sweep.radius': [0.5, 2.0],
+                'poses_file': 'calibration',
+            },
+            'stereo_calibrator': {'svp': False, 'views': 4},
+            'stereo_depth': {'svp': False},
+        }
+    )
+    ((numbers, columns),) = solve_sweep(plan, tasks(plan), 'numpy', InProcess(), 1)
     assert numbers == range(4)
     assert columns['scenario'] == [n for n in range(4) for _ in range(10)]
     assert columns['set'] == list(range(10)) * 4
@@ -175,19 +183,33 @@ def test_every_set_of_a_rig_is_a_row() -> None:
     assert set(columns['stereo_depth.note']) == {None}
 
 
-@pytest.mark.parametrize(('node', 'camera', 'said'), [
-    ('stereo_calibrator', 'style: mono, sweep.radius: [0.5]',
-     'stereo_calibrator solves nothing in this sweep: it needs style parallel, vergent or diver'),
-    ('localizer', 'sweep.style: [parallel, vergent]', 'it needs style mono'),
-    ('/**', 'sweep.radius: [0.5]', ''),  # the nodes that there are
-])
+@pytest.mark.parametrize(
+    ('node', 'camera', 'said'),
+    [
+        (
+            'stereo_calibrator',
+            'style: mono, sweep.radius: [0.5]',
+            'stereo_calibrator solves nothing in this sweep: it needs style parallel, '
+            'vergent or diver',
+        ),
+        ('localizer', 'sweep.style: [parallel, vergent]', 'it needs style mono'),
+        ('/**', 'sweep.radius: [0.5]', ''),  # the nodes that there are
+    ],
+)
 def test_a_section_of_a_solver_that_no_style_uses_is_told(
-    write: Callable[[str], Path], capsys: pytest.CaptureFixture[str], node: str, camera: str,
+    write: Callable[[str], Path],
+    capsys: pytest.CaptureFixture[str],
+    node: str,
+    camera: str,
     said: str,
 ) -> None:
     """A parameter file of ROS may hold more nodes than there are: it is no error."""
-    plan = read_sweep(write(f'{node}: {{ros__parameters: {{svp: true}}}}\n'
-                            f'synthetic_camera: {{ros__parameters: {{{camera}}}}}'))
+    plan = read_sweep(
+        write(
+            f'{node}: {{ros__parameters: {{svp: true}}}}\n'
+            f'synthetic_camera: {{ros__parameters: {{{camera}}}}}'
+        )
+    )
     assert node not in plan.solvers
     told = capsys.readouterr().err
     assert said in told and bool(told) == bool(said)
@@ -198,12 +220,24 @@ def test_a_set_that_cannot_be_solved_is_a_row_that_says_why(tmp_path: Path) -> N
     few.write_text('landmark,x,y,z\n1,0,0,-1\n2,1,0,-1\n3,0,1,-1\n')
     line = tmp_path / 'line.csv'
     line.write_text('landmark,x,y,z\n' + ''.join(f'{i},0,0,{-1 - i}\n' for i in range(6)))
-    plan = plan_sweep({'synthetic_camera': {
-        'sweep.environment': ['whole', str(few), 'inner', str(line)], 'sweep.radius': [1.0, 2.0]
-    }})
+    plan = plan_sweep(
+        {
+            'synthetic_camera': {
+                'sweep.environment': ['whole', str(few), 'inner', str(line)],
+                'sweep.radius': [1.0, 2.0],
+            }
+        }
+    )
     columns = sweep_rows(plan, range(8))
     assert [error is not None for error in columns['localizer.rms_px']] == [
-        True, True, False, False, True, True, False, False
+        True,
+        True,
+        False,
+        False,
+        True,
+        True,
+        False,
+        False,
     ]
     assert 'has 3 usable points' in columns['localizer.note'][2]
     assert 'do not determine a pose' in columns['localizer.note'][6]
@@ -213,8 +247,8 @@ def test_a_set_that_cannot_be_solved_is_a_row_that_says_why(tmp_path: Path) -> N
 BAD = {
     'sweep.radios: [1.0]': 'sweep.radios: no such parameter to sweep',
     'sweep.rig_file: [rig.yaml]': 'sweep.rig_file: no such parameter to sweep; known are lens, '
-        'shift_scale, environment, radius, style, baseline, vergence, poses_file, '
-        'trajectory_steps, noise_px, seed\n',
+    'shift_scale, environment, radius, style, baseline, vergence, poses_file, '
+    'trajectory_steps, noise_px, seed\n',
     'sweep.radius: []': 'sweep.radius is []; a list of at least one value',
     'sweep.radius: 2.0': 'sweep.radius is 2.0; a list of at least one value',
     'sweep.radius: [near, far]': "radius is 'near'; float is needed",
@@ -229,14 +263,17 @@ BAD = {
     'sweep.seed: [1], poses: [1.0, 2.0]': 'seven a pose are needed',
     'sweep.seed: [1], poses: 3.0': 'poses is 3.0; a list is needed',
     'sweep.seed: [1], noise_px: much': "noise_px is 'much'; float is needed",
-    f'sweep.seed: {list(range(1001))}, sweep.radius: {[0.1 * n for n in range(1, 1001)]}':
-        '1001000 scenarios (1001 seed x 1000 radius); add --large to run them all',
+    f'sweep.seed: {list(range(1001))}, sweep.radius: {[0.1 * n for n in range(1, 1001)]}': (
+        '1001000 scenarios (1001 seed x 1000 radius); add --large to run them all'
+    ),
 }
 
 
 @pytest.mark.parametrize('parameters', BAD)
 def test_a_bad_sweep_is_refused_before_anything_runs(
-    write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    write: Callable[[str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
     parameters: str,
 ) -> None:
     path = write(f'synthetic_camera: {{ros__parameters: {{{parameters}}}}}')
@@ -254,19 +291,34 @@ def test_one_scenario_is_told_in_the_singular(
     assert f'{file}: 1 scenario\n' in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(('text', 'reason'), [
-    ('localiser: {ros__parameters: {svp: true}}', 'is not a node of a sweep'),
-    ('localizer: {ros__parameters: {sweep.svp: [true]}}', 'sweep.svp: only parameters of '
-     'synthetic_camera can be swept, below its name; localizer takes one value of each'),
-    ('', 'should hold node names'),
-    ('a: [', 'broken YAML at line 2'),
-    ('stereo_depth: {ros__parameters: {rig: topic}}\nsynthetic_camera: {ros__parameters: '
-     '{sweep.style: [parallel]}}', "rig is 'topic'"),
-    ('localizer: {ros__parameters: {lens: nonsense}}\nsynthetic_camera: {ros__parameters: '
-     '{sweep.seed: [1]}}', "'nonsense' is neither a file"),
-])
+@pytest.mark.parametrize(
+    ('text', 'reason'),
+    [
+        ('localiser: {ros__parameters: {svp: true}}', 'is not a node of a sweep'),
+        (
+            'localizer: {ros__parameters: {sweep.svp: [true]}}',
+            'sweep.svp: only parameters of '
+            'synthetic_camera can be swept, below its name; localizer takes one value of each',
+        ),
+        ('', 'should hold node names'),
+        ('a: [', 'broken YAML at line 2'),
+        (
+            'stereo_depth: {ros__parameters: {rig: topic}}\nsynthetic_camera: {ros__parameters: '
+            '{sweep.style: [parallel]}}',
+            "rig is 'topic'",
+        ),
+        (
+            'localizer: {ros__parameters: {lens: nonsense}}\nsynthetic_camera: {ros__parameters: '
+            '{sweep.seed: [1]}}',
+            "'nonsense' is neither a file",
+        ),
+    ],
+)
 def test_a_file_that_is_no_sweep_is_refused(
-    write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str,
+    write: Callable[[str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    text: str,
     reason: str,
 ) -> None:
     assert main(['sweep', str(write(text)), '-o', str(tmp_path / 'out')]) == 2
@@ -302,7 +354,9 @@ def test_killed_twice_and_resumed_it_is_the_same_file(
 
 
 def test_parts_are_neither_repeated_nor_mixed_nor_lost(
-    write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    write: Callable[[str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     path, out = write(LONG), tmp_path / 'out'
@@ -319,8 +373,12 @@ def test_parts_are_neither_repeated_nor_mixed_nor_lost(
     assert 'it holds another, interrupted sweep' in capsys.readouterr().err
     # What is done stays as it is until it is joined.
     kept: dict[str, int] = {}
-    monkeypatch.setattr('shutil.rmtree', lambda folder, **_: kept.update(
-        {p.name: p.stat().st_mtime_ns for p in Path(folder).glob('0*.json')}))
+    monkeypatch.setattr(
+        'shutil.rmtree',
+        lambda folder, **_: kept.update(
+            {p.name: p.stat().st_mtime_ns for p in Path(folder).glob('0*.json')}
+        ),
+    )
     sweep(path, '-o', out, '--resume')
     assert 'scenarios are already done' in capsys.readouterr().err
     assert len(kept) == TASKS and {name: kept[name] for name in done} == done
@@ -378,7 +436,7 @@ def test_a_result_that_cannot_be_read_is_an_error(
 ) -> None:
     monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
     with process_pool(1) as workers:
-        folder, = tmp_path.iterdir()
+        (folder,) = tmp_path.iterdir()
         gone = workers.executor.submit(shutil.rmtree, str(folder))
         assert isinstance(gone.exception(timeout=60), FileNotFoundError)
 
@@ -403,10 +461,14 @@ class TestDask:
     def cluster(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
         """Return a cluster of two worker processes on loopback."""
         distributed = pytest.importorskip(
-            'distributed', reason='dask.distributed is not installed (extra `dask`)')
+            'distributed', reason='dask.distributed is not installed (extra `dask`)'
+        )
         monkeypatch.setenv('PYTHONPATH', str(ROOT))
         with distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, host='127.0.0.1', dashboard_address=None,
+            n_workers=2,
+            threads_per_worker=1,
+            host='127.0.0.1',
+            dashboard_address=None,
             local_directory=str(tmp_path / 'dask'),
         ) as cluster:
             yield cluster
@@ -425,11 +487,15 @@ class TestDask:
         assert files_of(out) == files_of(undisturbed)
 
     def test_no_scheduler_is_one_line(
-        self, write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+        self,
+        write: Callable[[str], Path],
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
         monkeypatch: pytest.MonkeyPatch,
     ) -> None:
         pytest.importorskip(
-            'distributed', reason='dask.distributed is not installed (extra `dask`)')
+            'distributed', reason='dask.distributed is not installed (extra `dask`)'
+        )
         monkeypatch.setattr('fisheye_svp_ros.commands.executors._PATIENCE', 0.2)
         arguments = ['sweep', str(write(SMALL)), '-o', str(tmp_path / 'out'), '--dask']
         assert main([*arguments, 'tcp://127.0.0.1:9']) == 2
@@ -438,9 +504,7 @@ class TestDask:
 
 def test_points_of_a_sweep_are_counted_like_an_odometer() -> None:
     plan = plan_sweep({'synthetic_camera': {'sweep.radius': [2.0, 1.0], 'sweep.seed': [7, 8, 9]}})
-    assert list(plan.sweep) == [
-        {'radius': r, 'seed': s} for r in (2.0, 1.0) for s in (7, 8, 9)
-    ]
+    assert list(plan.sweep) == [{'radius': r, 'seed': s} for r in (2.0, 1.0) for s in (7, 8, 9)]
     with pytest.raises(ParameterError):
         plan_sweep({})
 
@@ -451,11 +515,13 @@ def test_the_order_of_work_does_not_matter() -> None:
     rows = np.array(whole['localizer.position_error_m'])
     for numbers in (range(30, 40), range(30)):
         again = sweep_rows(plan, numbers)['localizer.position_error_m']
-        assert again == pytest.approx(rows[numbers.start:numbers.stop], abs=1e-12)
+        assert again == pytest.approx(rows[numbers.start : numbers.stop], abs=1e-12)
 
 
 def test_without_pyarrow_there_is_csv_and_one_line_that_says_so(
-    write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    write: Callable[[str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert main(['sweep', str(write(SMALL)), '-o', str(tmp_path / 'with')]) == 0
@@ -469,7 +535,8 @@ def test_without_pyarrow_there_is_csv_and_one_line_that_says_so(
     assert 'only CSV, no Parquet file: pyarrow' in err and err.count('\n') == 1
     assert not (tmp_path / 'out' / 'sweep.parquet').exists()
     assert (tmp_path / 'out' / 'sweep.csv').read_text() == (
-        tmp_path / 'with' / 'sweep.csv').read_text()
+        tmp_path / 'with' / 'sweep.csv'
+    ).read_text()
 
 
 def test_a_damaged_part_is_named(tmp_path: Path) -> None:
@@ -478,8 +545,10 @@ def test_a_damaged_part_is_named(tmp_path: Path) -> None:
         parts.write(number, {'n': [number], 'x': [None], 'note': ['']})
     parts.join(tmp_path / 'whole')
     assert (tmp_path / 'whole.csv').read_text() == 'n,x,note\n0,,\n1,,\n2,,\n'
-    for damaged in ('{"n": [1], "x": [], "note": [""]}',
-                    '{"n": [9223372036854775808], "x": [1.0], "note": [""]}'):
+    for damaged in (
+        '{"n": [1], "x": [], "note": [""]}',
+        '{"n": [9223372036854775808], "x": [1.0], "note": [""]}',
+    ):
         (tmp_path / 'parts' / '000000001.json').write_text(damaged)
         with pytest.raises(OutputError, match=r'000000001.json: a part of the table is damaged'):
             parts.join(tmp_path / 'whole')

@@ -124,15 +124,21 @@ class Medium:
         square = float(np.mean(self.air.residual[self.air.row_mask] ** 2)) * self.share
         square *= float(np.mean(1 / self.air.weight[self.air.weight > 0] ** 2))
         remaining = 1 - self.share
-        parts = [p._replace(share=remaining * p.share, named_share=remaining * p.named_share)
-                 for p in parts]
-        own = Component('named_lens', 'lens', float(np.sqrt(square)), self.share, self.share,
-                        self.p_value)
+        parts = [
+            p._replace(share=remaining * p.share, named_share=remaining * p.named_share)
+            for p in parts
+        ]
+        own = Component(
+            'named_lens', 'lens', float(np.sqrt(square)), self.share, self.share, self.p_value
+        )
         for part in parts:
             if part.name == own.name:
                 own = own._replace(
-                    sd_px=float(np.hypot(part.sd_px, own.sd_px)), share=part.share + own.share,
-                    named_share=part.named_share + own.share, p_value=0.0)
+                    sd_px=float(np.hypot(part.sd_px, own.sd_px)),
+                    share=part.share + own.share,
+                    named_share=part.named_share + own.share,
+                    p_value=0.0,
+                )
         return [own, *(part for part in parts if part.name != own.name)]
 
 
@@ -173,9 +179,17 @@ class InAir:
         lens = self.lens
         theta = np.linspace(0.0, lens.max_incidence, _SAMPLES)[1:]
         height = lens.image_height.value_and_slope(theta)[0]
-        by = {'f': height, 'fx': height, **dict(zip(
-            lens.image_height.coefficient_names, lens.fx * lens.image_height.columns(theta).T,
-            strict=True))}
+        by = {
+            'f': height,
+            'fx': height,
+            **dict(
+                zip(
+                    lens.image_height.coefficient_names,
+                    lens.fx * lens.image_height.columns(theta).T,
+                    strict=True,
+                )
+            ),
+        }
         columns = np.stack([by.get(name, np.zeros_like(theta)) for name in self.names], axis=-1)
         spread = np.sqrt(np.einsum('tk,kl,tl->t', columns, self.covariance, columns))
         open_ = spread > (self.focal + _KNOWN_SHARE) * lens.fx * height
@@ -227,12 +241,16 @@ class InAir:
         linear = Linearization(data, state, ())
         noise = float(np.median(np.abs(linear.residual[linear.row_mask]))) / _MEDIAN_SIZE
         others = sum(len(values) for effect, values in state.terms if is_shared(effect))
-        mean = np.concatenate([[state.lens.parameters[index]],
-                               parameter_values(self.lens, self.names),
-                               np.zeros(others)])
+        mean = np.concatenate(
+            [
+                [state.lens.parameters[index]],
+                parameter_values(self.lens, self.names),
+                np.zeros(others),
+            ]
+        )
         root = np.zeros((1 + len(self.names), len(mean)))
         root[0, 0] = 1 / _INDEX_SIGMA
-        root[1:, 1:1 + len(self.names)] = self._root
+        root[1:, 1 : 1 + len(self.names)] = self._root
         return Prior(mean, noise * root)
 
 
@@ -244,9 +262,11 @@ def _stated_covariance(lens: Lens, said: Mapping[str, Any]) -> tuple[tuple[str, 
         if not (right and (np.diag(whole) >= 0).all()):
             raise ValueError
     except (KeyError, TypeError, ValueError) as cause:
-        raise LensError(f'lens {lens.name!r}: calibration: covariance is no matrix of finite '
-                        'numbers, a row and a column for each name in stderr; calibrate anew, or '
-                        'leave it out') from cause
+        raise LensError(
+            f'lens {lens.name!r}: calibration: covariance is no matrix of finite '
+            'numbers, a row and a column for each name in stderr; calibrate anew, or '
+            'leave it out'
+        ) from cause
     return names, whole
 
 
@@ -255,8 +275,11 @@ def stated_parameters(lenses: Mapping[str, Lens]) -> dict[str, tuple[float, floa
     stated = {}
     for camera, lens in lenses.items():
         air = InAir.from_lens(lens)
-        errors = {} if air is None else dict(
-            zip(air.names, np.sqrt(np.diag(air.covariance)).tolist(), strict=True))
+        errors = (
+            {}
+            if air is None
+            else dict(zip(air.names, np.sqrt(np.diag(air.covariance)).tolist(), strict=True))
+        )
         for name, value in lens.parameters.items():
             error = errors.get('f' if name in ('fx', 'fy') and 'f' in errors else name, 0.0)
             stated[f'{camera}.{name}' if camera else name] = value, error
@@ -267,8 +290,10 @@ def find_medium(problem: Problem, progress: Progress) -> Medium | None:
     """Ask whether the camera looks through a flat port into another medium than air."""
     table, data, base, free = problem.table, problem.data, problem.base, problem.free
     lens = next(iter(problem.inputs.lenses.values()))
-    if lens.port is not None or data.cameras > 1 or (
-        FlatPortEffect.name in problem.options.left_out
+    if (
+        lens.port is not None
+        or data.cameras > 1
+        or (FlatPortEffect.name in problem.options.left_out)
     ):
         return None
     air = problem.linear
@@ -297,8 +322,14 @@ def behind_port(problem: Problem, medium: Medium) -> Problem:
     options, step = problem.options, SessionStepEffect.name
     if step not in options.included and step not in options.left_out:
         options = options.leave_out(step)
-    return replace(problem, data=medium.air.data, outliers=medium.outliers, base=medium.state,
-                   free=medium.names, options=options)
+    return replace(
+        problem,
+        data=medium.air.data,
+        outliers=medium.outliers,
+        base=medium.state,
+        free=medium.names,
+        options=options,
+    )
 
 
 def _correct_lens(everything: RigViews, lens: Lens, known: InAir) -> Lens | None:
@@ -330,20 +361,33 @@ def _assess_port(
     base = adjust(data, initial_state(data, lens), free)
     air, curve = Linearization(data, base, free), fit_free_curve(data, base)
     plain = replace(base, lens=replace(state.lens, port=None))
-    before, after, least = (Linearization(data, fitted, ()).sum_of_squares for fitted in (
-        adjust(data, plain, ()), state, curve))
+    before, after, least = (
+        Linearization(data, fitted, ()).sum_of_squares
+        for fitted in (adjust(data, plain, ()), state, curve)
+    )
     rows = int(air.row_mask.sum())
     square = min(after, least) / rows
-    criteria = (after / square + len(names) * np.log(rows) + moved,
-                least / square + (len(INTRINSICS) + CURVE_TERMS) * np.log(rows))
+    criteria = (
+        after / square + len(names) * np.log(rows) + moved,
+        least / square + (len(INTRINSICS) + CURVE_TERMS) * np.log(rows),
+    )
     near = before - after > _EXPLAINED_SHARE * (before - least) and after < _MAX_COST_RATIO * least
     if not (criteria[0] < criteria[1] or near):
         return None
     mine = air.sum_of_squares
     p_value = float(special.chdtrc(len(names), max(before - after, 0.0) / square))
     return Medium(
-        state, names, outliers, air, p_value, max(0.0, 1 - after / mine),
-        bool(criteria[1] < criteria[0]), criteria[0] - criteria[1], moved > 0, _focal_error(lens))
+        state,
+        names,
+        outliers,
+        air,
+        p_value,
+        max(0.0, 1 - after / mine),
+        bool(criteria[1] < criteria[0]),
+        criteria[0] - criteria[1],
+        moved > 0,
+        _focal_error(lens),
+    )
 
 
 def _leaves_room_for_port(air: Linearization, curve: Linearization) -> bool:
@@ -370,6 +414,7 @@ def _is_magnified(air: Linearization, lens: Lens, fitted: Linearization) -> bool
     """Whether a fitted lens sees things larger than in air, as a port makes them."""
     theta = np.array(0.5 * air.scene.theta_max)
     model = fitted.model.camera(0).lens
-    height, known = (one.focal * float(one.image_height.value_and_slope(theta)[0])
-                     for one in (model, lens))
+    height, known = (
+        one.focal * float(one.image_height.value_and_slope(theta)[0]) for one in (model, lens)
+    )
     return height > _MIN_MAGNIFICATION * known

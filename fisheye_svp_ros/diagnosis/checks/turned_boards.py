@@ -75,8 +75,11 @@ class _Frames(NamedTuple):
         there = self.slot >= 0
         moved = (back @ self.known[slot][..., None])[..., 0] - self.known[self.slot]
         rows = self.rows - (self.place @ moved[..., None])[..., 0]
-        return (slot, np.where(there[..., None, None], self.place @ back, 0.0),
-                np.where(there[..., None], rows, 0.0))
+        return (
+            slot,
+            np.where(there[..., None, None], self.place @ back, 0.0),
+            np.where(there[..., None], rows, 0.0),
+        )
 
     def products(self, turn: Index) -> tuple[Array, Array]:
         """Return what each frame says of landmarks: products (F, L, 3, 3) and (F, L, 3)."""
@@ -88,9 +91,7 @@ class _Frames(NamedTuple):
         np.add.at(product, at, (np.swapaxes(place, -1, -2) @ rows[..., None])[..., 0])
         return square, product
 
-    def compare_orders(
-        self, turn: Index, noise: float, spread: Array
-    ) -> tuple[Array, Array]:
+    def compare_orders(self, turn: Index, noise: float, spread: Array) -> tuple[Array, Array]:
         """Return the log likelihood ratios (T, F) of every order to the first, by the others.
 
         And by how many standard errors (T, F) each frame shows the difference of the two orders:
@@ -156,8 +157,9 @@ def find_turned_views(problem: Problem) -> list[tuple[TurnedFrame, BoardTurn]]:
     trials = []
     for turn in board_turns(Landmarks(target.landmark, target.points), target.board):
         for camera in range(len(table.cameras)):
-            data = group_by_frame(turn.apply(
-                table, np.isin(table.frame, torn) & (table.camera == camera)))
+            data = group_by_frame(
+                turn.apply(table, np.isin(table.frame, torn) & (table.camera == camera))
+            )
             data = data.select(np.isin(data.views.frame, torn))
             trials.append((camera, turn, _cross_camera_misfits(problem, data)))
     before, found = _cross_camera_misfits(problem, problem.table), []
@@ -165,11 +167,21 @@ def find_turned_views(problem: Problem) -> list[tuple[TurnedFrame, BoardTurn]]:
         camera, turn, misfits = min(trials, key=lambda one: one[2][frame])
         if misfits[frame] > _CONSISTENT_RATIO * usual:
             continue
-        gain = (before[frame]**2 - misfits[frame]**2) / (2 * usual**2) + np.log(_PRIOR)
+        gain = (before[frame] ** 2 - misfits[frame] ** 2) / (2 * usual**2) + np.log(_PRIOR)
         name, views = table.cameras[camera], int((problem.table.views.frame == frame).sum())
-        found.append((TurnedFrame(
-            frame, name, frame_name(table, frame, name if views > 2 else None), turn.degrees,
-            float(np.exp(min(gain, _MAX_LOG_ODDS))), bool(gain > np.log(CERTAIN_ODDS))), turn))
+        found.append(
+            (
+                TurnedFrame(
+                    frame,
+                    name,
+                    frame_name(table, frame, name if views > 2 else None),
+                    turn.degrees,
+                    float(np.exp(min(gain, _MAX_LOG_ODDS))),
+                    bool(gain > np.log(CERTAIN_ODDS)),
+                ),
+                turn,
+            )
+        )
     return found
 
 
@@ -177,8 +189,10 @@ def _cross_camera_misfits(problem: Problem, data: RigViews) -> dict[int, float]:
     """Return how far off, px, a view of each frame is at most from where the rig has it."""
     alone = localize_cameras(problem.base.model, data.views)
     misfit = cross_camera_offsets(data, problem.base, alone)[0]
-    return {frame: float(misfit[data.views.frame == frame].max())
-            for frame in np.unique(data.views.frame).tolist()}
+    return {
+        frame: float(misfit[data.views.frame == frame].max())
+        for frame in np.unique(data.views.frame).tolist()
+    }
 
 
 def find_turned_frames(
@@ -200,14 +214,25 @@ def find_turned_frames(
             view = first[at[i]]
             frame = int(views.frame[view])
             camera = table.cameras[views.camera[view]] if alone else ''
-            found.append((TurnedFrame(frame, camera, frame_name(table, frame, camera or None),
-                                      own[turn - 1].degrees, odds, odds > CERTAIN_ODDS),
-                          own[turn - 1]))
+            found.append(
+                (
+                    TurnedFrame(
+                        frame,
+                        camera,
+                        frame_name(table, frame, camera or None),
+                        own[turn - 1].degrees,
+                        odds,
+                        odds > CERTAIN_ODDS,
+                    ),
+                    own[turn - 1],
+                )
+            )
     return found
 
 
-def turn_frames(table: Observations, found: Sequence[tuple[TurnedFrame, BoardTurn]]
-                ) -> Observations:
+def turn_frames(
+    table: Observations, found: Sequence[tuple[TurnedFrame, BoardTurn]]
+) -> Observations:
     """Return the table with the frames that are certain in the order of the others."""
     for one, turn in found:
         if one.corrected:
@@ -235,8 +260,11 @@ def _resolve(frames: _Frames, noise: float) -> list[tuple[int, int, float]]:
             break
         turn[frame] = better[:, frame].argmax()
     odds = gain[turn, each] / scatter + np.log(_PRIOR)
-    return [(int(i), int(turn[i]), float(np.exp(min(odds[i], _MAX_LOG_ODDS))))
-            for i in np.flatnonzero(turn) if odds[i] > np.log(SUSPECT_ODDS)]
+    return [
+        (int(i), int(turn[i]), float(np.exp(min(odds[i], _MAX_LOG_ODDS))))
+        for i in np.flatnonzero(turn)
+        if odds[i] > np.log(SUSPECT_ODDS)
+    ]
 
 
 def _scatter(gain: Array, distance: Array) -> float:
@@ -261,14 +289,12 @@ def _gather(
     used = linear.row_mask.reshape(count, -1, 2)[..., 0]
     alone = np.isin(fitted.random.landmark, turns[0].alone)[columns.unit] & used
     shown = np.isin(fitted.random.landmark, ids)[columns.unit] & used
-    at = np.flatnonzero(
-        ((shown | alone) == used).all(axis=1) & (shown.sum(axis=1) >= _MIN_POINTS))
+    at = np.flatnonzero(((shown | alone) == used).all(axis=1) & (shown.sum(axis=1) >= _MIN_POINTS))
     # Fields of the image stay in: they take up what a frame in the wrong order errs by.
     rows = fitted.residuals(of_frames=True).reshape(count, -1, 2)[at]
     bumps = columns.group_label == NAMES.index('frame_bumps')
     fixed = np.concatenate([linear.frame_columns[at], columns.group[at][..., ~bumps]], axis=-1)
-    fixed = np.where(shown[at][..., None, None],
-                     fixed.reshape(*rows.shape, fixed.shape[-1]), 0.0)
+    fixed = np.where(shown[at][..., None, None], fixed.reshape(*rows.shape, fixed.shape[-1]), 0.0)
     fixed = fixed / np.maximum(np.sqrt((fixed**2).sum(axis=(1, 2), keepdims=True)), 1e-12)
     own = np.isin(target.landmark, ids)
     where = target.points[own] + target.displacements(linear.state.terms, linear.state.lens)[own]
@@ -276,7 +302,11 @@ def _gather(
     partner = [np.arange(len(ids)), *(np.searchsorted(ids, one.partner) for one in turns)]
     frames = _Frames(
         np.where((slot >= 0)[..., None], rows, 0.0),
-        np.where((slot >= 0)[..., None, None], columns.offset[at], 0.0), slot, fixed,
-        (where - board.centre) @ board.axes.T / MILLIMETRE, np.array(partner),
-        np.array([np.eye(3), *(one.matrix for one in turns)]))
+        np.where((slot >= 0)[..., None, None], columns.offset[at], 0.0),
+        slot,
+        fixed,
+        (where - board.centre) @ board.axes.T / MILLIMETRE,
+        np.array(partner),
+        np.array([np.eye(3), *(one.matrix for one in turns)]),
+    )
     return at, frames

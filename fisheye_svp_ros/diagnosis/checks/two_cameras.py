@@ -98,8 +98,7 @@ def fit_and_predict(
     Nothing random: what was carried over is tried as whoever uses it would.
     """
     fitted = adjust(data, state, free, held=held)
-    return fitted, cross_validate(
-        NullModel.with_variances(data, fitted, free), held=held)
+    return fitted, cross_validate(NullModel.with_variances(data, fitted, free), held=held)
 
 
 def fitted_target(fitted: FittedModel, known: KnownTarget) -> Array:
@@ -155,8 +154,11 @@ class TwoCameras:
         """Whether they agree on the target: agree, contradict, undecided; nothing: no shape."""
         if not self.target:
             return 'nothing'
-        apart = bool(self.rig) and not self.posed_alone and all(
-            moved.high < 0 for moved in self.rig.values())
+        apart = (
+            bool(self.rig)
+            and not self.posed_alone
+            and all(moved.high < 0 for moved in self.rig.values())
+        )
         if apart or any(one.worsens for one in self.target):
             return 'contradict'
         return 'agree' if all(one.improves for one in self.target) else 'undecided'
@@ -164,11 +166,13 @@ class TwoCameras:
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
         return {
-            'cameras': list(self.cameras), 'verdict': self.verdict,
+            'cameras': list(self.cameras),
+            'verdict': self.verdict,
             'target': [one.to_dict() for one in self.target],
             'maps': self.maps and self.maps._asdict(),
             'rig': {name: value.to_dict() for name, value in self.rig.items()},
-            'withdrawn': list(self.withdrawn), 'posed_alone': self.posed_alone,
+            'withdrawn': list(self.withdrawn),
+            'posed_alone': self.posed_alone,
         }
 
 
@@ -191,26 +195,36 @@ def agree_on_target(
         return selection, []
     progress('cross-camera validation', 0.78)
     pairs, problem = compare_cameras(selection), selection.problem
-    gone = tuple(e.name for e, _, _ in selection.causes
-                 if e.stage == 'target' and e.name not in problem.options.included)
+    gone = tuple(
+        e.name
+        for e, _, _ in selection.causes
+        if e.stage == 'target' and e.name not in problem.options.included
+    )
     if not gone or all(pair.verdict != 'contradict' for pair in pairs):
         return selection, pairs
     selection = select_causes(
         replace(problem, options=problem.options.leave_out(*gone)),
-        lambda stage, _: progress(stage, 0.79))
-    return selection, [replace(pair, withdrawn=gone if pair.verdict == 'contradict' else ())
-                       for pair in pairs]
+        lambda stage, _: progress(stage, 0.79),
+    )
+    return selection, [
+        replace(pair, withdrawn=gone if pair.verdict == 'contradict' else ()) for pair in pairs
+    ]
 
 
 def compare_cameras(selection: Selection) -> list[TwoCameras]:
     """Return what each two cameras of a rig say of each other, if both saw enough."""
     data = selection.null.linear.data
     known = KnownTarget.from_views(data.views)
-    cameras = [_fit_camera(selection, camera, known) for camera in range(data.cameras)
-               if (data.camera_of == camera).sum() >= MIN_SHARED_FRAMES]
+    cameras = [
+        _fit_camera(selection, camera, known)
+        for camera in range(data.cameras)
+        if (data.camera_of == camera).sum() >= MIN_SHARED_FRAMES
+    ]
     alone = is_unpaired(data)
-    return [replace(_compare(one, other, known), posed_alone=alone)
-            for one, other in combinations(cameras, 2)]
+    return [
+        replace(_compare(one, other, known), posed_alone=alone)
+        for one, other in combinations(cameras, 2)
+    ]
 
 
 def _fit_camera(selection: Selection, camera: int, known: KnownTarget) -> _Camera:
@@ -228,13 +242,22 @@ def _fit_camera(selection: Selection, camera: int, known: KnownTarget) -> _Camer
     stages = {STAGE_OF[name] for name in np.array(NAMES)[null.variances.alive]}
     if 'target' in stages or any(map(displaces_landmarks, selection.state.terms)):
         seen = np.unique(own.views.landmark[own.views.used])
-        variances = replace(null.variances, weight=null.variances.weight[
-            np.searchsorted(null.random.landmark, seen)])
+        variances = replace(
+            null.variances,
+            weight=null.variances.weight[np.searchsorted(null.random.landmark, seen)],
+        )
         state = refit(own, state, names, variances)
         target = fitted_target(
-            FittedModel.of_state(Linearization(own, state, names), variances), known)
-    return _Camera(data.observations.cameras[camera], _single_camera(base, pose, at, camera), own,
-                   state, names, target)
+            FittedModel.of_state(Linearization(own, state, names), variances), known
+        )
+    return _Camera(
+        data.observations.cameras[camera],
+        _single_camera(base, pose, at, camera),
+        own,
+        state,
+        names,
+        target,
+    )
 
 
 def _single_camera(state: RigState, pose: Pose, lens: int, camera: int) -> RigState:
@@ -253,26 +276,39 @@ def _compare(one: _Camera, other: _Camera, known: KnownTarget) -> TwoCameras:
             after, there = fit_and_predict(data, state, mine.free)
             carried.append(Transfer.compare(source.name, mine.name, without, there))
         poses.append((adjust(mine.data, mine.before, mine.free).pose, after.pose))
-    return TwoCameras((one.name, other.name), tuple(carried), _maps(one, other, known),
-                      _scatter((one.data, other.data), poses))
+    return TwoCameras(
+        (one.name, other.name),
+        tuple(carried),
+        _maps(one, other, known),
+        _scatter((one.data, other.data), poses),
+    )
 
 
 def _maps(one: _Camera, other: _Camera, known: KnownTarget) -> TargetMaps | None:
     """Compare what two cameras found of the target, by the landmarks that both saw."""
     if one.target is None or other.target is None:
         return None
-    seen = [np.isin(known.landmark, mine.data.views.landmark[mine.data.views.used])
-            for mine in (one, other)]
+    seen = [
+        np.isin(known.landmark, mine.data.views.landmark[mine.data.views.used])
+        for mine in (one, other)
+    ]
     both = seen[0] & seen[1]
     if both.sum() < _MIN_COMMON_LANDMARKS:
         return None
     shared = KnownTarget(known.landmark[both], known.board[both], known.points[both])
     off, along = (
-        [np.concatenate([getattr(board, name).ravel() for board in shared.maps(moved[both])])
-         for moved in (one.target, other.target)] for name in ('height', 'slide')
+        [
+            np.concatenate([getattr(board, name).ravel() for board in shared.maps(moved[both])])
+            for moved in (one.target, other.target)
+        ]
+        for name in ('height', 'slide')
     )
-    return TargetMaps(int(both.sum()), _correlation(*off), _correlation(*along),
-                (float(np.sqrt((off[0]**2).mean())), float(np.sqrt((off[1]**2).mean()))))
+    return TargetMaps(
+        int(both.sum()),
+        _correlation(*off),
+        _correlation(*along),
+        (float(np.sqrt((off[0] ** 2).mean())), float(np.sqrt((off[1] ** 2).mean()))),
+    )
 
 
 def _correlation(one: Array, other: Array) -> float:
@@ -286,7 +322,8 @@ def _scatter(
 ) -> dict[str, Comparison]:
     """Compare how the rig scatters that each frame gives, before and after."""
     shared, first, second = np.intersect1d(
-        data[0].views.frame, data[1].views.frame, return_indices=True)
+        data[0].views.frame, data[1].views.frame, return_indices=True
+    )
     if len(shared) < MIN_SHARED_FRAMES:
         return {}
     before, after = (
@@ -301,5 +338,6 @@ def deviations(rig: Pose) -> tuple[Array, Array]:
     """Return how far (F,), m and rad, each rig is from the middle of all."""
     turn = vector_from_rotation(np.swapaxes(rig.rotation[:1], -1, -2) @ rig.rotation)
     place, angle = (
-        np.linalg.norm(part - np.median(part, axis=0), axis=-1) for part in (rig.position, turn))
+        np.linalg.norm(part - np.median(part, axis=0), axis=-1) for part in (rig.position, turn)
+    )
     return place, angle

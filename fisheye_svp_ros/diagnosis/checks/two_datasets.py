@@ -86,8 +86,11 @@ class TwoDatasets:
     @property
     def refuted_causes(self) -> list[str]:
         """The causes of this set without which the other is predicted better beyond chance."""
-        return [] if self.tried[0] is None else [
-            name for name, one in self.tried[0].causes.items() if one.worsens]
+        return (
+            []
+            if self.tried[0] is None
+            else [name for name, one in self.tried[0].causes.items() if one.worsens]
+        )
 
     @property
     def verdict(self) -> str:
@@ -101,24 +104,36 @@ class TwoDatasets:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
+
         def entry(one: Transfer | None) -> dict[str, Any] | None:
             return None if one is None else one.to_dict()
 
         return {
-            'against': self.source, 'verdict': self.verdict, 'withdrawn': list(self.withdrawn),
-            'tried': [{
-                'lens': entry(one.lens), 'whole': entry(one.whole), 'target': entry(one.target),
-                'causes': {name: entry(cause) for name, cause in one.causes.items()},
-            } for one in self.tried if one is not None],
-            'parameters': {name: one._asdict() | {'apart': one.standardized_difference}
-                           for name, one in self.parameters.items()},
+            'against': self.source,
+            'verdict': self.verdict,
+            'withdrawn': list(self.withdrawn),
+            'tried': [
+                {
+                    'lens': entry(one.lens),
+                    'whole': entry(one.whole),
+                    'target': entry(one.target),
+                    'causes': {name: entry(cause) for name, cause in one.causes.items()},
+                }
+                for one in self.tried
+                if one is not None
+            ],
+            'parameters': {
+                name: one._asdict() | {'apart': one.standardized_difference}
+                for name, one in self.parameters.items()
+            },
         }
 
 
 def compare_datasets(one: DatasetModel, other: DatasetModel, source: str, to: str) -> TwoDatasets:
     """Return what two data sets of one camera say of each other."""
     return TwoDatasets(
-        to, (_transfer_causes(one, other, source, to), _transfer_causes(other, one, to, source)),
+        to,
+        (_transfer_causes(one, other, source, to), _transfer_causes(other, one, to, source)),
         _parameters(one, other),
     )
 
@@ -140,16 +155,22 @@ def _transfer_causes(
         return fit_and_predict(data, there, free, [effect.name for effect, _ in terms])[1]
 
     without, there = predict(()), predict(carried)
-    whole = (predict((), replace(bare, lens=one.simulation.state.lens), ()),
-             predict(carried, replace(bare, lens=one.null.linear.state.lens), ()))
+    whole = (
+        predict((), replace(bare, lens=one.simulation.state.lens), ()),
+        predict(carried, replace(bare, lens=one.null.linear.state.lens), ()),
+    )
     causes = {
-        effect.name: Transfer.compare(source, to, predict(
-            [term for term in carried if term[0].name != effect.name]), there)
+        effect.name: Transfer.compare(
+            source, to, predict([term for term in carried if term[0].name != effect.name]), there
+        )
         for effect, _ in carried
     }
     return TransferredCauses(
-        Transfer.compare(source, to, without, there), Transfer.compare(source, to, *whole), causes,
-        _transfer_target(one, other, source, to))
+        Transfer.compare(source, to, without, there),
+        Transfer.compare(source, to, *whole),
+        causes,
+        _transfer_target(one, other, source, to),
+    )
 
 
 def _transfer_target(
@@ -200,10 +221,14 @@ def _estimates(one: DatasetModel, state: RigState) -> dict[str, tuple[float, flo
     null = NullModel.with_variances(data, state, free, variances)
     errors = standard_errors(null)
     rig = null.column_count - len(free) - sum(len(values) for _, _, values in null.terms)
-    found = {name: (state.parameters[name], float(errors[rig + i]),
-                    'px' if name in INTRINSICS else '') for i, name in enumerate(free)}
+    found = {
+        name: (state.parameters[name], float(errors[rig + i]), 'px' if name in INTRINSICS else '')
+        for i, name in enumerate(free)
+    }
     for effect, columns, values in null.terms:
         if moves_with_lens((effect, values)):
-            found |= {f'{effect.name}.{p.name}': (float(v), float(e), p.unit) for p, v, e in zip(
-                effect.parameters, values, errors[columns], strict=True)}
+            found |= {
+                f'{effect.name}.{p.name}': (float(v), float(e), p.unit)
+                for p, v, e in zip(effect.parameters, values, errors[columns], strict=True)
+            }
     return found

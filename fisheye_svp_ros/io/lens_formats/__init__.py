@@ -17,11 +17,28 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
 # In the order in which they are asked: OpenCV's files are the most general of YAML.
-FORMATS = ('kalibr', 'ros', 'euroc', 'orbslam', 'camodocal', 'opencv', 'basalt', 'mrcal', 'colmap',
-           'nerfstudio', 'boofcv', 'metashape', 'ocamcalib', 'transforms', 'rig')
+FORMATS = (
+    'kalibr',
+    'ros',
+    'euroc',
+    'orbslam',
+    'camodocal',
+    'opencv',
+    'basalt',
+    'mrcal',
+    'colmap',
+    'nerfstudio',
+    'boofcv',
+    'metashape',
+    'ocamcalib',
+    'transforms',
+    'rig',
+)
 WRITABLE = ('kalibr', 'ros', 'opencv', 'basalt', 'mrcal', 'colmap', 'nerfstudio')
-READABLE = ('ROS camera_info, Kalibr, OpenCV, Basalt, mrcal, EuRoC, COLMAP, ORB-SLAM3, CamOdoCal, '
-            'nerfstudio, Metashape, OCamCalib and BoofCV')
+READABLE = (
+    'ROS camera_info, Kalibr, OpenCV, Basalt, mrcal, EuRoC, COLMAP, ORB-SLAM3, CamOdoCal, '
+    'nerfstudio, Metashape, OCamCalib and BoofCV'
+)
 # What is known by sight alone
 UNREADABLE_FORMATS = {
     'an OpenMVG scene': '"sfm_data_version"',
@@ -63,8 +80,10 @@ class Foreign(NamedTuple):
 
     def deviation_px(self, lens: Lens) -> float:
         """Return how far a lens of the file is from what the file says, px."""
-        return next((self.worst_px.get(camera, 0.0) for camera, one in self.lenses.items()
-                     if one == lens), 0.0)
+        return next(
+            (self.worst_px.get(camera, 0.0) for camera, one in self.lenses.items() if one == lens),
+            0.0,
+        )
 
 
 def read_foreign(path: str | Path, text: str) -> Foreign | None:

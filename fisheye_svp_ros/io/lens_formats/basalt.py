@@ -36,10 +36,14 @@ def read(text: str, where: str) -> Foreign:
     cameras = fields.sections(document, 'intrinsics', where)
     sizes = document.get('resolution')
     if not isinstance(sizes, list) or len(sizes) != len(cameras):
-        raise LensError(f'{where}: resolution is {sizes!r}; a list of width and height of each of '
-                        f'the {len(cameras)} cameras of intrinsics is needed')
-    found = {f'cam{i}': _lens(f'cam{i}', camera, size, f'{where}: camera {i}')
-             for i, (camera, size) in enumerate(zip(cameras, sizes, strict=True))}
+        raise LensError(
+            f'{where}: resolution is {sizes!r}; a list of width and height of each of '
+            f'the {len(cameras)} cameras of intrinsics is needed'
+        )
+    found = {
+        f'cam{i}': _lens(f'cam{i}', camera, size, f'{where}: camera {i}')
+        for i, (camera, size) in enumerate(zip(cameras, sizes, strict=True))
+    }
     rigs = _rigs(fields.sections({'T_imu_cam': [], **document}, 'T_imu_cam', where), where)
     return Foreign.from_lenses('Basalt', found, rigs)
 
@@ -47,22 +51,24 @@ def read(text: str, where: str) -> Foreign:
 def _lens(name: str, camera: Mapping[str, Any], size: Any, where: str) -> tuple[Lens, float]:
     kind = str(camera.get('camera_type'))
     if kind not in _MODELS:
-        raise LensError(f'{where}: camera_type is {kind!r}; those that can be read are '
-                        f'{", ".join(_MODELS)}')
+        raise LensError(
+            f'{where}: camera_type is {kind!r}; those that can be read are {", ".join(_MODELS)}'
+        )
     names, distortion = _MODELS[kind]
     given = fields.section(camera, 'intrinsics', where)
     pinhole = fields.values(given, ('fx', 'fy', 'cx', 'cy'), where)
     size = fields.numbers({'resolution': size}, 'resolution', 2, where)
     return models.nearest_lens(
-        name, size, pinhole, distortion(*fields.values(given, names, where)), where)
+        name, size, pinhole, distortion(*fields.values(given, names, where)), where
+    )
 
 
 def _rigs(entries: Sequence[Mapping[str, Any]], where: str) -> tuple[Pose, ...]:
-    table = [fields.values(entry, _NAMES, f'{where}: T_imu_cam {i}')
-             for i, entry in enumerate(entries)]
+    table = [
+        fields.values(entry, _NAMES, f'{where}: T_imu_cam {i}') for i, entry in enumerate(entries)
+    ]
     places = [fields.pose(row[:3], row[3:], f'{where}: T_imu_cam') for row in table]
-    return tuple(later.inverse().compose(earlier)
-                 for earlier, later in itertools.pairwise(places))
+    return tuple(later.inverse().compose(earlier) for earlier, later in itertools.pairwise(places))
 
 
 def write(lens: Lens) -> str:
@@ -70,8 +76,18 @@ def write(lens: Lens) -> str:
     near = models.nearest_kannala_brandt(lens)
     values = {'fx': near.fx, 'fy': near.fy, 'cx': near.cx, 'cy': near.cy}
     values |= {f'k{i}': k for i, k in enumerate(models.coefficients(near), start=1)}
-    return json.dumps({'value0': {
-        'T_imu_cam': [dict(zip(_NAMES, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), strict=True))],
-        'intrinsics': [{'camera_type': 'kb4', 'intrinsics': values}],
-        'resolution': [[near.width, near.height]],
-    }}, indent=4) + '\n'
+    return (
+        json.dumps(
+            {
+                'value0': {
+                    'T_imu_cam': [
+                        dict(zip(_NAMES, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), strict=True))
+                    ],
+                    'intrinsics': [{'camera_type': 'kb4', 'intrinsics': values}],
+                    'resolution': [[near.width, near.height]],
+                }
+            },
+            indent=4,
+        )
+        + '\n'
+    )

@@ -28,8 +28,9 @@ def fisheye624(values: Values) -> models.Distortion:
     """Return the distortion of six radial, two tangential and four thin prism coefficients."""
     k, s = ([values[f'{name}{i}'] for i in range(count)] for name, count in (('k', 6), ('s', 4)))
     # Its p0 belongs to u, as OpenCV's p2 does.
-    return models.Distortion(models.EQUIDISTANT, k, (), (values['p1'], values['p0']),
-                      prism=(s[:2], s[2:]), late=True)
+    return models.Distortion(
+        models.EQUIDISTANT, k, (), (values['p1'], values['p0']), prism=(s[:2], s[2:]), late=True
+    )
 
 
 def _brown(values: Values) -> models.Distortion:
@@ -44,12 +45,15 @@ _MODELS: dict[str, tuple[str, Callable[[Values], models.Distortion]]] = {
     'SIMPLE_FISHEYE': ('f cx cy', _fisheye),
     'FISHEYE': ('fx fy cx cy', _fisheye),
     'THIN_PRISM_FISHEYE': ('fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1', _fisheye),
-    'RAD_TAN_THIN_PRISM_FISHEYE': (
-        'fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3', fisheye624),
-    'FOV': ('fx fy cx cy omega',
-            lambda v: models.Distortion(models.field_of_view_model(v['omega']))),
-    'EUCM': ('fx fy cx cy alpha beta',
-             lambda v: models.Distortion(models.unified_heights(v['alpha'], v['beta']))),
+    'RAD_TAN_THIN_PRISM_FISHEYE': ('fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3', fisheye624),
+    'FOV': (
+        'fx fy cx cy omega',
+        lambda v: models.Distortion(models.field_of_view_model(v['omega'])),
+    ),
+    'EUCM': (
+        'fx fy cx cy alpha beta',
+        lambda v: models.Distortion(models.unified_heights(v['alpha'], v['beta'])),
+    ),
     'SIMPLE_PINHOLE': ('f cx cy', _brown),
     'PINHOLE': ('fx fy cx cy', _brown),
     'SIMPLE_RADIAL': ('f cx cy k1', _brown),
@@ -82,8 +86,9 @@ def read(text: str, where: str) -> Foreign:
         try:
             width, height, *values = (float(word) for word in rest.replace(',', ' ').split())
         except ValueError as cause:
-            raise LensError(f'{place}: width, height and the parameters of {model} must be '
-                            f'numbers ({cause})') from cause
+            raise LensError(
+                f'{place}: width, height and the parameters of {model} must be numbers ({cause})'
+            ) from cause
         found[camera] = _lens(f'camera{camera}', model, (width, height), values, place)
     return Foreign.from_lenses('COLMAP', found)
 
@@ -92,12 +97,14 @@ def _lens(
     name: str, model: str, size: Sequence[float], given: Sequence[float], where: str
 ) -> tuple[Lens, float]:
     if model not in _MODELS:
-        raise LensError(f'{where}: model is {model}; those that can be read are '
-                        f'{", ".join(_MODELS)}')
+        raise LensError(
+            f'{where}: model is {model}; those that can be read are {", ".join(_MODELS)}'
+        )
     names, distortion = _MODELS[model][0].split(), _MODELS[model][1]
     if len(given) != len(names):
-        raise LensError(f'{where}: {model} has {len(given)} parameters; needed are '
-                        f'{", ".join(names)}')
+        raise LensError(
+            f'{where}: {model} has {len(given)} parameters; needed are {", ".join(names)}'
+        )
     values = dict(zip(names, given, strict=True))
     focal = values.get('fx', values.get('f', 0.0)), values.get('fy', values.get('f', 0.0))
     middle = values['cx'] - _CORNER, values['cy'] - _CORNER
@@ -108,6 +115,8 @@ def write(lens: Lens) -> str:
     """Return the lens in this form, as its first camera."""
     near = models.nearest_kannala_brandt(lens)
     values = (near.fx, near.fy, near.cx + _CORNER, near.cy + _CORNER, *models.coefficients(near))
-    return ('# Camera list with one line of data per camera:\n'
-            '#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n'
-            f'1 OPENCV_FISHEYE {near.width} {near.height} {" ".join(map(repr, values))}\n')
+    return (
+        '# Camera list with one line of data per camera:\n'
+        '#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n'
+        f'1 OPENCV_FISHEYE {near.width} {near.height} {" ".join(map(repr, values))}\n'
+    )

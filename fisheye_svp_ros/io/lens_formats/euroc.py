@@ -31,8 +31,18 @@ def read(text: str, where: str) -> Foreign:
         d = fields.coefficients(document, name, (4, 5), where) if kind != 'none' else ()
         distortion = models.opencv_distortion(d)
     else:
-        raise LensError(f'{where}: distortion_model is {kind!r}; equidistant and '
-                        'radial-tangential can be read')
-    return Foreign.from_lenses('EuRoC', {'camera': models.nearest_lens(
-        'camera', fields.numbers(document, 'resolution', 2, where),
-        fields.numbers(document, 'intrinsics', 4, where), distortion, where)})
+        raise LensError(
+            f'{where}: distortion_model is {kind!r}; equidistant and radial-tangential can be read'
+        )
+    return Foreign.from_lenses(
+        'EuRoC',
+        {
+            'camera': models.nearest_lens(
+                'camera',
+                fields.numbers(document, 'resolution', 2, where),
+                fields.numbers(document, 'intrinsics', 4, where),
+                distortion,
+                where,
+            )
+        },
+    )

@@ -36,8 +36,10 @@ def sections(mapping: Mapping[str, Any], name: str, where: str) -> list[Mapping[
 def numbers(mapping: Mapping[str, Any], name: str, count: int, where: str) -> list[float]:
     """Return a list of `count` numbers of a mapping; raise LensError naming the field."""
     values = mapping.get(name)
-    if not isinstance(values, list) or len(values) != count or not all(
-        isinstance(value, int | float) and abs(value) < MAX_NUMBER for value in values
+    if (
+        not isinstance(values, list)
+        or len(values) != count
+        or not all(isinstance(value, int | float) and abs(value) < MAX_NUMBER for value in values)
     ):
         raise LensError(f'{where}: {name} must be a list of {count} finite numbers, is {values!r}')
     return [float(value) for value in values]
@@ -47,8 +49,11 @@ def values(mapping: Mapping[str, Any], names: Sequence[str], where: str) -> list
     """Return numbers of a mapping by their names; raise LensError naming the first missing one."""
     for name in names:
         value = mapping.get(name)
-        if isinstance(value, bool) or not isinstance(value, int | float) or (
-                not abs(value) < MAX_NUMBER):
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or (not abs(value) < MAX_NUMBER)
+        ):
             raise LensError(f'{where}: {name} is {value!r}; a finite number is needed')
     return [float(mapping[name]) for name in names]
 
@@ -60,11 +65,12 @@ def coefficients(
     given = mapping.get(name)
     count = len(given) if isinstance(given, list) else 0
     numbers_given = numbers(mapping, name, count or counts[0], where)
-    if count > counts[-1] and not any(numbers_given[counts[-1]:]):
+    if count > counts[-1] and not any(numbers_given[counts[-1] :]):
         count = counts[-1]
     if count not in counts:
-        raise LensError(f'{where}: {name} has {count} numbers, not '
-                        f'{" or ".join(map(str, counts))}')
+        raise LensError(
+            f'{where}: {name} has {count} numbers, not {" or ".join(map(str, counts))}'
+        )
     return numbers_given[:count]
 
 
@@ -93,15 +99,18 @@ def pose(place: ArrayLike, turn: ArrayLike, where: str) -> Pose:
         rotation = nearest_rotation(given)
         if np.allclose(rotation, given, atol=_SLACK):
             return Pose(rotation, place)
-    raise LensError(f'{where}: a translation and a quaternion of unit length or a rotation matrix '
-                    'are needed')
+    raise LensError(
+        f'{where}: a translation and a quaternion of unit length or a rotation matrix are needed'
+    )
 
 
 def xml(text: str, where: str, form: str) -> ElementTree.Element:
     """Return the root of an XML text; raise LensError for one that is no whole file of a form."""
     if '<!' in text.replace('<!--', '') or len(text) > LARGEST_YAML:
-        raise LensError(f'{where}: not a whole {form} (document types are not read, nor more than '
-                        f'{LARGEST_YAML >> 20} MB)')
+        raise LensError(
+            f'{where}: not a whole {form} (document types are not read, nor more than '
+            f'{LARGEST_YAML >> 20} MB)'
+        )
     try:
         return ElementTree.fromstring(text.lstrip().encode())
     except (ElementTree.ParseError, ValueError, LookupError) as cause:

@@ -26,8 +26,10 @@ def read(text: str, where: str) -> Foreign:
     """Read all cameras and the rigs between them; raises LensError, naming camera and field."""
     document = fields.yaml(text, where)
     # YAML libraries write cam10 before cam2.
-    names = sorted((name for name in map(str, document) if name.startswith('cam')),
-                   key=lambda name: (len(name), name))
+    names = sorted(
+        (name for name in map(str, document) if name.startswith('cam')),
+        key=lambda name: (len(name), name),
+    )
     found = {}
     rigs: list[Pose] = []
     for number, name in enumerate(names):
@@ -35,8 +37,10 @@ def read(text: str, where: str) -> Foreign:
         found[name] = _lens(name, camera, f'{where}: {name}')
         if number and 'T_cn_cnm1' in camera:
             if len(rigs) < number - 1:
-                raise LensError(f'{where}: {names[len(rigs) + 1]} has no T_cn_cnm1, and {name} '
-                                'after it has one; the chain is broken')
+                raise LensError(
+                    f'{where}: {names[len(rigs) + 1]} has no T_cn_cnm1, and {name} '
+                    'after it has one; the chain is broken'
+                )
             rigs.append(_rig(camera['T_cn_cnm1'], f'{where}: {name}'))
     return Foreign.from_lenses('Kalibr', found, rigs)
 
@@ -56,8 +60,11 @@ def _distortion(
 ) -> models.Distortion:
     """Return what the image is distorted by; own: numbers of the model beside the intrinsics."""
     kind = str(camera.get('distortion_model', 'none'))
-    d = fields.coefficients(camera, 'distortion_coeffs', (_COEFFICIENTS[kind],), where) if (
-        _COEFFICIENTS.get(kind)) else []
+    d = (
+        fields.coefficients(camera, 'distortion_coeffs', (_COEFFICIENTS[kind],), where)
+        if (_COEFFICIENTS.get(kind))
+        else []
+    )
     match model, kind:
         case 'pinhole', 'equidistant':
             return models.Distortion(models.EQUIDISTANT, d)
@@ -65,13 +72,16 @@ def _distortion(
             return models.Distortion(models.field_of_view_model(*d))
         case 'pinhole' | 'omni', 'radtan' | 'none':
             return models.opencv_distortion(
-                d, models.omnidirectional(*own) if own else models.PERSPECTIVE)
+                d, models.omnidirectional(*own) if own else models.PERSPECTIVE
+            )
         case 'ds' | 'eucm', 'radtan' | 'none' if not any(d):
             heights = models.double_sphere if model == 'ds' else models.unified_heights
             return models.Distortion(heights(*own))
-    raise LensError(f'{where}: {model} with {kind} is not a form that can be read; those are '
-                    'pinhole with equidistant, fov, radtan or none, omni with radtan or none, ds '
-                    'and eucm')
+    raise LensError(
+        f'{where}: {model} with {kind} is not a form that can be read; those are '
+        'pinhole with equidistant, fov, radtan or none, omni with radtan or none, ds '
+        'and eucm'
+    )
 
 
 def _rig(rows: Any, where: str) -> Pose:

@@ -14,8 +14,12 @@ from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 
 _MARKS = re.compile(r'<calibration[ >].*<(projection|resolution)[ >]', re.DOTALL)
-_BASES = {'frame': models.PERSPECTIVE, 'fisheye': models.EQUIDISTANT,
-          'equidistant_fisheye': models.EQUIDISTANT, 'equisolid_fisheye': models.EQUISOLID}
+_BASES = {
+    'frame': models.PERSPECTIVE,
+    'fisheye': models.EQUIDISTANT,
+    'equidistant_fisheye': models.EQUIDISTANT,
+    'equisolid_fisheye': models.EQUISOLID,
+}
 _NAMES = ('f', 'cx', 'cy', 'b1', 'b2', 'k1', 'k2', 'k3', 'k4', 'p1', 'p2', 'p3', 'p4')
 
 
@@ -27,24 +31,38 @@ def recognises(text: str) -> bool:
 def read(text: str, where: str) -> Foreign:
     """Read the lens, or those of all sensors; raises LensError, naming the field."""
     root = fields.xml(text, where, 'Metashape calibration')
-    found = [root] if root.tag == 'calibration' else [
-        one for one in root.iter('calibration') if one.get('class', 'adjusted') == 'adjusted']
+    found = (
+        [root]
+        if root.tag == 'calibration'
+        else [
+            one for one in root.iter('calibration') if one.get('class', 'adjusted') == 'adjusted'
+        ]
+    )
     if not found:
         raise LensError(f'{where}: no adjusted calibration in it; align the photographs first')
     names = ['camera'] if len(found) == 1 else [f'sensor{i}' for i in range(len(found))]
-    return Foreign.from_lenses('Metashape', {
-        name: _lens(name, one, f'{where}: {name}' if len(found) > 1 else where)
-        for name, one in zip(names, found, strict=True)})
+    return Foreign.from_lenses(
+        'Metashape',
+        {
+            name: _lens(name, one, f'{where}: {name}' if len(found) > 1 else where)
+            for name, one in zip(names, found, strict=True)
+        },
+    )
 
 
 def _lens(name: str, calibration: Element, where: str) -> tuple[Lens, float]:
     projection = calibration.findtext('projection') or calibration.get('type', '')
     if projection not in _BASES:
-        raise LensError(f'{where}: projection is {projection!r}; those that can be read are '
-                        f'{", ".join(_BASES)}')
+        raise LensError(
+            f'{where}: projection is {projection!r}; those that can be read are '
+            f'{", ".join(_BASES)}'
+        )
     resolution = calibration.find('resolution')
-    words = {tag: calibration.findtext(tag) for tag in ('width', 'height')} if (
-        resolution is None) else dict(resolution.attrib)
+    words = (
+        {tag: calibration.findtext(tag) for tag in ('width', 'height')}
+        if (resolution is None)
+        else dict(resolution.attrib)
+    )
     words |= {tag: calibration.findtext(tag, '0') for tag in _NAMES}
     values = {}
     for tag in ('width', 'height', *_NAMES):
@@ -55,7 +73,11 @@ def _lens(name: str, calibration: Element, where: str) -> tuple[Lens, float]:
     width, height = values['width'], values['height']
     f, b1, b2 = values['f'], values['b1'], values['b2']
     distortion = models.Distortion(
-        _BASES[projection], [values[f'k{i}'] for i in range(1, 5)], (),
-        (values['p2'], values['p1']), (values['p3'], values['p4']))
+        _BASES[projection],
+        [values[f'k{i}'] for i in range(1, 5)],
+        (),
+        (values['p2'], values['p1']),
+        (values['p3'], values['p4']),
+    )
     middle = width / 2 + values['cx'] - 0.5, height / 2 + values['cy'] - 0.5
     return models.nearest_lens(name, (width, height), (f + b1, f, *middle, b2), distortion, where)

@@ -42,6 +42,7 @@ class Base(NamedTuple):
 
 def omnidirectional(xi: float) -> Base:
     """Return Mei's heights (Mei and Rives, ICRA 2007); xi 0 is a pinhole."""
+
     def height(theta: Array) -> Array:
         return np.asarray(np.sin(theta) / (np.cos(theta) + xi))
 
@@ -50,6 +51,7 @@ def omnidirectional(xi: float) -> Base:
 
 def double_sphere(xi: float, alpha: float) -> Base:
     """Return the double sphere's heights (Usenko, Demmel, Cremers, 3DV 2018)."""
+
     def height(theta: Array) -> Array:
         z = np.cos(theta) + xi
         return np.asarray(np.sin(theta) / (alpha * np.hypot(np.sin(theta), z) + (1 - alpha) * z))
@@ -59,6 +61,7 @@ def double_sphere(xi: float, alpha: float) -> Base:
 
 def unified_heights(alpha: float, beta: float) -> Base:
     """Return the heights of the extended unified model (Khomutenko et al., RA-L 2016)."""
+
     def height(theta: Array) -> Array:
         sin, cos = np.sin(theta), np.cos(theta)
         return np.asarray(sin / (alpha * np.sqrt(beta * sin**2 + cos**2) + (1 - alpha) * cos))
@@ -68,6 +71,7 @@ def unified_heights(alpha: float, beta: float) -> Base:
 
 def field_of_view_model(omega: float) -> Base:
     """Return the heights of the FOV model (Devernay and Faugeras, MVA 2001); omega in rad."""
+
     def height(theta: Array) -> Array:
         return np.asarray(np.arctan(2 * np.tan(theta) * np.tan(omega / 2)) / omega)
 
@@ -76,6 +80,7 @@ def field_of_view_model(omega: float) -> Base:
 
 def division(k: float) -> Base:
     """Return the heights of the division model (Fitzgibbon, CVPR 2001), of one coefficient."""
+
     def height(theta: Array) -> Array:
         slope = np.tan(theta)
         return np.asarray(2 * slope / (1 + np.sqrt(1 - 4 * k * slope**2)))
@@ -107,8 +112,11 @@ class Distortion:
     @property
     def is_kannala_brandt(self) -> bool:
         """Whether Kannala-Brandt has the same radial curve."""
-        return self.base is EQUIDISTANT and not any(self.below) and not any(
-            self.stretch[RADIAL_TERMS:])
+        return (
+            self.base is EQUIDISTANT
+            and not any(self.below)
+            and not any(self.stretch[RADIAL_TERMS:])
+        )
 
     @property
     def sideways(self) -> bool:
@@ -130,9 +138,16 @@ class Distortion:
         z, (p1, p2) = x * x + y * y, self.tangential
         along_u, along_v = (_powers(coefficients, z) for coefficients in self.prism)
         grown = 1 + _powers(self.growth, z)
-        return np.asarray(stretched + np.stack([
-            (2 * p1 * x * y + p2 * (z + 2 * x * x)) * grown + along_u,
-            (p1 * (z + 2 * y * y) + 2 * p2 * x * y) * grown + along_v], axis=-1))
+        return np.asarray(
+            stretched
+            + np.stack(
+                [
+                    (2 * p1 * x * y + p2 * (z + 2 * x * x)) * grown + along_u,
+                    (p1 * (z + 2 * y * y) + 2 * p2 * x * y) * grown + along_v,
+                ],
+                axis=-1,
+            )
+        )
 
 
 def _powers(coefficients: Sequence[float], z: Array) -> Array:
@@ -155,7 +170,10 @@ def opencv_distortion(d: Sequence[float], base: Base = PERSPECTIVE) -> Distortio
 
 
 def nearest_lens(
-    name: str, size: Sequence[float], intrinsics: Sequence[float], distortion: Distortion,
+    name: str,
+    size: Sequence[float],
+    intrinsics: Sequence[float],
+    distortion: Distortion,
     where: str,
 ) -> tuple[Lens, float]:
     """Return the lens nearest to a distorted image, and its worst deviation, px; 0: none.
@@ -169,8 +187,9 @@ def nearest_lens(
         k = (*distortion.stretch, *[0.0] * RADIAL_TERMS)[:RADIAL_TERMS]
         lens, worst = kannala_brandt(name, size, (fx, fy, cx, cy), k, where), 0.0
     else:
-        lens, worst = fit_curve(name, size, (fx, fy, cx, cy), distortion.height,
-                                    distortion.base.limit, where)
+        lens, worst = fit_curve(
+            name, size, (fx, fy, cx, cy), distortion.height, distortion.base.limit, where
+        )
     if distortion.sideways:
         lens, worst = _fit_corrections(lens, (fx, fy), distortion, worst)
     if skew:
@@ -193,8 +212,9 @@ def _fit_corrections(
 
     focal: of the distorted image, px; worst: deviation of the curve, px.
     """
-    theta, azimuth = np.meshgrid(np.linspace(0, lens.max_incidence, _STEPS)[1:],
-                                 np.linspace(0, 2 * np.pi, _STEPS))
+    theta, azimuth = np.meshgrid(
+        np.linspace(0, lens.max_incidence, _STEPS)[1:], np.linspace(0, 2 * np.pi, _STEPS)
+    )
     uv = distortion.project(theta, azimuth) * focal + (lens.cx, lens.cy)
     sin = np.sin(theta)
     points = np.stack([sin * np.cos(azimuth), sin * np.sin(azimuth), np.cos(theta)], axis=-1)
@@ -211,14 +231,22 @@ def _fit_corrections(
     columns = np.concatenate([effect.columns(scene) for effect in effects], axis=-1)[0]
     found = np.linalg.lstsq(columns.reshape(len(points) * 2, -1), (uv - ideal).ravel(), rcond=None)
     parts = np.split(found[0], range(2, 2 * len(effects), 2))
-    lens = replace(lens, corrections={
-        effect.name: effect.to_dict(part) for effect, part in zip(effects, parts, strict=True)})
+    lens = replace(
+        lens,
+        corrections={
+            effect.name: effect.to_dict(part) for effect, part in zip(effects, parts, strict=True)
+        },
+    )
     return lens, float(np.abs(project(lens, points).uv - uv).max())
 
 
 def kannala_brandt(
-    name: str, size: Sequence[float], intrinsics: Sequence[float], k: Sequence[float],
-    where: str, shift: ViewpointShift | None = None,
+    name: str,
+    size: Sequence[float],
+    intrinsics: Sequence[float],
+    k: Sequence[float],
+    where: str,
+    shift: ViewpointShift | None = None,
 ) -> Lens:
     """Build a lens: size (width, height); intrinsics fx, fy, cx, cy; raise LensError for none."""
     try:
@@ -230,8 +258,19 @@ def kannala_brandt(
         raise LensError(f'{where}: k1 to k4 are {curve.coefficients}; no real lens has these')
     if not (width.is_integer() and height.is_integer()):
         raise LensError(f'{where}: the image size is {width} x {height}; whole numbers are needed')
-    lens = Lens(name, int(width), int(height), fx, fy, cx, cy, curve, np.nan, shift,
-                calibration={'source': where})
+    lens = Lens(
+        name,
+        int(width),
+        int(height),
+        fx,
+        fy,
+        cx,
+        cy,
+        curve,
+        np.nan,
+        shift,
+        calibration={'source': where},
+    )
     wrong = lens.check()
     if wrong:
         raise LensError(f'{where}: {wrong}')
@@ -239,8 +278,13 @@ def kannala_brandt(
 
 
 def fit_curve(
-    name: str, size: Sequence[float], intrinsics: Sequence[float], curve: Curve, limit: float,
-    where: str, shift: ViewpointShift | None = None,
+    name: str,
+    size: Sequence[float],
+    intrinsics: Sequence[float],
+    curve: Curve,
+    limit: float,
+    where: str,
+    shift: ViewpointShift | None = None,
 ) -> tuple[Lens, float]:
     """Return the Kannala-Brandt lens nearest to a radial curve, and its worst deviation, px.
 
@@ -267,8 +311,14 @@ def fit_curve(
     if not scale > 0:
         raise LensError(f'{where}: no fisheye curve fits the projection')
     worst = float(np.abs(powers @ [scale, *rest] - heights).max() * max(fx, fy))
-    lens = kannala_brandt(name, size, (scale * fx, scale * fy, cx, cy),
-                          [value / scale for value in rest], where, shift)
+    lens = kannala_brandt(
+        name,
+        size,
+        (scale * fx, scale * fy, cx, cy),
+        [value / scale for value in rest],
+        where,
+        shift,
+    )
     return replace(lens, max_incidence=min(lens.max_incidence, float(theta[-1]))), worst
 
 
@@ -278,11 +328,19 @@ def nearest_kannala_brandt(lens: Lens) -> Lens:
         return lens
     value = lens.image_height.value_and_slope
     found, worst = fit_curve(
-        lens.name, (lens.width, lens.height), (lens.fx, lens.fy, lens.cx, lens.cy),
-        lambda theta: value(theta)[0], lens.max_incidence, lens.name, lens.viewpoint_shift)
+        lens.name,
+        (lens.width, lens.height),
+        (lens.fx, lens.fy, lens.cx, lens.cy),
+        lambda theta: value(theta)[0],
+        lens.max_incidence,
+        lens.name,
+        lens.viewpoint_shift,
+    )
     if worst > _TOLERANCE:
-        raise LensError(f'lens {lens.name!r}: its curve is {worst:.2g} px from any curve of this '
-                        'format; calibrate it as kannala_brandt')
+        raise LensError(
+            f'lens {lens.name!r}: its curve is {worst:.2g} px from any curve of this '
+            'format; calibrate it as kannala_brandt'
+        )
     return found
 
 

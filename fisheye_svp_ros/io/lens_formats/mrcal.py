@@ -30,7 +30,8 @@ from fisheye_svp_ros.optics.lens import Lens
 
 recognises = re.compile('[\'"]LENSMODEL_').search
 _LINEARITY = re.compile(
-    r'LENSMODEL_CAHVORE_linearity=([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)$')
+    r'LENSMODEL_CAHVORE_linearity=([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)$'
+)
 # Those of cv2.calibrateCamera, and how many coefficients follow fx, fy, cx and cy
 _PERSPECTIVE = {'LENSMODEL_PINHOLE': 0} | {f'LENSMODEL_OPENCV{n}': n for n in (4, 5, 8)}
 _STEREOGRAPHIC = 'LENSMODEL_STEREOGRAPHIC'
@@ -56,8 +57,16 @@ def read(text: str, where: str) -> Foreign:
         model = str(document.get('lensmodel', document.get('lens_model')))
         values = [float(value) for value in document['intrinsics']]
         size = [int(value) for value in document['imagersize']]
-    except (AttributeError, LookupError, SyntaxError, TypeError, ValueError, MemoryError,
-            RecursionError, OverflowError) as cause:
+    except (
+        AttributeError,
+        LookupError,
+        SyntaxError,
+        TypeError,
+        ValueError,
+        MemoryError,
+        RecursionError,
+        OverflowError,
+    ) as cause:
         raise LensError(f'{where}: not a whole .cameramodel ({cause})'.splitlines()[0]) from cause
     match = _LINEARITY.match(model)
     needed = _OF_CAHVORE if match else _COUNTS.get(model, len(values))
@@ -69,15 +78,25 @@ def read(text: str, where: str) -> Foreign:
         lens = _read_splined(model, values, size, where)
         return Foreign('mrcal', {'camera': lens}, (), {})
     if model in _PERSPECTIVE:
-        return Foreign.from_lenses('mrcal', {'camera': models.nearest_lens(
-            'camera', size, values[:4], models.opencv_distortion(values[4:]), where)})
+        return Foreign.from_lenses(
+            'mrcal',
+            {
+                'camera': models.nearest_lens(
+                    'camera', size, values[:4], models.opencv_distortion(values[4:]), where
+                )
+            },
+        )
     if match is None:
-        raise LensError(f'{where}: lensmodel is {model}; CAHVORE with its linearity, '
-                        'STEREOGRAPHIC, SPLINED_STEREOGRAPHIC, PINHOLE and OPENCV4 to 8 can be '
-                        'read')
+        raise LensError(
+            f'{where}: lensmodel is {model}; CAHVORE with its linearity, '
+            'STEREOGRAPHIC, SPLINED_STEREOGRAPHIC, PINHOLE and OPENCV4 to 8 can be '
+            'read'
+        )
     if max(map(abs, values[4:6])) > _AXIS:
-        raise LensError(f'{where}: the axis of its CAHVORE is not square to the image (alpha, '
-                        'beta); that is not supported')
+        raise LensError(
+            f'{where}: the axis of its CAHVORE is not square to the image (alpha, '
+            'beta); that is not supported'
+        )
     linearity, r = float(match[1]), values[6:9]
 
     def curve(theta: Array) -> Array:
@@ -86,8 +105,10 @@ def read(text: str, where: str) -> Foreign:
 
     shift = Gennery(0.0, *values[9:12]) if any(values[9:12]) else None
     limit = np.pi / 2 / abs(linearity) * (1 - 1e-3) if abs(linearity) > 0.5 else np.pi * 0.999
-    return Foreign.from_lenses('mrcal', {
-        'camera': models.fit_curve('camera', size, values[:4], curve, limit, where, shift)})
+    return Foreign.from_lenses(
+        'mrcal',
+        {'camera': models.fit_curve('camera', size, values[:4], curve, limit, where, shift)},
+    )
 
 
 def _chi(theta: Array, linearity: float) -> Array:
@@ -100,7 +121,8 @@ def _chi(theta: Array, linearity: float) -> Array:
 def _read_stereographic(size: list[int], values: list[float], where: str) -> Foreign:
     value = Stereographic().value_and_slope
     lens, _ = models.fit_curve(
-        'camera', size, values, lambda theta: value(theta)[0], np.pi * 0.9, where)
+        'camera', size, values, lambda theta: value(theta)[0], np.pi * 0.9, where
+    )
     lens = replace(lens, fx=values[0], fy=values[1], image_height=Stereographic())
     return Foreign('mrcal', {'camera': lens}, (), {})
 
@@ -120,26 +142,44 @@ def write(lens: Lens) -> str:
     if shift is None and (lens.image_field is not None or worst > _TOLERANCE):
         return _document(*_fit_splined(lens), (0.0, 0.0, 0.0), lens)
     if worst > _TOLERANCE:
-        raise LensError(f'lens {lens.name!r}: its curve is {worst:.2g} px from any CAHVORE, and '
-                        'mrcal has no other fisheye model with a viewpoint shift; --range writes '
-                        'it for one distance, without the shift')
+        raise LensError(
+            f'lens {lens.name!r}: its curve is {worst:.2g} px from any CAHVORE, and '
+            'mrcal has no other fisheye model with a viewpoint shift; --range writes '
+            'it for one distance, without the shift'
+        )
     if shift is not None and not isinstance(shift, Gennery):
         raise LensError(f'lens {lens.name!r}: CAHVORE has no viewpoint shift but gennery')
     e = [shift.e0, shift.e1, shift.e2] if shift is not None else [0.0] * 3
-    intrinsics = [lens.fx, lens.fy, lens.cx, lens.cy, 0.0, 0.0,
-                  float(terms[0]) - 1, *map(float, terms[1:]), *e]
+    intrinsics = [
+        lens.fx,
+        lens.fy,
+        lens.cx,
+        lens.cy,
+        0.0,
+        0.0,
+        float(terms[0]) - 1,
+        *map(float, terms[1:]),
+        *e,
+    ]
     # A constant part of the shift is where the camera stands.
     place = (0.0, 0.0, -shift.s0 if shift is not None else 0.0)
     return _document('LENSMODEL_CAHVORE_linearity=0', intrinsics, place, lens)
 
 
-def _document(
-    model: str, intrinsics: list[float], place: tuple[float, ...], lens: Lens
-) -> str:
-    return ('{\n' + ''.join(f'    {key!r}: {value!r},\n' for key, value in (
-        ('lensmodel', model), ('intrinsics', intrinsics),
-        ('extrinsics', [0.0, 0.0, 0.0, *place]), ('imagersize', [lens.width, lens.height]),
-    )) + '}\n')
+def _document(model: str, intrinsics: list[float], place: tuple[float, ...], lens: Lens) -> str:
+    return (
+        '{\n'
+        + ''.join(
+            f'    {key!r}: {value!r},\n'
+            for key, value in (
+                ('lensmodel', model),
+                ('intrinsics', intrinsics),
+                ('extrinsics', [0.0, 0.0, 0.0, *place]),
+                ('imagersize', [lens.width, lens.height]),
+            )
+        )
+        + '}\n'
+    )
 
 
 def _read_splined(model: str, values: Sequence[float], size: Sequence[int], where: str) -> Lens:
@@ -148,10 +188,15 @@ def _read_splined(model: str, values: Sequence[float], size: Sequence[int], wher
     if match is None or match[1] != '3':
         raise LensError(f'{where}: {model} cannot be read; its splines must be of order 3')
     columns, rows, degrees = (int(match[i]) for i in (2, 3, 4))
-    if not (min(rows, columns) >= MIN_NODES and max(rows, columns) <= MAX_NODES
-            and 0 < degrees < 360 and len(values) == 4 + 2 * rows * columns):
-        raise LensError(f'{where}: {model} with {len(values)} values; it needs '
-                        f'{4 + 2 * rows * columns}')
+    if not (
+        min(rows, columns) >= MIN_NODES
+        and max(rows, columns) <= MAX_NODES
+        and 0 < degrees < 360
+        and len(values) == 4 + 2 * rows * columns
+    ):
+        raise LensError(
+            f'{where}: {model} with {len(values)} values; it needs {4 + 2 * rows * columns}'
+        )
     focal, centre = np.array(values[:2]), np.array(values[2:4])
     pitch = focal * _spacing(columns, degrees)
     low = centre - pitch * (np.array([columns, rows]) - 1) / 2
@@ -159,15 +204,17 @@ def _read_splined(model: str, values: Sequence[float], size: Sequence[int], wher
     # The spline holds between the second node and the last but one.
     steps = (np.arange(1.0, count - 1.75, 0.25) for count in (columns, rows))
     ideal = low + pitch * np.stack(np.meshgrid(*steps), axis=-1)
-    shown = ((np.abs(field.apply(ideal) + 0.5 - np.array(size) / 2) <= np.array(size) / 2)
-             .all(axis=-1))
+    shown = (np.abs(field.apply(ideal) + 0.5 - np.array(size) / 2) <= np.array(size) / 2).all(
+        axis=-1
+    )
     if not shown.any():
         raise LensError(f'{where}: {model}: no point of it is in the image')
     reach = np.linalg.norm((ideal[shown] - centre) / focal, axis=-1).max()
     theta = float(Stereographic().angle(np.asarray(reach)))
     fx, fy, cx, cy = values[:4]
-    lens = Lens('camera', size[0], size[1], fx, fy, cx, cy, Stereographic(), theta,
-                image_field=field)
+    lens = Lens(
+        'camera', size[0], size[1], fx, fy, cx, cy, Stereographic(), theta, image_field=field
+    )
     if wrong := lens.check():
         raise LensError(f'{where}: {wrong}')
     return lens
@@ -181,8 +228,10 @@ def _fit_splined(lens: Lens) -> tuple[str, list[float]]:
         if worst < _TOLERANCE:
             focal = [lens.fx, lens.fy]
             return model, [*focal, lens.cx, lens.cy, *(field.values / focal).ravel().tolist()]
-    raise LensError(f'lens {lens.name!r}: its image is {worst:.2g} px from any splined model of '
-                    f'{_NODES[-1]} nodes')
+    raise LensError(
+        f'lens {lens.name!r}: its image is {worst:.2g} px from any splined model of '
+        f'{_NODES[-1]} nodes'
+    )
 
 
 def _fit_nodes(lens: Lens, columns: int) -> tuple[str, ImageField, float]:
@@ -191,8 +240,10 @@ def _fit_nodes(lens: Lens, columns: int) -> tuple[str, ImageField, float]:
     from scipy.sparse.linalg import splu
 
     count = _SAMPLES * columns
-    uv = np.stack(np.meshgrid(np.linspace(0, lens.width - 1, count),
-                              np.linspace(0, lens.height - 1, count)), axis=-1).reshape(-1, 2)
+    uv = np.stack(
+        np.meshgrid(np.linspace(0, lens.width - 1, count), np.linspace(0, lens.height - 1, count)),
+        axis=-1,
+    ).reshape(-1, 2)
     rays = back_project(lens, uv)
     uv, way = uv[rays.valid], rays.direction[rays.valid]
     # tan(theta / 2) = sin / (1 + cos)
@@ -200,8 +251,10 @@ def _fit_nodes(lens: Lens, columns: int) -> tuple[str, ImageField, float]:
     edge = np.abs(plane).max(axis=0)
     degrees = int(np.ceil(np.degrees(4 * np.arctan(edge[0] / 2))))
     if degrees >= 360:
-        raise LensError(f'lens {lens.name!r}: a splined model cannot reach its max_incidence_deg, '
-                        'so far behind the camera')
+        raise LensError(
+            f'lens {lens.name!r}: a splined model cannot reach its max_incidence_deg, '
+            'so far behind the camera'
+        )
     spacing = _spacing(columns, degrees)
     rows = int(np.ceil(2 * edge[1] / spacing)) + _MARGIN_NODES
     focal, centre = np.array([lens.fx, lens.fy]), np.array([lens.cx, lens.cy])
@@ -211,7 +264,8 @@ def _fit_nodes(lens: Lens, columns: int) -> tuple[str, ImageField, float]:
     weight, node = empty.weights(ideal)
     design: Any = sparse.csr_array(
         (weight.ravel(), (np.repeat(np.arange(len(uv)), weight.shape[1]), node.ravel())),
-        (len(uv), rows * columns))
+        (len(uv), rows * columns),
+    )
     normal = design.T @ design + _RIDGE * sparse.csr_array(sparse.eye(rows * columns))
     values: Array = splu(normal.tocsc()).solve(design.T @ (uv - ideal))
     field = replace(empty, values=values.reshape(rows, columns, 2))

@@ -27,22 +27,29 @@ def read(text: str, where: str) -> Foreign:
     document = parse_json(text, where, LensError)
     shared = {key: document[key] for key in _KEYS if key in document}
     frames = document.get('frames')
-    given = [{key: frame[key] for key in _KEYS if key in frame} | shared
-             for frame in (frames if isinstance(frames, list) else []) if isinstance(frame, dict)]
+    given = [
+        {key: frame[key] for key in _KEYS if key in frame} | shared
+        for frame in (frames if isinstance(frames, list) else [])
+        if isinstance(frame, dict)
+    ]
     different = list({json.dumps(one): one for one in given}.values()) or [shared]
     if len(different) == 1:
         found = {'camera': _lens('camera', different[0], where)}
     else:
-        found = {f'camera{i}': _lens(f'camera{i}', one, f'{where}: camera{i}')
-                 for i, one in enumerate(different, start=1)}
+        found = {
+            f'camera{i}': _lens(f'camera{i}', one, f'{where}: camera{i}')
+            for i, one in enumerate(different, start=1)
+        }
     return Foreign.from_lenses('nerfstudio', found)
 
 
 def _lens(name: str, given: Mapping[str, Any], where: str) -> tuple[Lens, float]:
     model = given.get('camera_model', _FISHEYE if given.get('is_fisheye') else 'OPENCV')
     if model != _FISHEYE and model not in _PERSPECTIVE:
-        raise LensError(f'{where}: camera_model is {model!r}; those that can be read are '
-                        f'{", ".join((_FISHEYE, *_PERSPECTIVE))}')
+        raise LensError(
+            f'{where}: camera_model is {model!r}; those that can be read are '
+            f'{", ".join((_FISHEYE, *_PERSPECTIVE))}'
+        )
     size = fields.values(given, ('w', 'h'), where)
     fx, cx, cy = fields.values(given, ('fl_x', 'cx', 'cy'), where)
     fy = fields.values(given, ('fl_y',), where)[0] if 'fl_y' in given else fx
@@ -50,7 +57,8 @@ def _lens(name: str, given: Mapping[str, Any], where: str) -> tuple[Lens, float]
     values = dict(zip(names, fields.values(given, names, where), strict=True))
     if model == _FISHEYE:
         distortion = models.Distortion(
-            models.EQUIDISTANT, [values.get(key, 0.0) for key in _NAMES[:4]])
+            models.EQUIDISTANT, [values.get(key, 0.0) for key in _NAMES[:4]]
+        )
     else:
         distortion = models.brown(models.PERSPECTIVE, values)
     return models.nearest_lens(name, size, (fx, fy, cx - _CORNER, cy - _CORNER), distortion, where)
@@ -59,8 +67,20 @@ def _lens(name: str, given: Mapping[str, Any], where: str) -> tuple[Lens, float]
 def write(lens: Lens) -> str:
     """Return the lens in this form, without frames."""
     near = models.nearest_kannala_brandt(lens)
-    return json.dumps({
-        'camera_model': _FISHEYE, 'w': near.width, 'h': near.height,
-        'fl_x': near.fx, 'fl_y': near.fy, 'cx': near.cx + _CORNER, 'cy': near.cy + _CORNER,
-        **dict(zip(_NAMES, models.coefficients(near), strict=False)), 'frames': [],
-    }, indent=4) + '\n'
+    return (
+        json.dumps(
+            {
+                'camera_model': _FISHEYE,
+                'w': near.width,
+                'h': near.height,
+                'fl_x': near.fx,
+                'fl_y': near.fy,
+                'cx': near.cx + _CORNER,
+                'cy': near.cy + _CORNER,
+                **dict(zip(_NAMES, models.coefficients(near), strict=False)),
+                'frames': [],
+            },
+            indent=4,
+        )
+        + '\n'
+    )

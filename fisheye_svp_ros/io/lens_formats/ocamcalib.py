@@ -30,27 +30,44 @@ def read(text: str, where: str) -> Foreign:
     """Read the lens; raises LensError, naming the line that is missing."""
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != '#']
     if len(lines) < len(_LINES):
-        raise LensError(f'{where}: {_LINES[len(lines)]} is missing; calib_results.txt of '
-                        'OCamCalib has five lines of numbers')
+        raise LensError(
+            f'{where}: {_LINES[len(lines)]} is missing; calib_results.txt of '
+            'OCamCalib has five lines of numbers'
+        )
     try:
         rows = [np.array([float(word) for word in line.split()]) for line in lines]
         direct, (row, column) = rows[0], rows[2]
         (c, d, e), (height, width) = rows[3], rows[4]
     except ValueError as cause:
         raise LensError(f'{where}: not a whole calib_results.txt ({cause})') from cause
-    if len(direct) < 2 or len(direct) != 1 + direct[0] or not (
-            np.abs(np.concatenate(rows)) < MAX_NUMBER).all() or not direct[1] < 0:
-        raise LensError(f'{where}: the direct polynomial must have as many coefficients as its '
-                        'first number says, and begin below 0')
+    if (
+        len(direct) < 2
+        or len(direct) != 1 + direct[0]
+        or not (np.abs(np.concatenate(rows)) < MAX_NUMBER).all()
+        or not direct[1] < 0
+    ):
+        raise LensError(
+            f'{where}: the direct polynomial must have as many coefficients as its '
+            'first number says, and begin below 0'
+        )
     # What remains when a turn about the axis is taken out of the affine part
     cos, sin = np.array([c, d]) / np.hypot(c, d)
     fx, fy, skew = cos - sin * e, np.hypot(c, d), sin + cos * e
     focal = float(-direct[1])
     farthest = 2 * float(np.hypot(max(row, height - row), max(column, width - column)))
     base = _heights(direct[1:], farthest)
-    return Foreign.from_lenses('OCamCalib', {'camera': models.nearest_lens(
-        'camera', (width, height), (focal * fx, focal * fy, column, row, focal * skew),
-        models.Distortion(base), where)})
+    return Foreign.from_lenses(
+        'OCamCalib',
+        {
+            'camera': models.nearest_lens(
+                'camera',
+                (width, height),
+                (focal * fx, focal * fy, column, row, focal * skew),
+                models.Distortion(base),
+                where,
+            )
+        },
+    )
 
 
 def _heights(direct: Array, farthest: float) -> models.Base:
@@ -59,13 +76,15 @@ def _heights(direct: Array, farthest: float) -> models.Base:
     theta = np.arctan2(rho, -np.polynomial.polynomial.polyval(rho, direct))
     falls = np.diff(theta) <= 0
     last = int(np.argmax(falls)) if falls.any() else _SAMPLES - 1
-    rho, theta = rho[:last + 1], theta[:last + 1]
+    rho, theta = rho[: last + 1], theta[: last + 1]
 
     def height(angle: Array) -> Array:
         found = np.interp(angle, theta, rho)
         for _ in range(4):  # Newton's method: rho cos(angle) + f(rho) sin(angle) = 0
-            value, slope = (np.polynomial.polynomial.polyval(found, p)
-                            for p in (direct, np.polynomial.polynomial.polyder(direct)))
+            value, slope = (
+                np.polynomial.polynomial.polyval(found, p)
+                for p in (direct, np.polynomial.polynomial.polyder(direct))
+            )
             sin, cos = np.sin(angle), np.cos(angle)
             found = found - (found * cos + value * sin) / (cos + slope * sin)
         return np.asarray(found / -direct[0])

@@ -20,8 +20,14 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
 _MATRIX = ('camera_matrix', 'cameraMatrix', 'Camera_Matrix', 'K', 'K1', 'M1', 'cameraMatrix1')
-_COEFFICIENTS = ('distortion_coefficients', 'Distortion_Coefficients', 'distCoeffs', 'D', 'D1',
-                 'distCoeffs1')
+_COEFFICIENTS = (
+    'distortion_coefficients',
+    'Distortion_Coefficients',
+    'distCoeffs',
+    'D',
+    'D1',
+    'distCoeffs1',
+)
 _RIGHT_KEYS = ('K2', 'M2', 'cameraMatrix2'), ('D2', 'distCoeffs2')
 _WIDTH, _HEIGHT = ('image_width', 'width', 'image_Width'), ('image_height', 'height')
 _XI, _OF_FISHEYE = 'xi', 4
@@ -33,8 +39,11 @@ _SIZE = ('image_size', 'imageSize', 'size')
 def recognises(text: str) -> bool:
     """Say whether a text is such a file."""
     start = text.lstrip()
-    return (start.startswith('%YAML') or '<opencv_storage>' in text
-            or (start.startswith('{') and '"opencv-matrix"' in text))
+    return (
+        start.startswith('%YAML')
+        or '<opencv_storage>' in text
+        or (start.startswith('{') and '"opencv-matrix"' in text)
+    )
 
 
 def read(text: str, where: str) -> Foreign:
@@ -78,22 +87,29 @@ def _distortion(d: Sequence[float], document: Mapping[str, Any], where: str) -> 
     """Four coefficients are those of cv2.fisheye, with xi of cv2.omnidir; more, of a pinhole."""
     if _XI in document:
         given = document[_XI]
-        xi = _matrix(given, ((1, 1),), where)[0] if isinstance(given, dict) else (
-            fields.values(document, (_XI,), where)[0])
+        xi = (
+            _matrix(given, ((1, 1),), where)[0]
+            if isinstance(given, dict)
+            else (fields.values(document, (_XI,), where)[0])
+        )
         return models.opencv_distortion(d, models.omnidirectional(xi))
     if len(d) == _OF_FISHEYE and document.get(_IS_FISHEYE, 1):
         return models.Distortion(models.EQUIDISTANT, d)
-    if any(d[len(models.OPENCV):]):
-        raise LensError(f'{where}: {len(d)} coefficients, with a thin prism or a tilt; the four '
-                        'of cv2.fisheye, or five or eight of cv2.calibrateCamera can be read')
+    if any(d[len(models.OPENCV) :]):
+        raise LensError(
+            f'{where}: {len(d)} coefficients, with a thin prism or a tilt; the four '
+            'of cv2.fisheye, or five or eight of cv2.calibrateCamera can be read'
+        )
     return models.opencv_distortion(d)
 
 
 def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[float]:
     """Return the numbers of a matrix of one of some shapes, row by row."""
     if not isinstance(value, dict) or (value.get('rows'), value.get('cols')) not in shapes:
-        raise LensError(f'{where}: a matrix of 3 x 3 and the four coefficients of cv2.fisheye are '
-                        'needed (of a rig R, 3 x 3, and T, 3 x 1)')
+        raise LensError(
+            f'{where}: a matrix of 3 x 3 and the four coefficients of cv2.fisheye are '
+            'needed (of a rig R, 3 x 3, and T, 3 x 1)'
+        )
     return fields.numbers(value, 'data', value['rows'] * value['cols'], where)
 
 
@@ -101,7 +117,8 @@ def _from_xml(text: str, where: str) -> dict[str, Any]:
     """Return the numbers, lists and matrices of a FileStorage in XML by name."""
     return {
         one.tag: {part.tag: _parse_numbers(part.text, part.tag == 'data') for part in one}
-        if one.get('type_id') == 'opencv-matrix' else _parse_numbers(one.text, False)
+        if one.get('type_id') == 'opencv-matrix'
+        else _parse_numbers(one.text, False)
         for one in fields.xml(text, where, 'OpenCV file')
     }
 

@@ -24,20 +24,23 @@ _STEREO = ('Stereo.T_c1_c2', 'Tlr')
 def read(text: str, where: str) -> Foreign:
     """Read one lens or two and the rig; raises LensError, naming the field."""
     document = fields.yaml(text, where)
-    prefixes = {camera: next((p for p in known if f'{p}fx' in document), '')
-                for camera, known in _CAMERAS.items()}
+    prefixes = {
+        camera: next((p for p in known if f'{p}fx' in document), '')
+        for camera, known in _CAMERAS.items()
+    }
     if not prefixes['right']:
         return Foreign.from_lenses(
-            'ORB-SLAM3', {'camera': _lens('camera', prefixes['left'], document, where)})
-    found = {camera: _lens(camera, prefix, document, f'{where}: {prefix.rstrip(".")}')
-             for camera, prefix in prefixes.items()}
+            'ORB-SLAM3', {'camera': _lens('camera', prefixes['left'], document, where)}
+        )
+    found = {
+        camera: _lens(camera, prefix, document, f'{where}: {prefix.rstrip(".")}')
+        for camera, prefix in prefixes.items()
+    }
     rigs = tuple(_rig(document[name], f'{where}: {name}') for name in _STEREO if name in document)
     return Foreign.from_lenses('ORB-SLAM3', found, rigs[:1])
 
 
-def _lens(
-    name: str, prefix: str, document: Mapping[str, Any], where: str
-) -> tuple[Lens, float]:
+def _lens(name: str, prefix: str, document: Mapping[str, Any], where: str) -> tuple[Lens, float]:
     def values(*names: str) -> list[float]:
         return fields.values(document, [f'{prefix}{name}' for name in names], where)
 
@@ -49,10 +52,12 @@ def _lens(
     elif kind == 'PinHole':
         names = [name for name in models.OPENCV if f'{prefix}{name}' in document]
         distortion = models.brown(
-            models.PERSPECTIVE, dict(zip(names, values(*names), strict=True)))
+            models.PERSPECTIVE, dict(zip(names, values(*names), strict=True))
+        )
     else:
-        raise LensError(f'{where}: Camera.type is {kind!r}; KannalaBrandt8 and PinHole can be '
-                        'read')
+        raise LensError(
+            f'{where}: Camera.type is {kind!r}; KannalaBrandt8 and PinHole can be read'
+        )
     return models.nearest_lens(name, size, intrinsics, distortion, where)
 
 

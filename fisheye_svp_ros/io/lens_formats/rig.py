@@ -31,12 +31,19 @@ def read(text: str, where: str) -> Foreign:
     names, rigs = _steps(parse_yaml(text, where, LensError)), []
     for name, entry in names.items():
         place = f'{where}: {name}'
-        rigs.append(fields.pose(fields.numbers(entry, 'position', 3, place),
-                                fields.numbers(entry, 'quaternion', 4, place), place))
+        rigs.append(
+            fields.pose(
+                fields.numbers(entry, 'position', 3, place),
+                fields.numbers(entry, 'quaternion', 4, place),
+                place,
+            )
+        )
     cameras = cameras_of(list(names))
     if not cameras:
-        raise LensError(f'{where}: {", ".join(names)} are no chain; each must begin with the '
-                        'camera in which the one before ends')
+        raise LensError(
+            f'{where}: {", ".join(names)} are no chain; each must begin with the '
+            'camera in which the one before ends'
+        )
     return Foreign('rig', {}, tuple(rigs), {}, cameras)
 
 
@@ -52,7 +59,7 @@ def cameras_of(keys: Sequence[str]) -> tuple[str, ...]:
     """
     first, *others = keys
     for place in (match.start() for match in re.finditer(f'(?={SEPARATOR})', first)):
-        cameras = [first[:place], first[place + len(SEPARATOR):]]
+        cameras = [first[:place], first[place + len(SEPARATOR) :]]
         for key in others:
             if not key.startswith(cameras[-1] + SEPARATOR):
                 break
@@ -64,5 +71,8 @@ def cameras_of(keys: Sequence[str]) -> tuple[str, ...]:
 
 def _steps(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the entries that hold a pose."""
-    return {str(name): entry for name, entry in document.items()
-            if SEPARATOR in str(name) and isinstance(entry, dict) and 'position' in entry}
+    return {
+        str(name): entry
+        for name, entry in document.items()
+        if SEPARATOR in str(name) and isinstance(entry, dict) and 'position' in entry
+    }

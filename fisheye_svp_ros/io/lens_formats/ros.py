@@ -49,8 +49,10 @@ def read(text: str, where: str) -> Foreign:
         if 'distortion_model' not in document:
             other = document.get('camera_model')
             instead = f' in place of camera_model: {other}' if other else ''
-            raise LensError(f'{where}: distortion_model is missing; a fisheye camera_info has '
-                            f'distortion_model: equidistant{instead}')
+            raise LensError(
+                f'{where}: distortion_model is missing; a fisheye camera_info has '
+                f'distortion_model: equidistant{instead}'
+            )
         model = str(document['distortion_model'])
         d = document['distortion_coefficients']['data']
         d = fields.numbers({'data': d}, 'data', len(d), where)
@@ -58,8 +60,10 @@ def read(text: str, where: str) -> Foreign:
         raise LensError(f'{where}: not a whole camera_info; {cause.args[0]} is missing') from cause
     except (TypeError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
-    return Foreign.from_lenses('ROS', {
-        name: _fit_lens(model, size, (k[0], k[4], k[2], k[5], k[1]), tuple(d), name, where)})
+    return Foreign.from_lenses(
+        'ROS',
+        {name: _fit_lens(model, size, (k[0], k[4], k[2], k[5], k[1]), tuple(d), name, where)},
+    )
 
 
 def _read_message(text: str, where: str) -> Foreign:
@@ -79,8 +83,12 @@ def _read_message(text: str, where: str) -> Foreign:
 
 @lru_cache(maxsize=64)
 def lens_of(
-    model: str, size: tuple[int, int], intrinsics: tuple[float, ...], d: tuple[float, ...],
-    name: str, where: str,
+    model: str,
+    size: tuple[int, int],
+    intrinsics: tuple[float, ...],
+    d: tuple[float, ...],
+    name: str,
+    where: str,
 ) -> tuple[Lens, float]:
     """Return the lens of a distortion model, and how far off it is at worst, px.
 
@@ -90,14 +98,20 @@ def lens_of(
     """
     lens, worst = _fit_lens(model, size, intrinsics, d, name, where)
     if not worst <= _TOLERANCE:
-        raise LensError(f'{where}: the nearest lens is {worst:.2g} px off this {model}; calibrate '
-                        'again, as equidistant')
+        raise LensError(
+            f'{where}: the nearest lens is {worst:.2g} px off this {model}; calibrate '
+            'again, as equidistant'
+        )
     return lens, worst
 
 
 def _fit_lens(
-    model: str, size: tuple[int, int], intrinsics: tuple[float, ...], d: tuple[float, ...],
-    name: str, where: str,
+    model: str,
+    size: tuple[int, int],
+    intrinsics: tuple[float, ...],
+    d: tuple[float, ...],
+    name: str,
+    where: str,
 ) -> tuple[Lens, float]:
     """Return the nearest lens, however far off: a file is read with a warning."""
     if model in _EQUIDISTANT:
@@ -107,12 +121,14 @@ def _fit_lens(
     elif model in _PERSPECTIVE:
         counts = _PERSPECTIVE[model]
         # rational_polynomial may carry coefficients of a thin prism and a tilt as well.
-        if len(d) not in counts and any(d[counts[-1]:] or d):
+        if len(d) not in counts and any(d[counts[-1] :] or d):
             raise LensError(f'{where}: {model} has {len(d)} coefficients; {counts[-1]} are needed')
         distortion = models.opencv_distortion(d)
     else:
-        raise LensError(f'{where}: distortion_model is {model!r}; known are '
-                        f'{", ".join((*_EQUIDISTANT, *_PERSPECTIVE))}')
+        raise LensError(
+            f'{where}: distortion_model is {model!r}; known are '
+            f'{", ".join((*_EQUIDISTANT, *_PERSPECTIVE))}'
+        )
     try:
         with np.errstate(all='ignore'):
             return models.nearest_lens(name, size, intrinsics, distortion, where)
@@ -124,21 +140,35 @@ def write(lens: Lens) -> str:
     """Return the lens in this form."""
     near = models.nearest_kannala_brandt(lens)
     k = models.camera_matrix(near)
-    return camera_info_text(near.name, (near.width, near.height), k, 'equidistant',
-                            models.coefficients(near), np.column_stack([k, np.zeros(3)]))
+    return camera_info_text(
+        near.name,
+        (near.width, near.height),
+        k,
+        'equidistant',
+        models.coefficients(near),
+        np.column_stack([k, np.zeros(3)]),
+    )
 
 
 def camera_info_text(
     name: str, size: tuple[int, int], k: Array, model: str, d: Sequence[float], p: Array
 ) -> str:
     """Return a camera_info as camera_calibration writes it: k (3, 3), p (3, 4), px and px m."""
+
     def matrix(values: Array) -> dict[str, Any]:
         rows, columns = values.shape
         return {'rows': rows, 'cols': columns, 'data': values.ravel().tolist()}
 
-    return dump_yaml({
-        'image_width': size[0], 'image_height': size[1], 'camera_name': name,
-        'camera_matrix': matrix(k), 'distortion_model': model,
-        'distortion_coefficients': matrix(np.array([d], dtype=float)),
-        'rectification_matrix': matrix(np.eye(3)), 'projection_matrix': matrix(p),
-    }, default_flow_style=None)
+    return dump_yaml(
+        {
+            'image_width': size[0],
+            'image_height': size[1],
+            'camera_name': name,
+            'camera_matrix': matrix(k),
+            'distortion_model': model,
+            'distortion_coefficients': matrix(np.array([d], dtype=float)),
+            'rectification_matrix': matrix(np.eye(3)),
+            'projection_matrix': matrix(p),
+        },
+        default_flow_style=None,
+    )

@@ -47,8 +47,10 @@ def _camera(side: str, joints: list[_Joint], where: str) -> str:
     found = [frame for frame in frames if side in frame]
     found = [frame for frame in found if _OPTICAL in frame] or found
     if len(found) != 1:
-        raise LensError(f'{where}: one frame called {side} and {_OPTICAL} is needed; there are '
-                        + (', '.join(found or frames) or 'no fixed transforms'))
+        raise LensError(
+            f'{where}: one frame called {side} and {_OPTICAL} is needed; there are '
+            + (', '.join(found or frames) or 'no fixed transforms')
+        )
     return found[0]
 
 
@@ -70,11 +72,16 @@ def _urdf(text: str, where: str) -> Iterator[_Joint]:
         if joint.get('type') == 'fixed' and ends[0] is not None and ends[1] is not None:
             origin = joint.find('origin')
             given = {} if origin is None else origin.attrib
-            place, turn = (_numbers(given.get(name, '0 0 0'), f'{where}: {joint.get("name")}')
-                           for name in ('xyz', 'rpy'))
+            place, turn = (
+                _numbers(given.get(name, '0 0 0'), f'{where}: {joint.get("name")}')
+                for name in ('xyz', 'rpy')
+            )
             roll, pitch, yaw = rotation_from_vector(np.diag(turn))  # about fixed axes
-            yield (str(ends[0].get('link')), str(ends[1].get('link')),
-                   Pose(np.asarray(yaw @ pitch @ roll), place))
+            yield (
+                str(ends[0].get('link')),
+                str(ends[1].get('link')),
+                Pose(np.asarray(yaw @ pitch @ roll), place),
+            )
 
 
 def _numbers(text: str, where: str) -> Array:
@@ -93,7 +100,8 @@ def _messages(text: str, where: str) -> Iterator[_Joint]:
             try:
                 place, turn = (
                     [float(entry['transform'][name][axis]) for axis in axes]
-                    for name, axes in (('translation', 'xyz'), ('rotation', 'xyzw')))
+                    for name, axes in (('translation', 'xyz'), ('rotation', 'xyzw'))
+                )
                 ends = str(entry['header']['frame_id']), str(entry['child_frame_id'])
             except (KeyError, TypeError, ValueError) as cause:
                 raise LensError(f'{where}: not a whole transform ({cause!r})') from cause
@@ -106,13 +114,19 @@ def urdf_text(cameras: Sequence[str], rig: Pose) -> str:
     lines = ['<robot name="rig">', f'  <link name="{frames[0]}"/>']
     for number, frame in enumerate(frames[1:], start=1):
         place, turn = rig.position[number], rig.rotation[number]
-        angles = (np.arctan2(turn[2, 1], turn[2, 2]), -np.arcsin(np.clip(turn[2, 0], -1, 1)),
-                  np.arctan2(turn[1, 0], turn[0, 0]))
+        angles = (
+            np.arctan2(turn[2, 1], turn[2, 2]),
+            -np.arcsin(np.clip(turn[2, 0], -1, 1)),
+            np.arctan2(turn[1, 0], turn[0, 0]),
+        )
         xyz, rpy = (' '.join(f'{value:.12g}' for value in values) for values in (place, angles))
-        lines += [f'  <link name="{frame}"/>',
-                  f'  <joint name="{frames[0]}_to_{frame}" type="fixed">',
-                  f'    <parent link="{frames[0]}"/><child link="{frame}"/>',
-                  f'    <origin xyz="{xyz}" rpy="{rpy}"/>', '  </joint>']
+        lines += [
+            f'  <link name="{frame}"/>',
+            f'  <joint name="{frames[0]}_to_{frame}" type="fixed">',
+            f'    <parent link="{frames[0]}"/><child link="{frame}"/>',
+            f'    <origin xyz="{xyz}" rpy="{rpy}"/>',
+            '  </joint>',
+        ]
     return '\n'.join([*lines, '</robot>', ''])
 
 
@@ -120,8 +134,18 @@ def static_transforms_text(cameras: Sequence[str], rig: Pose) -> str:
     """Return the same as a tf2_msgs/TFMessage for /tf_static, YAML."""
     frames = [f'{camera}_{_OPTICAL}_frame' for camera in cameras]
     turns = quaternion_from_rotation(rig.rotation)
-    return dump_yaml({'transforms': [{
-        'header': {'frame_id': frames[0]}, 'child_frame_id': frame,
-        'transform': {'translation': dict(zip('xyz', place.tolist(), strict=True)),
-                      'rotation': dict(zip('xyzw', turn.tolist(), strict=True))},
-    } for frame, place, turn in zip(frames[1:], rig.position[1:], turns[1:], strict=True)]})
+    return dump_yaml(
+        {
+            'transforms': [
+                {
+                    'header': {'frame_id': frames[0]},
+                    'child_frame_id': frame,
+                    'transform': {
+                        'translation': dict(zip('xyz', place.tolist(), strict=True)),
+                        'rotation': dict(zip('xyzw', turn.tolist(), strict=True)),
+                    },
+                }
+                for frame, place, turn in zip(frames[1:], rig.position[1:], turns[1:], strict=True)
+            ]
+        }
+    )

@@ -35,8 +35,11 @@ def workspace(views):
     """Return what `minimise` works in: two states and equations each, a step, and some room."""
     rows = views + 1
     return (
-        np.empty((2, rows, *POSE)), np.empty((2, rows, *NORMAL)), np.empty((rows, 6)),
-        np.empty((views, 7, 6)), np.empty((6, 6)),
+        np.empty((2, rows, *POSE)),
+        np.empty((2, rows, *NORMAL)),
+        np.empty((rows, 6)),
+        np.empty((views, 7, 6)),
+        np.empty((6, 6)),
         (np.empty(POSE), np.empty(NORMAL), np.zeros((6, 12)), np.empty((6, 12))),
     )
 
@@ -71,7 +74,8 @@ def _equations(w, left, right, cameras, state, normal, room):
         rotation, position = pose_of(state[v])
         own, _, gradient = normal_of(normal[v])
         total += view_equations(
-            w, points[v], uv[v], weight[v], lens, rotation, position, own, gradient)
+            w, points[v], uv[v], weight[v], lens, rotation, position, own, gradient
+        )
         if cameras == 2 and np.isfinite(total):
             total += _left_equations(w, left, v, state, normal, room)
         if not np.isfinite(total):
@@ -90,7 +94,8 @@ def _left_equations(w, seen, v, state, normal, room):
     rig, _, rig_gradient = normal_of(normal[len(points)])
     _left_pose(pose_of(state[v]), pose_of(state[len(points)]), rotation, position, change)
     cost = view_equations(
-        w, points[v], uv[v], weight[v], lens, rotation, position, hessian, gradient)
+        w, points[v], uv[v], weight[v], lens, rotation, position, hessian, gradient
+    )
     half[:] = 0.0
     mixed[:] = 0.0
     for i in range(6):

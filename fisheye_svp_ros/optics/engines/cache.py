@@ -11,8 +11,12 @@ from importlib.metadata import version
 from pathlib import Path
 
 _SOURCES = (
-    'optics/formulas.py', 'optics/rays.py', 'optics/engines/kernels.py',
-    'optics/engines/adjustment.py', 'optics/engines/entries.py', 'optics/engines/marquardt.py',
+    'optics/formulas.py',
+    'optics/rays.py',
+    'optics/engines/kernels.py',
+    'optics/engines/adjustment.py',
+    'optics/engines/entries.py',
+    'optics/engines/marquardt.py',
 )
 
 

@@ -95,8 +95,11 @@ def _is_planar(points, weight):
     for i in range(len(points)):
         k = weight[i]
         # Beside the first point, for the digits of a target far from the origin.
-        a, b, c = (points[i, 0] - points[0, 0], points[i, 1] - points[0, 1],
-                   points[i, 2] - points[0, 2])
+        a, b, c = (
+            points[i, 0] - points[0, 0],
+            points[i, 1] - points[0, 1],
+            points[i, 2] - points[0, 2],
+        )
         total, x, y, z = total + k, x + k * a, y + k * b, z + k * c
         xx, xy, xz = xx + k * a * a, xy + k * a * b, xz + k * a * c
         yy, yz, zz = yy + k * b * b, yz + k * b * c, zz + k * c * c
@@ -166,7 +169,7 @@ def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
             for row in range(4):
                 # By place and by turn, of u and of v; the camera moves, not the point.
                 at = ROW + (row // 2) * ROWS + (row % 2) * 3 * B
-                x, y, z = w[at:at + B], w[at + B:at + 2 * B], w[at + 2 * B:at + 3 * B]
+                x, y, z = w[at : at + B], w[at + B : at + 2 * B], w[at + 2 * B : at + 3 * B]
                 sign = 1.0 if row % 2 else -1.0
                 for k in range(3):
                     a, b, c = sign * r[k, 0], sign * r[k, 1], sign * r[k, 2]
@@ -178,11 +181,37 @@ def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
 _VIEW_ARRAYS = (_arg(3), _arg(3), _arg(2))
 
 
-@_entry(types.UniTuple(types.int64, 2), _arg(1), types.int64, types.int64, *_VIEW_ARRAYS,
-        _arg(2, types.int64), _dest(3), _dest(2), _dest(3), _dest(3), _dest(1),
-        _dest(1, types.boolean), _dest(1, types.int64))
-def localize(lens, minimum, limit, points, uv, weight, row, rotation, position, covariance,
-             residual, cost, solved, iterations):
+@_entry(
+    types.UniTuple(types.int64, 2),
+    _arg(1),
+    types.int64,
+    types.int64,
+    *_VIEW_ARRAYS,
+    _arg(2, types.int64),
+    _dest(3),
+    _dest(2),
+    _dest(3),
+    _dest(3),
+    _dest(1),
+    _dest(1, types.boolean),
+    _dest(1, types.int64),
+)
+def localize(
+    lens,
+    minimum,
+    limit,
+    points,
+    uv,
+    weight,
+    row,
+    rotation,
+    position,
+    covariance,
+    residual,
+    cost,
+    solved,
+    iterations,
+):
     """Move S poses to their minima; return how many remain for the reference, and flat targets."""
     w, work, remaining, flat = np.empty(SCRATCH), workspace(1), 0, 0
     states, normals, lower = work[0], work[1], work[4]
@@ -194,7 +223,7 @@ def localize(lens, minimum, limit, points, uv, weight, row, rotation, position, 
             pose = pose_of(states[0, 0])
             copy(rotation[s], pose[0])
             copy(position[s], pose[1])
-            seen = (points[s:s + 1], uv[s:s + 1], weight[s:s + 1], lens)
+            seen = (points[s : s + 1], uv[s : s + 1], weight[s : s + 1], lens)
             cost[s], iterations[s], ended, at, known = minimise(w, seen, seen, 1, work, limit)
             pose = pose_of(states[at, 0])
             copy(pose[0], rotation[s])
@@ -209,10 +238,31 @@ def localize(lens, minimum, limit, points, uv, weight, row, rotation, position, 
     return remaining, flat
 
 
-@_entry(types.int64, *_VIEW_ARRAYS, _arg(1), *_VIEW_ARRAYS, _arg(1), _dest(4), _dest(4), _dest(1),
-        _dest(1, types.int64))
-def adjust_rigs(left_points, left_uv, left_weight, left_lens, points, uv, weight, lens, state,
-                normal, cost, iterations):
+@_entry(
+    types.int64,
+    *_VIEW_ARRAYS,
+    _arg(1),
+    *_VIEW_ARRAYS,
+    _arg(1),
+    _dest(4),
+    _dest(4),
+    _dest(1),
+    _dest(1, types.int64),
+)
+def adjust_rigs(
+    left_points,
+    left_uv,
+    left_weight,
+    left_lens,
+    points,
+    uv,
+    weight,
+    lens,
+    state,
+    normal,
+    cost,
+    iterations,
+):
     """Move S rigs of V views to their minima; return how many remain for the reference.
 
     state (S, V + 1, 4, 3); normal (S, V + 1, 13, 6): see `adjustment`.
@@ -223,8 +273,13 @@ def adjust_rigs(left_points, left_uv, left_weight, left_lens, points, uv, weight
         mine = slice(s * views, (s + 1) * views)
         copy(state[s], work[0][0])
         cost[s], iterations[s], ended, at, known = minimise(
-            w, (left_points[mine], left_uv[mine], left_weight[mine], left_lens),
-            (points[mine], uv[mine], weight[mine], lens), 2, work, MAX_ITERATIONS)
+            w,
+            (left_points[mine], left_uv[mine], left_weight[mine], left_lens),
+            (points[mine], uv[mine], weight[mine], lens),
+            2,
+            work,
+            MAX_ITERATIONS,
+        )
         copy(work[0][at], state[s])
         copy(work[1][known], normal[s])
         remaining += ended < 1

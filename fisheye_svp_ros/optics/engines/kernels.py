@@ -28,16 +28,44 @@ OPTIONS = {'error_model': 'numpy', 'fastmath': {'reassoc', 'contract', 'arcp'}}
 # What allocates nothing need not count who holds an array either, which would take a third of its
 # time.  Numba has its own runtime's switch under a private name.
 BARE = OPTIONS | ({'_nrt': False} if hasattr(CPUTargetOptions, '_nrt') else {})
-HEIGHTS = (formulas.orthographic, formulas.equidistant, formulas.equisolid,
-           formulas.stereographic, formulas.kannala_brandt)
+HEIGHTS = (
+    formulas.orthographic,
+    formulas.equidistant,
+    formulas.equisolid,
+    formulas.stereographic,
+    formulas.kannala_brandt,
+)
 SHIFTS = (formulas.gennery, formulas.flat_port)
-for formula in (*HEIGHTS, *SHIFTS, formulas.half_angle, formulas.newton_step,
-                formulas.point_derivatives):
+for formula in (
+    *HEIGHTS,
+    *SHIFTS,
+    formulas.half_angle,
+    formulas.newton_step,
+    formulas.point_derivatives,
+):
     register_jitable(**OPTIONS)(formula)
 
 B = 248  # points in a block; rows a power of two apart would share the same lines of the cache
-(X, Y, Z, R, THETA0, SIN0, COS0, THETA, SIN, COS, TURN, CLEARANCE, STATE, RATIO, SLOPE,
- U, V, ROW) = (B * i for i in range(18))
+(
+    X,
+    Y,
+    Z,
+    R,
+    THETA0,
+    SIN0,
+    COS0,
+    THETA,
+    SIN,
+    COS,
+    TURN,
+    CLEARANCE,
+    STATE,
+    RATIO,
+    SLOPE,
+    U,
+    V,
+    ROW,
+) = (B * i for i in range(18))
 ROWS = 7 * B  # from ROW on, for u and for v: by place (3), by turn (3), residual
 GRAM = ROW + 2 * ROWS  # the upper triangle of 7 x 7, row by row, then room for `view_equations`
 SCRATCH = GRAM + 28 + 49 + 42
@@ -75,10 +103,13 @@ def _half_angle(r, m):
 def _rotate_sin_cos(sin, cos, turn):
     """Return sine and cosine of an angle turned on by up to 0.3 rad."""
     w = turn * turn
-    s = turn * (1 + w * (-1 / 6 + w * (1 / 120 + w * (-1 / 5040 + w * (
-        1 / 362880 - w / 39916800)))))
-    c = 1 + w * (-1 / 2 + w * (1 / 24 + w * (-1 / 720 + w * (1 / 40320 + w * (
-        -1 / 3628800 + w / 479001600)))))
+    s = turn * (
+        1 + w * (-1 / 6 + w * (1 / 120 + w * (-1 / 5040 + w * (1 / 362880 - w / 39916800))))
+    )
+    c = 1 + w * (
+        -1 / 2
+        + w * (1 / 24 + w * (-1 / 720 + w * (1 / 40320 + w * (-1 / 3628800 + w / 479001600))))
+    )
     return sin * c + cos * s, cos * c - sin * s
 
 
@@ -130,15 +161,18 @@ def _newton_steps(w, first, last, lens):
     if lens[SHIFT_KIND] == 0:
         for i in range(first, last):
             w[U + i], w[V + i] = formulas.gennery(
-                w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1], k[2], k[3])
+                w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1], k[2], k[3]
+            )
     else:
         for i in range(first, last):
             w[U + i], w[V + i] = formulas.flat_port(
-                w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1])
+                w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1]
+            )
     late = 0
     for i in range(first, last):
         step, clearance = formulas.newton_step(
-            w[R + i], w[Z + i], w[SIN + i], w[COS + i], w[U + i], w[V + i])
+            w[R + i], w[Z + i], w[SIN + i], w[COS + i], w[U + i], w[V + i]
+        )
         turn = w[TURN + i] + step
         w[TURN + i], w[CLEARANCE + i] = turn, clearance
         w[THETA + i] = w[THETA0 + i] + turn
@@ -167,7 +201,8 @@ def image(w, n, lens):
     else:
         for i in range(n):
             w[RATIO + i], w[SLOPE + i] = formulas.kannala_brandt(
-                w[THETA + i], k[0], k[1], k[2], k[3])
+                w[THETA + i], k[0], k[1], k[2], k[3]
+            )
     fx, fy, cx, cy = lens[FX], lens[FY], lens[CX], lens[CY]
     for i in range(n):
         w[RATIO + i] /= w[R + i]
@@ -183,7 +218,8 @@ def derivatives(w, n, lens):
         x, y, z, r, ratio = w[X + i], w[Y + i], w[Z + i], w[R + i], w[RATIO + i]
         inverse = 1.0 / (w[CLEARANCE + i] * r)
         rise, fall, bend = formulas.point_derivatives(
-            ratio, w[SLOPE + i], r * r, w[COS + i] * r * inverse, w[SIN + i] * inverse)
+            ratio, w[SLOPE + i], r * r, w[COS + i] * r * inverse, w[SIN + i] * inverse
+        )
         turn, level = bend * z + fall, ratio * z
         x2, y2, mixed = x * x, y * y, x * y
         w[ROW + i] = fx * (ratio + x2 * bend)
@@ -298,8 +334,36 @@ def _add_products(w, n, gram):
         f6 += _row_product(w, i, 6, u, v)
         u, v = s * w[ROW + 6 * B + i], s * w[ROW + ROWS + 6 * B + i]
         g6 += _row_product(w, i, 6, u, v)
-    sums = (a0, a1, a2, a3, a4, a5, a6, b1, b2, b3, b4, b5, b6, c2, c3, c4, c5, c6,
-            d3, d4, d5, d6, e4, e5, e6, f5, f6, g6)
+    sums = (
+        a0,
+        a1,
+        a2,
+        a3,
+        a4,
+        a5,
+        a6,
+        b1,
+        b2,
+        b3,
+        b4,
+        b5,
+        b6,
+        c2,
+        c3,
+        c4,
+        c5,
+        c6,
+        d3,
+        d4,
+        d5,
+        d6,
+        e4,
+        e5,
+        e6,
+        f5,
+        f6,
+        g6,
+    )
     for k in range(28):
         gram[k] += sums[k]
 
@@ -307,7 +371,7 @@ def _add_products(w, n, gram):
 @njit(**BARE)
 def view_equations(w, points, uv, weight, lens, rotation, position, hessian, gradient):
     """Write H (6, 6) and g (6) of one pose; return its cost, inf outside, nan if left."""
-    sums, gram, half = w[GRAM:GRAM + 28], w[GRAM + 28:GRAM + 77], w[GRAM + 77:SCRATCH]
+    sums, gram, half = w[GRAM : GRAM + 28], w[GRAM + 28 : GRAM + 77], w[GRAM + 77 : SCRATCH]
     sums[:] = 0.0
     state = add_view(w, points, uv, weight, lens, rotation, position, sums)
     if state < VALID:

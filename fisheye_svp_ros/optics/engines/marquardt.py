@@ -43,7 +43,7 @@ def update_damping(
     """Return the next damping and its growth from what a step gained in cost, and |J d|^2."""
     # A step out of the domain gains minus infinity.
     ratio = np.minimum(np.maximum(gained / np.maximum(moved, _MIN_DIVISOR), -1.0), 2.0)
-    shrunk = damping * np.minimum(np.maximum(1.0 - (2.0 * ratio - 1.0)**3, 0.1), 2.0)
+    shrunk = damping * np.minimum(np.maximum(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1), 2.0)
     raised = np.maximum(damping, 1e-9) * growth
     accepted, refused = 1.0 * better, 1.0 - better  # factors, see `optics.formulas.half_angle`
     return (

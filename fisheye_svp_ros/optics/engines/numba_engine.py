@@ -65,7 +65,13 @@ def linearise_views(
 
     def run(part: slice) -> None:
         entries.linearise_views(
-            rotation[part], position[part], points[part], numbers, limit, uv[part], state[part],
+            rotation[part],
+            position[part],
+            points[part],
+            numbers,
+            limit,
+            uv[part],
+            state[part],
             d_pose[part],
         )
 
@@ -90,8 +96,11 @@ def localize(
         return None
     systems, count = row.shape
     found = Localization(
-        Pose(start.rotation.copy(), start.position.copy()), np.empty((systems, 6, 6)),
-        np.empty((systems, count, 2)), np.empty(systems), np.empty(systems, dtype=np.bool_),
+        Pose(start.rotation.copy(), start.position.copy()),
+        np.empty((systems, 6, 6)),
+        np.empty((systems, count, 2)),
+        np.empty(systems),
+        np.empty(systems, dtype=np.bool_),
         np.empty(systems, dtype=np.int64),
     )
     arrays = (*_contiguous(*seen, row), *found.pose, *found[1:])
@@ -100,7 +109,8 @@ def localize(
 
     def run(part: slice) -> tuple[int, int]:
         counts: tuple[int, int] = entries.localize(
-            numbers, minimum, limit, *(array[part] for array in arrays))
+            numbers, minimum, limit, *(array[part] for array in arrays)
+        )
         return counts
 
     remaining, flat = map(sum, zip(*_run_threaded(run, systems, 4 * systems * count), strict=True))
@@ -122,13 +132,21 @@ def adjust_rigs(
     normal, cost = np.empty((systems, views + 1, *NORMAL)), np.empty(systems)
     iterations = np.empty(systems, dtype=np.int64)
     if entries.adjust_rigs(
-        *_contiguous(*seen[0]), left, *_contiguous(*seen[1]), right, poses, normal, cost,
+        *_contiguous(*seen[0]),
+        left,
+        *_contiguous(*seen[1]),
+        right,
+        poses,
+        normal,
+        cost,
         iterations,
     ):
         return None
     block, shared = normal[:, :-1], normal[:, -1]
     return Rigs(
-        parts, cost, iterations,
+        parts,
+        cost,
+        iterations,
         (block[:, :, :6], block[:, :, 6:12], shared[:, :6], block[:, :, 12], shared[:, 12]),
     )
 
@@ -147,7 +165,7 @@ def pack_lens(lens: Lens) -> Array | None:
 def _pack(lens: Lens) -> Array | None:
     height, shift = lens.image_height, lens.viewpoint_shift
     numbers = np.zeros(kernels.LENS)
-    numbers[kernels.FX:kernels.CY + 1] = lens.fx, lens.fy, lens.cx, lens.cy
+    numbers[kernels.FX : kernels.CY + 1] = lens.fx, lens.fy, lens.cx, lens.cy
     numbers[kernels.SHIFT_KIND] = -1
     curves: list[tuple[Any, Any, int, int]] = [
         (height, kernels.HEIGHTS, kernels.HEIGHT_KIND, kernels.HEIGHT_K)
@@ -160,7 +178,7 @@ def _pack(lens: Lens) -> Array | None:
         if formula not in known:
             return None
         numbers[kind] = known.index(formula)
-        numbers[first:first + len(curve.coefficients)] = curve.coefficients
+        numbers[first : first + len(curve.coefficients)] = curve.coefficients
     return numbers
 
 

@@ -16,16 +16,22 @@ _BLOCK = 16_700  # points; rows a power of two apart would share the same lines 
 
 # What the derivatives of a place in the image add up to, (3, 2, 6): by a point's x, y, z in the
 # camera frame, or by a turn of the point about these axes; of u, v; the terms of `_add_up`.
-_INTRINSICS_JACOBIAN = np.array([
-    [[1, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]],
-    [[0, 0, 0, 1, 0, 0], [0, 1, -1, 0, 0, 0]],
-    [[0, 0, 0, 0, -1, 0], [0, 0, 0, 0, 0, -1]],
-], dtype=float)
-_TURN = np.array([
-    [[0, 0, 0, -1, 0, 0], [-1, -1, 1, 0, 0, 0]],
-    [[1, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]],
-    [[0, 0, 0, 0, 0, -1], [0, 0, 0, 0, 1, 0]],
-], dtype=float)
+_INTRINSICS_JACOBIAN = np.array(
+    [
+        [[1, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]],
+        [[0, 0, 0, 1, 0, 0], [0, 1, -1, 0, 0, 0]],
+        [[0, 0, 0, 0, -1, 0], [0, 0, 0, 0, 0, -1]],
+    ],
+    dtype=float,
+)
+_TURN = np.array(
+    [
+        [[0, 0, 0, -1, 0, 0], [-1, -1, 1, 0, 0, 0]],
+        [[1, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]],
+        [[0, 0, 0, 0, 0, -1], [0, 0, 0, 0, 1, 0]],
+    ],
+    dtype=float,
+)
 _BY_CAMERA = -np.array([_INTRINSICS_JACOBIAN, _TURN])  # which moves the other way
 _IMAGE = np.eye(2, 6, 4)  # the place itself: the last terms by turn
 
