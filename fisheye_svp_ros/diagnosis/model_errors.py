@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Mask, flat_rows
+from fisheye_svp_ros.arrays import Array, Index, Mask, flat_rows
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
 from fisheye_svp_ros.diagnosis.null_model import FINEST_FIELD, NullModel
 from fisheye_svp_ros.diagnosis.random_effects import (
@@ -78,7 +78,9 @@ class ModelErrors:
         inverse = pseudo_inverse(bare.information[np.ix_(own, own)], 1e-13)
         finest = [grid.pitch for grid in null.random.grids if grid.name == FINEST_FIELD]
         modes, alone = fitted.target_modes(null.variances.sigma)
-        geometry = ColumnGeometry.measure(null.linear, max(finest, default=np.nan), modes, alone)
+        geometry = ColumnGeometry.measure(
+            null.linear, max(finest, default=np.nan), modes, alone, null.random.normals
+        )
         return cls(
             shared_names(null.linear), inverse / np.outer(scale, scale), null.variances, geometry
         )
@@ -318,6 +320,7 @@ def _entry(
         'components': sizes,
         'extent_px': geometry.extents[camera].tolist(),
         'finest_px': float(geometry.finest) if np.isfinite(geometry.finest) else None,
+        'normals': geometry.normals.tolist(),
         'landmarks': [
             [*pair, *place, *(float(f'{value:.6g}') for value in values)]
             for *pair, place, values in zip(
@@ -329,6 +332,12 @@ def _entry(
             )
         ],
     }
+
+
+def _mean_normals(entry: Mapping[str, Any], boards: Index) -> Array:
+    """Return the mean normals (boards, 3) that an entry holds; zeros in older files."""
+    shape = len(np.unique(boards)), 3
+    return np.array(entry.get('normals', np.zeros(shape)), dtype=float).reshape(shape)
 
 
 @dataclass(frozen=True)
@@ -370,6 +379,7 @@ class LensErrors:
                 rows[:, 2:5],
                 rows[:, 8:].reshape(len(rows), 3, -1),
                 rows[:, 5:8],
+                _mean_normals(entry, boards),
             )
             names = tuple(map(str, entry['parameters']))
             covariance = np.array(entry['covariance'], dtype=float).reshape(len(names), len(names))
@@ -389,6 +399,7 @@ class LensErrors:
             and len(rows)
             and wide.all()
             and np.isfinite(rows).all()
+            and np.isfinite(geometry.normals).all()
             and (np.diag(covariance) >= 0).all()
         ):
             raise LensError(f'lens {lens.name!r}: uncertainty holds a number that cannot be')

@@ -67,13 +67,15 @@ class RandomEffects(NamedTuple):
     """The random columns of a state, and what they stand for.
 
     landmark (L,): ids of the units; grids: what the first of the shared columns are of (u and v of
-    each bump); axes (L, 3, 3): of the board of each landmark.
+    each bump); axes (L, 3, 3): of the board of each landmark; normals (boards, 3): see
+    `ColumnGeometry`.
     """
 
     columns: RandomColumns
     landmark: Index
     grids: tuple[ImageGrid, ...]
     axes: Array
+    normals: Array
 
     def select(self, alive: Mask) -> RandomEffects:
         """Return the effects of some of the components (`NAMES`) only."""
@@ -94,7 +96,8 @@ class ColumnGeometry(NamedTuple):
     extents (C, 2, 2), px: least and largest u, v by camera; finest, px: pitch of the finest grid,
     NaN without one; landmark, board (L,), points (L, 3), m: the target, by ascending numbers;
     modes (L, 3, K) and alone (L, 3), m: how far its landmarks are off along the axes of their
-    boards, each as a sum of the modes, drawn once for all, and of what it has alone.
+    boards, each as a sum of the modes, drawn once for all, and of what it has alone; normals
+    (boards, 3): means over the frames, by the axes of the camera or rig.
     """
 
     extents: Array
@@ -104,13 +107,14 @@ class ColumnGeometry(NamedTuple):
     points: Array
     modes: Array
     alone: Array
+    normals: Array
 
     @classmethod
     def measure(
-        cls, linear: Linearization, finest: float, modes: Array, alone: Array
+        cls, linear: Linearization, finest: float, modes: Array, alone: Array, normals: Array
     ) -> ColumnGeometry:
-        """Return that of a linearised state; modes, alone: see above."""
-        return cls(_extents(linear), finest, *_seen_target(linear), modes, alone)
+        """Return that of a linearised state; modes, alone, normals: see above."""
+        return cls(_extents(linear), finest, *_seen_target(linear), modes, alone, normals)
 
 
 class _Landmarks(NamedTuple):
@@ -223,8 +227,11 @@ def make_random_effects(
         for _, bumps in static
     ]
     names = [grid.name for grid in grids]
+    normals = np.zeros((len(points.landmarks.boards), 3))
     if linear.data.poses is None:  # else the camera moves, and gravity beside it
-        parts.append(_sag_columns(points, linear.state.pose.rotation))
+        middle = None if geometry is None else geometry.normals
+        columns, normals = _sag_columns(points, linear.state.pose.rotation, middle)
+        parts.append(columns)
         names.append(SAG)
     of = [
         np.full(part.shape[1], NAMES.index(name))
@@ -244,7 +251,7 @@ def make_random_effects(
             for one in landmarks.boards
         ]
     )
-    columns = RandomColumns(
+    every = RandomColumns(
         frame,
         label,
         points.place,
@@ -255,7 +262,7 @@ def make_random_effects(
         np.concatenate([np.zeros(0, dtype=np.int64), *of]),
         Components(OF_LANDMARKS, _NUMEROUS),
     )
-    return RandomEffects(columns, landmarks.ids, tuple(grids), landmarks.axes)
+    return RandomEffects(every, landmarks.ids, tuple(grids), landmarks.axes, normals)
 
 
 def _frame_columns(points: _Points, compact: bool) -> tuple[Array, Index]:
@@ -306,18 +313,25 @@ def _bend_columns(points: _Points) -> Array:
     return np.asarray(columns.reshape(*columns.shape[:3], -1))
 
 
-def _sag_columns(points: _Points, rotation: Array) -> sparse.csr_array:
-    """Return columns (2 F N, 9 boards) of a bend of each board in proportion to its normal.
+def _sag_columns(
+    points: _Points, rotation: Array, middle: Array | None
+) -> tuple[sparse.csr_array, Array]:
+    """Return columns (2 F N, 9 boards) of a bend of each board by how its normal departs.
 
+    And the means (boards, 3) of the normals that these are centered on, `middle` where given.
     rotation (F, 3, 3): of the camera or rig.  A board that sags by its own weight bends by
     b (n . g), n its normal and g the direction of gravity, which stands still beside a camera
-    that does.
+    that does.  The mean is a bend that stays: left in, it would hide `target_shape`.
     """
     bend, boards = _bend_columns(points), points.landmarks.boards
-    normals = np.array([one.axes[2] for one in boards]) @ rotation  # (F, boards, 3)
+    normals = np.array([board.axes[2] for board in boards]) @ rotation  # (F, boards, 3)
     parts = bend.reshape(*bend.shape[:3], len(boards), 3)[..., None]
-    columns = parts * normals[:, None, None, :, None]
-    return sparse.csr_array(columns.reshape(points.used.size * 2, -1))
+    if middle is None:
+        weight = (parts**2).sum(axis=(1, 2, 4, 5))  # of a frame: what it shows of a bend
+        middle = (weight[..., None] * normals).sum(axis=0)
+        middle = middle / np.maximum(weight.sum(axis=0), 1e-300)[:, None]
+    columns = parts * (normals - middle)[:, None, None, :, None]
+    return sparse.csr_array(columns.reshape(points.used.size * 2, -1)), middle
 
 
 def _image_grids(points: _Points, finest: bool) -> Iterator[tuple[ImageGrid, sparse.csr_array]]:
