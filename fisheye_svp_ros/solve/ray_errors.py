@@ -172,18 +172,22 @@ def points_on_rays(lens: Lens, uv: Array, ranges: Sequence[float] = RANGES) -> A
 def without_motion(points: Array, change: Array) -> Array:
     """Return changes (R, G, 3, ...), m, of points over their range, rad, without a rigid motion.
 
-    The motion is that of least squares over all ranges together, of the angles.
+    Of the components across the rays: along them nothing is seen.  The motion is that of least
+    squares over all ranges together, of the angles.
     """
     distance = np.linalg.norm(points, axis=-1, keepdims=True)
+    along = (points / distance)[..., None]
+
+    def across_rays(moves: Array) -> Array:
+        angles = moves / distance[..., None]
+        return np.asarray(angles - along * (along * angles).sum(axis=-2, keepdims=True))
+
     x, y, z = np.moveaxis(points, -1, 0)
     zero = np.zeros_like(x)
     turns = np.stack([[zero, -z, y], [z, zero, -x], [-y, x, zero]])  # of unit rotations
     turns = np.moveaxis(turns, (0, 1), (-1, -2))
     shifts = np.broadcast_to(np.eye(3), (*points.shape, 3))
-    motion = (np.concatenate([turns, shifts], axis=-1) / distance[..., None]).reshape(-1, 6)
-    angles = change.reshape(points.size, -1) / np.repeat(distance.ravel(), 3)[:, None]
-    fitted = motion @ np.linalg.lstsq(motion, angles, rcond=None)[0]
-    left = (angles - fitted).reshape(*points.shape, -1)
-    along = (points / distance)[..., None]
-    left = left - along * (left * along).sum(axis=-2, keepdims=True)
+    motion = across_rays(np.concatenate([turns, shifts], axis=-1)).reshape(-1, 6)
+    angles = across_rays(change.reshape(*points.shape, -1)).reshape(points.size, -1)
+    left = angles - motion @ np.linalg.lstsq(motion, angles, rcond=None)[0]
     return np.asarray(left.reshape(change.shape))

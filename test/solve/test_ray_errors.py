@@ -42,19 +42,37 @@ def test_a_motion_of_the_camera_frame_is_no_error() -> None:
     assert np.abs(without_motion(points, turned - points)).max() < 1e-8
 
 
+def test_what_moves_points_along_their_rays_is_no_error() -> None:
+    points, near = points_on_rays(LENS, UV), points_on_rays(focal(np.array([4.0])), UV)
+    along = 0.02 * points * np.linspace(-1, 1, len(UV))[:, None]
+    np.testing.assert_allclose(
+        without_motion(points, near - points + along),
+        without_motion(points, near - points),
+        atol=1e-12,
+    )
+    # The best motion is that of what is seen: no other leaves less across the rays.
+    left = without_motion(points, near - points + along)
+    turned = points @ rotation_from_vector(np.array([1e-4, -1e-4, 1e-4])).T + (1e-4, 1e-4, 2e-4)
+    distance = np.linalg.norm(points, axis=-1, keepdims=True)
+    way = points / distance
+    other = (turned - points) / distance
+    other = left + other - way * (other * way).sum(axis=-1, keepdims=True)
+    assert (left**2).sum() < (other**2).sum()
+
+
 def test_a_focal_length_off_by_one_percent_costs_a_radial_angle() -> None:
     model, there = ray_model(focal, np.array([[16.0]]), UV)
     assert there.all()
     theta = np.linalg.norm(UV - (640, 480), axis=1) / 400
-    # A motion along the axis takes up some of it at the nearest range.
-    np.testing.assert_allclose(model.sd[-1], 0.01 * theta, rtol=0.06)
+    # A motion along the axis takes up most of it at the nearest range, a thirteenth at 5 m.
+    np.testing.assert_allclose(model.sd[-1], 0.01 * theta, rtol=0.09)
     error = model.errors()[-1]
     expected = np.sqrt(np.mean((0.01 * theta) ** 2))
     assert error.value == pytest.approx(expected, rel=0.1)
     assert error.low < error.value < error.high
     off = without_motion(model.points, points_on_rays(focal(np.array([8.0])), UV) - model.points)
     both = model.errors(off)[-1]
-    assert both.value == pytest.approx(5**0.5 * expected, rel=0.1)
+    assert both.value == pytest.approx(5**0.5 * error.value, rel=0.05)
 
 
 def test_a_viewpoint_shift_costs_more_the_nearer_the_landmark_is() -> None:
