@@ -82,11 +82,11 @@ def _angles(axes: object, detection: Detection, camera: int, name: str) -> None:
     points = fitted.adjusted.pose.into_body(views.points)[views.used]
     distance = np.linalg.norm(points, axis=-1)
     theta = np.degrees(np.arccos(points[:, 2] / distance))
-    axes.plot(
+    axes.plot(  # type: ignore[attr-defined]
         theta,
         distance,
         '.',
-        markersize=2,  # type: ignore[attr-defined]
+        markersize=2,
         color=(OURS, FAINT)[camera % 2],
         label=name or lens.name,
     )
