@@ -27,6 +27,7 @@ from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.targets import board_views
@@ -117,7 +118,7 @@ def trial(number: int) -> dict[str, Any]:
     table, shift, bend, _ = draw_set(number)
     lens, diagnosis = study.calibrated_and_diagnosed(table, SIZE)
     options = DiagnosisOptions(included=('viewpoint_shift',))
-    found, asked = diagnosis.to_dict(), diagnose(table, lens, options=options).to_dict()
+    found, asked = map(diagnosis_document, (diagnosis, diagnose(table, lens, options=options)))
     e0 = next(c for c in asked['causes'] if c['effect'] == 'viewpoint_shift')['parameters']['e0']
     return {
         'number': number,

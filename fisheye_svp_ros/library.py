@@ -323,6 +323,7 @@ def diagnose(
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
     from fisheye_svp_ros.diagnosis import diagnose as find_causes
+    from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
     from fisheye_svp_ros.solve.measured_poses import posable_observations, poses_by_frame
 
     table, known = table_and_lens(observations, lens)
@@ -337,7 +338,7 @@ def diagnose(
         poses=given,
         progress=progress,
     )
-    return Diagnosed(found.verdict, found.to_dict(), found.lens)
+    return Diagnosed(found.verdict, diagnosis_document(found), found.lens)
 
 
 @limit_threads

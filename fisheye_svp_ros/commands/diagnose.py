@@ -333,13 +333,14 @@ def _write(
     free: bool,
     wanted: NextViews | None,
 ) -> None:
+    from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
     from fisheye_svp_ros.reporting.diagnosis_plots import point_residuals
     from fisheye_svp_ros.reporting.diagnosis_report import write_report
     from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE, refusal_reason
 
     folder, points = args.output, point_residuals(diagnosis.simulation, diagnosis.cause_fit)
     truth = {name: compared.to_dict() for name, compared in known.items()}
-    document = {**diagnosis.to_dict(), 'known_truth': truth}
+    document = {**diagnosis_document(diagnosis), 'known_truth': truth}
     if wanted:
         document['next'] = wanted.to_list()
     write_json(folder / 'diagnosis.json', document)

@@ -29,7 +29,17 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
     compare_errors,
     predict_other_data,
 )
-from fisheye_svp_ros.diagnosis.decision import Decision
+from fisheye_svp_ros.diagnosis.decision import (
+    MIN_FRAMES,
+    Decision,
+    LensFacts,
+    LensReason,
+    PhotographsFacts,
+    PhotographsReason,
+    TargetError,
+    TargetFacts,
+    TargetReason,
+)
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import MAX_RMS_RATIO
@@ -46,6 +56,7 @@ __all__ = [
     'CONFOUNDED_P',
     'DIAGNOSE_AIR',
     'MAX_RMS_RATIO',
+    'MIN_FRAMES',
     'NAMED_P',
     'RETAKE',
     'SIGNIFICANCE',
@@ -61,8 +72,15 @@ __all__ = [
     'EffectTests',
     'ErrorParts',
     'LensErrors',
+    'LensFacts',
+    'LensReason',
     'NullModel',
+    'PhotographsFacts',
+    'PhotographsReason',
     'PredictedOffsets',
+    'TargetError',
+    'TargetFacts',
+    'TargetReason',
     'TraceStep',
     'Transfer',
     'TwoCameras',

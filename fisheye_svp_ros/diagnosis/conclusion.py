@@ -6,7 +6,7 @@ Advice comes in the order of what it brings; nothing that held-out data refute.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from fisheye_svp_ros.diagnosis.decision import (
     FileFigure,
     LensFacts,
     PhotographsFacts,
+    TargetError,
     TargetFacts,
     decide_lens,
     decide_photographs,
@@ -348,14 +349,6 @@ class Conclusion:
             return lens
         return replace(lens, uncertainty={**(lens.uncertainty or {}), 'ray_error_mrad': found})
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the keys of diagnosis.json that are its own."""
-        return {
-            'file': self.file._asdict(),
-            'candidates': [asdict(one) for one in self.candidates],
-            'decision': {name: one.to_dict() for name, one in self.decision.items()},
-        }
-
 
 def conclude(
     evaluation: Evaluation,
@@ -370,16 +363,16 @@ def conclude(
     file, gain = compare_lens_files(evaluation), evaluation.gains['named']
     lens = decide_lens(
         LensFacts(
-            [c.effect for c in causes if c.stage == 'lens'],
-            [c.effect for c in causes if c.stage != 'noise'],
-            bool(evaluation.averaged_model.shifts),
-            (gain.value, gain.low),
-            file,
-            offset if evaluation.free else None,
-            find_bounds(evaluation.null),
-            evaluation.noise_px,
-            evaluation.falling,
-            evaluation.frames,
+            lens_causes=[c.effect for c in causes if c.stage == 'lens'],
+            causes=[c.effect for c in causes if c.stage != 'noise'],
+            has_likely_shift=bool(evaluation.averaged_model.shifts),
+            named_gain=(gain.value, gain.low),
+            file=file,
+            offset=offset if evaluation.free else None,
+            bounds=find_bounds(evaluation.null),
+            noise_px=evaluation.noise_px,
+            falling=evaluation.falling,
+            frames=evaluation.frames,
         )
     )
     scatter = np.hypot.reduce(
@@ -389,15 +382,15 @@ def conclude(
     target = decide_target(_target_facts(evaluation, causes, components, contradicted))
     photographs = decide_photographs(
         PhotographsFacts(
-            evaluation.frames,
-            frames_of(advice, RETAKE),
-            frames_of(advice, UNLIKE),
-            evaluation.figures.named.heldout_rms_px,
-            2**0.5 * float(scatter),
-            lens.say,
-            target.say == 'measure_again' and target.confidence is not None,
-            evaluation.selection.problem.plannable,
-            'view' if is_unpaired(evaluation.null.linear.data) else 'frame',
+            frames=evaluation.frames,
+            bad=frames_of(advice, RETAKE),
+            unlike=frames_of(advice, UNLIKE),
+            heldout_px=evaluation.figures.named.heldout_rms_px,
+            scatter_px=2**0.5 * float(scatter),
+            lens=lens.say,
+            is_target_off=target.say == 'measure_again' and target.confidence is not None,
+            plannable=evaluation.selection.problem.plannable,
+            unit='view' if is_unpaired(evaluation.null.linear.data) else 'frame',
         )
     )
     return Conclusion(
@@ -445,39 +438,33 @@ def _target_facts(
         return float(np.sqrt(sum(part.sd_px**2 for part in parts)))
 
     return TargetFacts(
-        [cause.effect for cause in mine],
-        _largest_error(evaluation, mine),
-        gain,
-        size([part for part in of_target if part.named_share]),
-        size(local),
-        float(np.sqrt((far**2).mean())),
-        max((p.p_value for p in local), default=0.0),
-        evaluation.noise_px,
-        contradicted,
-        evaluation.frames,
+        largest=_largest_error(evaluation, mine),
+        gain=gain,
+        named_px=size([part for part in of_target if part.named_share]),
+        local_px=size(local),
+        local_m=float(np.sqrt((far**2).mean())),
+        local_p=max((p.p_value for p in local), default=0.0),
+        noise_px=evaluation.noise_px,
+        contradicted=contradicted,
+        frames=evaluation.frames,
     )
 
 
-def _largest_error(evaluation: Evaluation, causes: Sequence[Cause]) -> str:
-    """Return how large the largest error of the target is, as the start of a sentence."""
+def _largest_error(evaluation: Evaluation, causes: Sequence[Cause]) -> TargetError | None:
+    """Return the largest of the target's causes, None without any."""
     if not causes:
-        return ''
+        return None
     worst = max(causes, key=lambda cause: cause.share)
     if worst.effect == 'target_shape':
         linear = evaluation.fixed_model
         terms = [term for term in linear.state.terms if term[0].name == worst.effect]
         maps = board_maps(linear.data.views, terms, linear.state.lens)
-        one = max(maps, key=lambda board: board.peak_to_valley)
-        which = f'board {one.board}' if len(maps) > 1 else 'the board'
-        return f'{which} is bent by {1e3 * one.peak_to_valley:.2g} mm'
+        bent = max(maps, key=lambda board: board.peak_to_valley)
+        board = bent.board if len(maps) > 1 else None
+        return TargetError(worst.effect, bent.peak_to_valley, board)
     if worst.effect == 'landmark_survey':
-        count = len(worst.members)
-        return f'{count} landmark{"s are" if count > 1 else " is"} displaced'
+        return TargetError(worst.effect, len(worst.members))
     if worst.effect == 'landmark_scale':
-        most = max((abs(p['value']) for p in worst.parameters.values()), default=0.0)
-        stretched = 'relative' not in worst.parameters
-        what = 'the board is stretched' if stretched else 'the scale of the board is off'
-        return f'{what} by {100 * most:.2g} %'
-    if worst.effect == 'board_pose':
-        return 'the relative poses of its boards are wrong'
-    return f'confirmed cause: {worst.effect}'
+        size = max((abs(p['value']) for p in worst.parameters.values()), default=0.0)
+        return TargetError(worst.effect, size, stretched='relative' not in worst.parameters)
+    return TargetError(worst.effect)

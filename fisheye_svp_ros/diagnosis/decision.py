@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
+from enum import Enum
 from math import erf
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 LensAnswer = Literal['keep', 'use_extended', 'recalibrate', 'undecided']
 TargetAnswer = Literal['keep', 'correct', 'measure_again']
@@ -15,10 +16,46 @@ _INTRINSIC = ('focal_length', 'principal_point', 'aspect')
 _OFF_P = 0.04  # of the offset by chance: below, the lens is another one
 _OFF_PX = 0.2  # of the noise: a difference that matters
 _HINT = 2.4  # standard errors: an effect that is not named, and yet likely there
-_MIN_FRAMES = 8  # frames
-_ONE_FRAME = 'one frame does not tell errors of the lens from those of the target'
+MIN_FRAMES = 8  # frames
 _MAX_REJECTED_SHARE = 0.1  # of the frames
 _TARGET_RATIO = 1.5  # times noise and scatter: a held-out error that needs a reason
+
+
+class LensReason(Enum):
+    """What a decision about the lens rests on."""
+
+    FITTED_ERROR_RISES = 1
+    OFF = 2
+    ONE_FRAME = 3
+    INTRINSICS_WRONG = 4
+    PREDICTS_BETTER = 5
+    LENS_ALONE_PREDICTS_WORSE = 6
+    GAIN_UNCERTAIN = 7
+    EFFECT_LIKELY = 8
+    NOTHING_CONFIRMED = 9
+
+
+class TargetReason(Enum):
+    """What a decision about the target rests on."""
+
+    CAMERAS_CONTRADICT = 1
+    CORRECTION_GAINS = 2
+    CORRECTION_GAINS_NOTHING = 3
+    CAUSE_AND_OFFSETS = 4
+    ONE_FRAME = 5
+    OFFSETS_ABOVE_NOISE = 6
+    OFFSETS_BELOW_NOISE = 7
+    BELOW_NOISE = 8
+
+
+class PhotographsReason(Enum):
+    """What a decision about the photographs rests on."""
+
+    SOME_ARE_WRONG = 1
+    TOO_FEW = 2
+    LENS_UNDECIDED = 3
+    NOT_PREDICTED = 4
+    PREDICTED = 5
 
 
 class Figure(NamedTuple):
@@ -47,20 +84,17 @@ class EffectBound:
 
 @dataclass(frozen=True)
 class Decision:
-    """One answer: what to do, why, the figure behind it; confidence: 0 to 1, if measured."""
+    """One answer: what to do, why, the figure behind it; confidence: 0 to 1, if measured.
+
+    facts: what it was judged by, for the sentence that says why.
+    """
 
     say: LensAnswer | TargetAnswer | PhotographsAnswer
-    why: str
+    reason: LensReason | TargetReason | PhotographsReason
+    facts: LensFacts | TargetFacts | PhotographsFacts
     figure: Figure
     confidence: float | None
     bound: list[EffectBound] = field(default_factory=list)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what diagnosis.json holds."""
-        found = asdict(self) | {'figure': self.figure._asdict()}
-        if not self.bound:
-            del found['bound']
-        return found
 
 
 class LensOffset(NamedTuple):
@@ -137,117 +171,72 @@ class LensFacts(NamedTuple):
         """Intrinsics that only a change of the lens explains, confirmed as causes."""
         return [name for name in self.causes if name in _INTRINSIC]
 
+    @property
+    def likely_effects(self) -> list[EffectBound]:
+        """Effects that are not named and yet likely there, the costliest first."""
+        likely = (b for b in self.bounds if b.z > _HINT and b.edge_px > self.noise_px)
+        return sorted(likely, key=lambda bound: -bound.edge_px)
+
 
 def decide_lens(facts: LensFacts) -> Decision:
     """Return what to do about the lens."""
-    file, bounds = facts.file, facts.bounds
+    file, off, sure = facts.file, facts.offset, facts.file.sure
     gained = Figure('file_gain', file.gain, '1')
+
+    def decide(
+        say: LensAnswer, reason: LensReason, confidence: float | None, bounded: bool = False
+    ) -> Decision:
+        return Decision(say, reason, facts, gained, confidence, facts.bounds * bounded)
+
     if not facts.falling:
-        return Decision(
-            'undecided',
-            'the error on the fitted frames rises with the causes in the '
-            'model, so nothing is recommended',
-            gained,
-            0.0,
-            bounds,
-        )
-    if (off := facts.offset) is not None and off.matters(facts.noise_px):
-        return Decision(
-            'recalibrate',
-            f'the lens{off.camera and f" of {off.camera}"} as given is off by at '
-            f'least {off.mrad:.2g} mrad ({off.px:.2g} px) at 1 m, '
-            f'{off.ratio:.1f} times the combined standard error',
-            Figure('ray_error', off.mrad, 'mrad'),
-            1 - off.p_value,
-        )
+        return decide('undecided', LensReason.FITTED_ERROR_RISES, 0.0, bounded=True)
+    if off is not None and off.matters(facts.noise_px):
+        figure = Figure('ray_error', off.mrad, 'mrad')
+        return Decision('recalibrate', LensReason.OFF, facts, figure, 1 - off.p_value)
     if facts.frames < 2 and not facts.causes:
-        return Decision(
-            'undecided', f'{_ONE_FRAME}; take {_MIN_FRAMES} frames or more', gained, None
-        )
+        return decide('undecided', LensReason.ONE_FRAME, None)
     if facts.wrong_intrinsics:
-        return Decision(
-            'recalibrate',
-            f'the lens as given is wrong in {", ".join(facts.wrong_intrinsics)}',
-            gained,
-            file.sure,
-        )
+        return decide('recalibrate', LensReason.INTRINSICS_WRONG, sure)
     borne_out = facts.named_gain[0] > 0 if facts.causes else facts.has_likely_shift
     if borne_out and file.low > 0:
-        return Decision(
-            'use_extended',
-            'on the same corrected target it takes the held-out error from '
-            f'{file.given_px:.3g} to {file.extended_px:.3g} px',
-            gained,
-            file.sure,
-        )
-    return _doubt(facts, gained) or Decision('keep', _keep_text(bounds, off), gained, 0.95, bounds)
-
-
-def _doubt(facts: LensFacts, gained: Figure) -> Decision | None:
-    """Return why nothing can be said of the lens; None where it can."""
-    file, bounds = facts.file, facts.bounds
-    hints = sorted(
-        (one for one in bounds if one.z > _HINT and one.edge_px > facts.noise_px),
-        key=lambda one: -one.edge_px,
-    )
+        return decide('use_extended', LensReason.PREDICTS_BETTER, sure)
     if facts.causes and file.high < 0 < facts.named_gain[1]:
-        why, sure = (
-            (
-                f'held-out error {file.extended_px:.3g} px with the extended lens alone, '
-                f'{file.given_px:.3g} px with the lens as given; only all causes together '
-                'reduce it'
-            ),
-            1 - file.sure,
-        )
-    elif facts.lens_causes:
-        why, sure = (
-            (
-                f'it is not certain that {", ".join(facts.lens_causes)} in the lens reduces '
-                f'the held-out error ({file.given_px:.3g} → {file.extended_px:.3g} px): its '
-                f'probability is {100 * file.sure:.0f} %'
-            ),
-            file.sure,
-        )
-    elif hints:
-        why, sure = (
-            (
-                f'likely but not confirmed: {" or ".join(one.effect for one in hints)}, '
-                f'which may cause up to {hints[0].edge_px:.2g} px at the edge'
-            ),
-            erf(hints[0].z / 2**0.5),
-        )
-    else:
-        return None
-    return Decision('undecided', why, gained, sure, bounds)
+        reason = LensReason.LENS_ALONE_PREDICTS_WORSE
+        return decide('undecided', reason, 1 - sure, bounded=True)
+    if facts.lens_causes:
+        return decide('undecided', LensReason.GAIN_UNCERTAIN, sure, bounded=True)
+    if facts.likely_effects:
+        certainty = erf(facts.likely_effects[0].z / 2**0.5)
+        return decide('undecided', LensReason.EFFECT_LIKELY, certainty, bounded=True)
+    return decide('keep', LensReason.NOTHING_CONFIRMED, 0.95, bounded=True)
 
 
-def _keep_text(bounds: Sequence[EffectBound], off: LensOffset | None) -> str:
-    worst = max(bounds, key=lambda one: one.edge_px, default=None)
-    cost = (
-        ''
-        if worst is None
-        else (
-            f'; effects that these data do not exclude cause at most {worst.edge_px:.2g} px '
-            f'({worst.edge_mrad:.2g} mrad) at the edge'
-        )
-    )
-    fit = '' if off is None else ' and its parameters agree with these data within their errors'
-    return f'no cause in the lens is confirmed{fit}{cost}'
+class TargetError(NamedTuple):
+    """The largest error of the target, by the effect that names it.
+
+    size: m, from peak to valley, of a bent board; the relative error of a scale; how many
+    landmarks are displaced; 0 of others.  board: which one is bent, of several; stretched: whether
+    a scale differs along and across the board.
+    """
+
+    effect: str
+    size: float = 0.0
+    board: int | None = None
+    stretched: bool = False
 
 
 class TargetFacts(NamedTuple):
     """What the target is judged by.
 
-    causes: confirmed ones of the target; size: of the largest, in words; gain, low: what they take
-    away of the held-out error above noise, and the low end of that; named_px, local_px, noise_px:
+    largest: of its confirmed causes, None without; gain: what they take away of the held-out error
+    above noise, the low end of that, its confidence; named_px, local_px, noise_px:
     standard deviations of a coordinate by causes, by offsets without a name, and of noise;
     local_m: rms of those offsets; local_p: p-value of the least sure of their components;
     contradicted: whether the cameras of a rig contradict each other about the target; frames: how
     many.
     """
 
-    causes: Sequence[str]
-    size: str
+    largest: TargetError | None
     gain: tuple[float, float, float]
     named_px: float
     local_px: float
@@ -261,50 +250,30 @@ class TargetFacts(NamedTuple):
 def decide_target(facts: TargetFacts) -> Decision:
     """Return what to do about the target."""
     gain, low, sure = facts.gain
-    local = (
-        f'landmarks are displaced by {1e3 * facts.local_m:.2g} mm rms, which causes '
-        f'{facts.local_px:.2g} px'
-        if facts.local_m
-        else f'local offsets cause {facts.local_px:.2g} px'
-    )
+    offsets = Figure('local_offsets', facts.local_px, 'px')
+
+    def decide(
+        say: TargetAnswer, reason: TargetReason, confidence: float | None, figure: Figure = offsets
+    ) -> Decision:
+        return Decision(say, reason, facts, figure, confidence)
+
     if facts.contradicted:
-        return Decision(
-            'measure_again',
-            'the cameras contradict each other about its shape',
-            Figure('local_offsets', facts.local_px, 'px'),
-            None,
-        )
-    if facts.causes:
-        figure = Figure('gain', gain, '1')
+        return decide('measure_again', TargetReason.CAMERAS_CONTRADICT, None)
+    if facts.largest is not None:
+        gained = Figure('gain', gain, '1')
         if low > 0 and facts.local_px <= facts.named_px:
-            return Decision(
-                'correct',
-                f'{facts.size}; the correction removes {100 * gain:.0f} % '
-                'of the squared held-out error',
-                figure,
-                sure,
-            )
+            return decide('correct', TargetReason.CORRECTION_GAINS, sure, gained)
         if not facts.local_px:
-            return Decision(
-                'measure_again',
-                f'{facts.size}; the correction does not lower the held-out error significantly',
-                figure,
-                None,
-            )
-        return Decision('measure_again', f'{facts.size}; in addition, {local}', figure, sure)
-    figure = Figure('local_offsets', facts.local_px, 'px')
+            reason = TargetReason.CORRECTION_GAINS_NOTHING
+            return decide('measure_again', reason, None, gained)
+        return decide('measure_again', TargetReason.CAUSE_AND_OFFSETS, sure, gained)
     if facts.frames < 2:
-        return Decision('keep', f'its errors are unknown: {_ONE_FRAME}', figure, None)
+        return decide('keep', TargetReason.ONE_FRAME, None)
     if facts.local_px > facts.noise_px:
-        return Decision(
-            'measure_again',
-            f'{local}, more than the noise of {facts.noise_px:.2g} px',
-            figure,
-            1 - facts.local_p,
-        )
+        return decide('measure_again', TargetReason.OFFSETS_ABOVE_NOISE, 1 - facts.local_p)
     if facts.local_px > 0:
-        return Decision('keep', f'{local}, less than the noise', figure, 1 - facts.local_p)
-    return Decision('keep', 'its errors are below the noise', figure, 0.95)
+        return decide('keep', TargetReason.OFFSETS_BELOW_NOISE, 1 - facts.local_p)
+    return decide('keep', TargetReason.BELOW_NOISE, 0.95)
 
 
 class PhotographsFacts(NamedTuple):
@@ -326,43 +295,30 @@ class PhotographsFacts(NamedTuple):
     plannable: bool = True
     unit: str = 'frame'
 
+    @property
+    def ratio(self) -> float:
+        """The held-out error over what noise and scatter between frames leave."""
+        return self.heldout_px / max(self.scatter_px, 1e-9)
+
+    @property
+    def target_causes_rest(self) -> bool:
+        """Whether more than noise is held out, for which errors of the target are the reason."""
+        return self.is_target_off and self.ratio > _TARGET_RATIO
+
 
 def decide_photographs(facts: PhotographsFacts) -> Decision:
     """Return what to do about the photographs."""
-    times = facts.heldout_px / max(facts.scatter_px, 1e-9)
-    figure = Figure('held_out_over_noise', times, '1')
-    if facts.bad and len(facts.bad) >= _MAX_REJECTED_SHARE * facts.frames:
-        what = (
-            'scatter more than the others or are outliers'
-            if len(facts.bad) > 1
-            else 'scatters more than the others or is an outlier'
-        )
-        return Decision(
-            'retake', f'{len(facts.bad)} of {facts.frames} {what} as a whole', figure, None
-        )
-    if facts.frames < _MIN_FRAMES:
-        few = f'one {facts.unit} is' if facts.frames == 1 else f'{facts.frames} {facts.unit}s are'
-        return Decision('more', f'{few} too few; take {_MIN_FRAMES} or more', figure, None)
+    figure, many = Figure('held_out_over_noise', facts.ratio, '1'), _MAX_REJECTED_SHARE
+
+    def decide(say: PhotographsAnswer, reason: PhotographsReason) -> Decision:
+        return Decision(say, reason, facts, figure, None)
+
+    if facts.bad and len(facts.bad) >= many * facts.frames:
+        return decide('retake', PhotographsReason.SOME_ARE_WRONG)
+    if facts.frames < MIN_FRAMES:
+        return decide('more', PhotographsReason.TOO_FEW)
     if facts.lens == 'undecided':
-        how = '--next 6 lists the views that decide it'
-        if not facts.plannable:
-            how = 'cover the image to its edge, at different distances'
-        return Decision('more', f'the lens is undecided; {how}', figure, None)
-    if len(facts.unlike) >= _MAX_REJECTED_SHARE * facts.frames:
-        are = 'are' if len(facts.unlike) > 1 else 'is'
-        return Decision(
-            'more',
-            f'{len(facts.unlike)} of {facts.frames} {are} not predicted by the others',
-            figure,
-            None,
-        )
-    rest = ''
-    if facts.is_target_off and times > _TARGET_RATIO:
-        rest = '; the target causes the rest'
-    return Decision(
-        'enough',
-        f'{facts.frames} {facts.unit}s, held-out error {times:.1f} times '
-        f'what noise and scatter between frames leave{rest}',
-        figure,
-        None,
-    )
+        return decide('more', PhotographsReason.LENS_UNDECIDED)
+    if len(facts.unlike) >= many * facts.frames:
+        return decide('more', PhotographsReason.NOT_PREDICTED)
+    return decide('enough', PhotographsReason.PREDICTED)

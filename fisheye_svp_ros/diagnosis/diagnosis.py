@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +29,7 @@ from fisheye_svp_ros.diagnosis.written_lens import AveragedModel
 from fisheye_svp_ros.effects.target_map import BoardMap, board_maps
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scene.observations import photograph_names, rig_cameras
+from fisheye_svp_ros.scene.observations import rig_cameras
 from fisheye_svp_ros.solve.hand_eye import HandEye
 from fisheye_svp_ros.solve.rig_calibration import connected_cameras
 from fisheye_svp_ros.solve.rig_checks import has_no_rig
@@ -249,49 +249,3 @@ class Diagnosis:
             part.sd_px for part in self.components if part.name in ('noise', REPEATED_COMPONENT)
         ]
         return float(np.hypot.reduce(parts))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what diagnosis.json holds (design, section 7)."""
-        base, named, lens, extended = (
-            {name: value for name, value in asdict(fit).items() if value is not None}
-            for fit in self.figures[:4]
-        )
-        external: dict[str, Any] = {}
-        if self.cameras:
-            external['cameras'] = [pair.to_dict() for pair in self.cameras]
-        if self.against is not None:
-            external['sets'] = self.against.to_dict()
-        field = self.evaluation.written_field
-        return {
-            'verdict': self.verdict,
-            'noise_px': self.noise_px,
-            'frames': self.frames,
-            'observations': self.observations,
-            'base': base,
-            'components': [part._asdict() for part in self.components],
-            'causes': [{'effect': cause.effect, **asdict(cause)} for cause in self.causes],
-            'named': named,
-            'lens': {
-                **lens,
-                'ray_error_mrad': self.conclusion.ray_error_mrad(),
-                **self.averaged_model.to_dict(),
-                **({} if field is None else {'image_field': field.to_dict()}),
-            },
-            'extended': extended,
-            **self.conclusion.to_dict(),
-            'photographs': [
-                {'frame': frame, 'camera': camera, 'name': name}
-                for (frame, camera), name in photograph_names(self.problem.observations).items()
-            ],
-            'gross': self.gross,
-            'advice': [asdict(advice) for advice in self.advice],
-            'remaining': {'structure': [s._asdict() for s in self.remaining]},
-            'untestable': [{'effect': e, 'why': why} for e, why in self.untestable.items()],
-            'gain': self.figures.gain.interval,
-            'intrinsics': {name: asdict(value) for name, value in self.intrinsics.items()},
-            'uncertainty': self.uncertainty,
-            'trace': [asdict(step) for step in self.trace],
-            **({'external': external} if external else {}),
-            'turned': [asdict(one) for one in self.record.turned],
-            **({'hand_eye': self.hand_eye.to_dict()} if self.hand_eye else {}),
-        }

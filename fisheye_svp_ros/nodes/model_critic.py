@@ -35,6 +35,7 @@ from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.diagnosis_text import refusal_reason
 from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
+from fisheye_svp_ros.reporting.wording.decisions import decision_reason
 from fisheye_svp_ros.scene.observations import STEREO, Observations
 from fisheye_svp_ros.solve.measured_poses import posable_observations
 from fisheye_svp_ros.study.settings import RigSettings
@@ -290,7 +291,7 @@ def decisions(found: Diagnosis) -> dict[str, object]:
         unit = _suffix(one.figure.unit)
         words |= {
             f'decision_{name}': one.say,
-            f'decision_{name}_why': one.why,
+            f'decision_{name}_why': decision_reason(one),
             f'decision_{name}_{one.figure.name}{unit}': one.figure.value,
         }
         if one.confidence is not None:

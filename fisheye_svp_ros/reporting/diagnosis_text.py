@@ -21,6 +21,7 @@ from fisheye_svp_ros.reporting.cause_text import (
     probability,
     size,
 )
+from fisheye_svp_ros.reporting.wording.decisions import decision_reason
 from fisheye_svp_ros.scene.observations import frame_name
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
 
@@ -82,7 +83,8 @@ def refusal_reason(d: Diagnosis) -> str:
         return ''
     if d.is_lens_off:
         return 'It predicts held-out frames worse than the lens as given: calibrate again'
-    return f'It is not known to be better than the lens as given: {d.decision["lens"].why}'
+    why = decision_reason(d.decision['lens'])
+    return f'It is not known to be better than the lens as given: {why}'
 
 
 def only_gross(d: Diagnosis) -> bool:

@@ -40,6 +40,7 @@ from fisheye_svp_ros.reporting.diagnosis_text import (
     lens_words,
     only_gross,
 )
+from fisheye_svp_ros.reporting.wording.decisions import decision_reason
 from fisheye_svp_ros.scene.observations import photograph_names
 
 _MAX_NAMES = 4  # photographs, and candidates, by name
@@ -159,7 +160,7 @@ def first_screen(
 
 def _reason(decision: Decision, d: Diagnosis) -> str:
     """Return why, with the photographs whose board is numbered from another end."""
-    why = _capital(decision.why)
+    why = _capital(decision_reason(decision))
     if decision is not d.decision['photographs'] or not d.record.turned:
         return why
     names = [one.photograph for one in d.record.turned]
@@ -344,7 +345,7 @@ def largest_cause(d: Diagnosis) -> str:
     if d.frames < 2 and (d.candidates or d.decision['target'].figure.value > 0):
         return 'Errors show in one frame, which does not tell their cause'
     if d.decision['lens'].say == 'recalibrate':
-        return _capital(d.decision['lens'].why)
+        return _capital(decision_reason(d.decision['lens']))
     if only_gross(d):
         count = len(d.gross)
         return (
@@ -356,7 +357,7 @@ def largest_cause(d: Diagnosis) -> str:
         d.verdict == 'adequate' and d.decision['target'].figure.value > 0
     ):
         which = 'Only the target' if d.verdict == 'adequate' else 'The target'
-        return f'{which} is imperfect: {d.decision["target"].why}'
+        return f'{which} is imperfect: {decision_reason(d.decision["target"])}'
     if d.verdict == 'adequate':
         return (
             _capital(NO_CONFIRMED_ERROR)

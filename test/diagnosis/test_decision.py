@@ -15,8 +15,12 @@ from fisheye_svp_ros.diagnosis.decision import (
     FileFigure,
     LensFacts,
     LensOffset,
+    LensReason,
     PhotographsFacts,
+    PhotographsReason,
+    TargetError,
     TargetFacts,
+    TargetReason,
     decide_lens,
     decide_photographs,
     decide_target,
@@ -36,7 +40,7 @@ SOUND = LensFacts(
 def test_a_sound_lens_is_kept_with_the_bound() -> None:
     found = decide_lens(SOUND)
     assert found.say == 'keep' and found.bound == [SMALL] and found.confidence == 0.95
-    assert 'cause at most 0.02 px (0.05 mrad) at the edge' in found.why
+    assert found.reason == LensReason.NOTHING_CONFIRMED
 
 
 @pytest.mark.parametrize('causes', [[], ['target_shape']])
@@ -44,14 +48,8 @@ def test_a_lens_off_by_three_of_its_errors_is_to_be_calibrated_again(causes: lis
     """It was silently fitted anew, and called adequate."""
     off = SOUND._replace(offset=LensOffset(1.2, 3.0, 0.001, 1.5), causes=causes, file=BETTER)
     found = decide_lens(off)
-    assert found.say == 'recalibrate'
-    assert found.why == (
-        'the lens as given is off by at least 1.2 mrad (1.5 px) at 1 m, 3.0 '
-        'times the combined standard error'
-    )
-    assert off.offset is not None
-    left = decide_lens(off._replace(offset=off.offset._replace(camera='left')))
-    assert left.why.startswith('the lens of left as given is off')
+    assert (found.say, found.reason) == ('recalibrate', LensReason.OFF)
+    assert found.figure == ('ray_error', 1.2, 'mrad')
     assert found.confidence is not None and found.confidence > 0.99
 
 
@@ -82,7 +80,7 @@ def test_figures_that_disagree_leave_it_undecided() -> None:
 
 def test_what_is_likely_and_not_confirmed_keeps_the_lens_from_being_kept() -> None:
     found = decide_lens(SOUND._replace(bounds=[LIKELY]))
-    assert found.say == 'undecided' and 'up to 0.32 px at the edge' in found.why
+    assert (found.say, found.reason) == ('undecided', LensReason.EFFECT_LIKELY)
 
 
 def test_an_error_that_rises_on_the_fitted_frames_recommends_nothing() -> None:
@@ -93,33 +91,16 @@ def test_an_error_that_rises_on_the_fitted_frames_recommends_nothing() -> None:
     assert found.say == 'undecided' and found.confidence == 0.0
 
 
-@pytest.mark.parametrize(
-    'facts',
-    [
-        SOUND._replace(bounds=[LIKELY]),
-        SOUND._replace(
-            lens_causes=['sensor_tilt'], causes=['sensor_tilt'], named_gain=(0.1, 0.02)
-        ),
-        SOUND._replace(causes=['focal_length']),
-    ],
-)
-def test_no_reason_begins_with_the_name_of_an_effect(facts: LensFacts) -> None:
-    """Reasons begin sentences: the first screen had "Sensor_tilt is confirmed"."""
-    first = decide_lens(facts).why.split()[0]
-    assert '_' not in first and first in ('likely', 'it', 'the')
-
-
 TARGET = TargetFacts(
-    ['target_shape'],
-    'board 0 is bent by 0.81 mm',
-    (0.82, 0.76, 1.0),
-    0.137,
-    0.05,
-    4e-5,
-    1e-6,
-    0.043,
-    False,
-    12,
+    largest=TargetError('target_shape', 0.81e-3, board=0),
+    gain=(0.82, 0.76, 1.0),
+    named_px=0.137,
+    local_px=0.05,
+    local_m=4e-5,
+    local_p=1e-6,
+    noise_px=0.043,
+    contradicted=False,
+    frames=12,
 )
 
 
@@ -127,17 +108,17 @@ def test_the_target_is_judged_apart() -> None:
     assert decide_target(TARGET).say == 'correct'
     assert decide_target(TARGET._replace(local_px=0.2)).say == 'measure_again'
     assert decide_target(TARGET._replace(contradicted=True)).say == 'measure_again'
-    alone = TARGET._replace(causes=[], size='')
+    alone = TARGET._replace(largest=None)
     assert decide_target(alone).say == 'measure_again'
     harmless = decide_target(alone._replace(local_px=0.03))
-    assert harmless.say == 'keep' and 'landmarks are displaced by 0.04 mm rms' in harmless.why
+    assert (harmless.say, harmless.reason) == ('keep', TargetReason.OFFSETS_BELOW_NOISE)
     assert decide_target(alone._replace(local_px=0.0, local_m=0.0)).say == 'keep'
 
 
 def test_a_correction_that_gains_nothing_is_not_blamed_on_offsets_of_nothing() -> None:
     """Once "In addition, local offsets cause 0 px (0 % sure)" stood beside an assumed board."""
     found = decide_target(TARGET._replace(gain=(-0.2, -0.5, 0.0), local_px=0.0, local_m=0.0))
-    assert found.why.endswith('the correction does not lower the held-out error significantly')
+    assert found.reason == TargetReason.CORRECTION_GAINS_NOTHING
     assert found.confidence is None
 
 
@@ -147,44 +128,37 @@ def test_photographs_are_enough_or_not() -> None:
     assert decide_photographs(facts._replace(bad=['1.jpg', '2.jpg', '3.jpg'])).say == 'retake'
     assert decide_photographs(facts._replace(bad=['1.jpg'])).say == 'enough'
     few = facts._replace(frames=9)
-    assert decide_photographs(few._replace(bad=['1.jpg'])).why == (
-        '1 of 9 scatters more than the others or is an outlier as a whole'
-    )
-    assert '1 of 9 is not predicted' in decide_photographs(few._replace(unlike=['1.jpg'])).why
+    assert decide_photographs(few._replace(bad=['1.jpg'])).say == 'retake'
+    alone = decide_photographs(few._replace(unlike=['1.jpg']))
+    assert alone.reason == PhotographsReason.NOT_PREDICTED
     assert decide_photographs(facts._replace(frames=5)).say == 'more'
     assert decide_photographs(facts._replace(lens='undecided')).say == 'more'
-    open_ = facts._replace(lens='undecided', plannable=False)
-    assert '--next' not in decide_photographs(open_).why
     assert decide_photographs(facts._replace(unlike=['1', '2', '3', '4'])).say == 'more'
 
 
 def test_enough_photographs_with_a_large_error_say_where_it_is_from() -> None:
     """Once "Enough. Held-out error 15.6 times what noise leaves" asked for a reason."""
     facts = PhotographsFacts(26, [], [], 0.9, 0.09, 'keep', is_target_off=True)
-    assert decide_photographs(facts).why.endswith('leave; the target causes the rest')
-    assert decide_photographs(facts._replace(heldout_px=0.1)).why.endswith('frames leave')
-    assert decide_photographs(facts._replace(unit='view')).why.startswith('26 views, ')
-    assert decide_photographs(facts._replace(unit='view', frames=1)).why.startswith('one view ')
+    assert facts.target_causes_rest
+    assert not facts._replace(heldout_px=0.1).target_causes_rest
 
 
 def test_all_that_is_likely_is_named() -> None:
     """Of three effects that are alike, only one was."""
     tilt = EffectBound('sensor_tilt', 0.002, 'rad', 2.7, 0.31, 0.6)
     found = decide_lens(SOUND._replace(bounds=[LIKELY, SMALL, tilt]))
-    assert found.say == 'undecided'
-    assert 'viewpoint_shift or sensor_tilt, which may cause up to 0.32 px' in found.why
+    assert (found.say, found.reason) == ('undecided', LensReason.EFFECT_LIKELY)
+    assert isinstance(found.facts, LensFacts) and found.facts.likely_effects == [LIKELY, tilt]
 
 
 def test_one_frame_decides_nothing() -> None:
     """A board bent by 1.5 mm was called sound from one photograph, 95 % sure."""
     lens = decide_lens(SOUND._replace(frames=1))
-    assert lens.say == 'undecided' and 'one frame' in lens.why and not lens.bound
-    target = decide_target(
-        TARGET._replace(causes=[], size='', local_px=0.0, local_m=0.0, frames=1)
-    )
-    assert target.confidence is None and 'errors are unknown' in target.why
-    displaced = decide_target(TARGET._replace(causes=[], size='', frames=1))
-    assert displaced.say == 'keep' and displaced.why == target.why
+    assert (lens.say, lens.reason) == ('undecided', LensReason.ONE_FRAME) and not lens.bound
+    target = decide_target(TARGET._replace(largest=None, local_px=0.0, local_m=0.0, frames=1))
+    assert target.confidence is None and target.reason == TargetReason.ONE_FRAME
+    displaced = decide_target(TARGET._replace(largest=None, frames=1))
+    assert displaced.say == 'keep' and displaced.reason == target.reason
 
 
 def test_the_gain_of_all_offsets_is_not_that_of_one_landmark() -> None:
@@ -209,17 +183,17 @@ def test_the_worst_of_several_lenses_may_be_so_by_chance() -> None:
 
 
 @pytest.mark.parametrize(
-    ('effect', 'values', 'words'),
+    ('effect', 'values', 'expected'),
     [
-        ('landmark_survey', {'7.x': 1e-3, '7.y': 2e-3, '9.z': 1e-3}, '2 landmarks are displaced'),
-        ('landmark_survey', {'7.x': 1e-3, '7.y': 2e-3}, '1 landmark is displaced'),
-        ('landmark_scale', {'relative': -0.0047}, 'the scale of the board is off by 0.47 %'),
-        ('landmark_scale', {'x_over_y': 0.002}, 'the board is stretched by 0.2 %'),
-        ('board_pose', {'1.x': 1e-3}, 'the relative poses of its boards are wrong'),
+        ('landmark_survey', {'7.x': 1e-3, '7.y': 2e-3, '9.z': 1e-3}, (2, False)),
+        ('landmark_survey', {'7.x': 1e-3, '7.y': 2e-3}, (1, False)),
+        ('landmark_scale', {'relative': -0.0047}, (0.0047, False)),
+        ('landmark_scale', {'x_over_y': 0.002}, (0.002, True)),
+        ('board_pose', {'1.x': 1e-3}, (0.0, False)),
     ],
 )
-def test_the_largest_error_of_the_target_is_said(
-    effect: str, values: dict[str, float], words: str
+def test_the_largest_error_of_the_target(
+    effect: str, values: dict[str, float], expected: tuple[float, bool]
 ) -> None:
     cause = Cause(
         effect,
@@ -235,4 +209,6 @@ def test_the_largest_error_of_the_target_is_said(
     smaller = replace(
         cause, form='board_pose' if effect != 'board_pose' else 'landmark_survey', share=0.1
     )
-    assert _largest_error(None, [smaller, cause]) == words  # type: ignore[arg-type]
+    largest = _largest_error(None, [smaller, cause])  # type: ignore[arg-type]
+    size, stretched = expected
+    assert largest == TargetError(effect, size, stretched=stretched)

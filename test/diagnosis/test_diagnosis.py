@@ -18,6 +18,7 @@ from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import intrinsic_names
+from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
 from fisheye_svp_ros.scene.observations import Observations, views_of
 from fisheye_svp_ros.scene.table_checks import quantization_step, thin_out
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
@@ -445,7 +446,7 @@ def test_rigs_and_frames_that_see_little(kept):
     found = diagnose(table.take(kept(table)), lens(), free_intrinsics=True)
     assert not found.causes
     assert np.isfinite(found.figures.extended.rms_px)
-    found.to_dict()
+    diagnosis_document(found)
 
 
 def test_the_last_fit_is_the_best_under_the_last_variances():

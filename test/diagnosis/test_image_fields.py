@@ -14,6 +14,7 @@ from fisheye_svp_ros.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.diagnosis.written_lens import MIN_GAIN
 from fisheye_svp_ros.effects.forward import back_project, project
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 
 
@@ -47,13 +48,14 @@ def test_a_warp_is_written_and_brings_the_rays_nearer_to_the_truth(
     far = true_directions(uv, length)
     off = [errors_px(lens, far, uv) for lens in (replace(written, image_field=None), written)]
     assert off[1] < 0.75 * off[0]
-    entry = found.to_dict()['lens']['image_field']
+    entry = diagnosis_document(found)['lens']['image_field']
     assert entry['written']
     assert entry['refuted_by_frames'] == []
     assert entry['rms_px'] == pytest.approx(written.image_field.rms)
     # The field's own errors are among those of the rays, which are nearer than those of `given`.
     stated, given = (
-        found.to_dict()['lens']['ray_error_mrad'][which][-1] for which in ('extended', 'given')
+        diagnosis_document(found)['lens']['ray_error_mrad'][which][-1]
+        for which in ('extended', 'given')
     )
     truth = 1e3 * off[1] / AIR.fx
     assert 0.5 * stated['low'] < truth < 1.5 * stated['high']
@@ -89,5 +91,5 @@ def errors_px(lens: object, directions: np.ndarray, uv: np.ndarray) -> float:
 def test_none_is_written_for_a_clean_set(seed: int) -> None:
     found = diagnosed(0.0, seed)
     assert found.lens.image_field is None
-    entry = found.to_dict()['lens'].get('image_field')
+    entry = diagnosis_document(found)['lens'].get('image_field')
     assert entry is None or not entry['written']

@@ -16,6 +16,7 @@ from fisheye_svp_ros.diagnosis import TURNED, Diagnosis, DiagnosisOptions, diagn
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
 from fisheye_svp_ros.scene.boards import board_turns
@@ -61,7 +62,7 @@ def diagnosed(table: Observations) -> Diagnosis:
 def test_reversed_photographs_are_named_and_put_in_order() -> None:
     found, right = (diagnosed(photographs(1, 0.2, hidden)) for hidden in (HIDDEN, ()))
     assert [one.frame for one in found.record.turned] == list(HIDDEN)
-    for one in found.to_dict()['turned']:
+    for one in diagnosis_document(found)['turned']:
         assert one['photograph'] == f'left{one["frame"]:02d}.png'
         assert one['corrected'] and one['degrees'] == 180 and one['odds'] > 1e3
     assert not right.record.turned

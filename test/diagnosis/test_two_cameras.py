@@ -26,6 +26,7 @@ from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.io.rig_files import load_rig
+from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.reporting.external_text import sections
 from fisheye_svp_ros.reporting.first_screen import first_screen
@@ -53,7 +54,7 @@ def test_cameras_bear_each_other_out():
     assert all(one.with_px < 0.8 * one.without_px for one in said.target)
     assert {one.source for one in said.target} == {'left', 'right'}
     assert all(rig.low > 0 and rig.value > 0.3 for rig in said.rig.values())
-    document = found.to_dict()['external']['cameras'][0]
+    document = diagnosis_document(found)['external']['cameras'][0]
     assert set(document['rig']) == {'translation_m', 'rotation_rad'}
     assert 'agree' in sections(found)[0].sentence
 
@@ -61,7 +62,7 @@ def test_cameras_bear_each_other_out():
 def test_reversed_views_are_put_in_the_order_of_the_other_camera():
     seen = pair(replace(SMALL, reversed_frames=2), 3)
     found = diagnose(seen.table, seen.lenses, options=DiagnosisOptions(quick=True))
-    assert [one['frame'] for one in found.to_dict()['turned']] == seen.reversed_frames
+    assert [one['frame'] for one in diagnosis_document(found)['turned']] == seen.reversed_frames
     assert all(one.corrected and one.degrees == 180 for one in found.record.turned)
     assert [one.photograph for one in found.record.turned] == [
         f'frame {frame}' for frame in seen.reversed_frames

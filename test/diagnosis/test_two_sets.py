@@ -21,6 +21,7 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import write_observations
+from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
 from fisheye_svp_ros.reporting.external_text import sections
 
 SHIFT, SKEW = CATALOGUE['viewpoint_shift'](), CATALOGUE['skew']()
@@ -54,7 +55,7 @@ def test_what_moves_with_the_lens_holds_in_the_other_set():
     e0 = said.parameters['viewpoint_shift.e0']
     assert abs(e0.standardized_difference) < 3 and e0.value == pytest.approx(0.02, abs=0.003)
     assert 'hold in both sets' in sections(found)[0].sentence
-    assert found.to_dict()['external']['sets']['against'] == 'set 32'
+    assert diagnosis_document(found)['external']['sets']['against'] == 'set 32'
 
 
 def test_nothing_of_the_target_is_predicted_of_another_one():

@@ -19,6 +19,7 @@ from fisheye_svp_ros.diagnosis.written_lens import (
 )
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.curves import Gennery
+from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
 from fisheye_svp_ros.reporting.first_screen import first_screen
 
 
@@ -40,7 +41,7 @@ def test_a_shift_that_is_likely_and_not_named_is_written_in_part() -> None:
     assert known is not None and known['averaged_shift']['weight'] == pytest.approx(shift.weight)
     at = known['parameters'].index('e0')
     assert known['covariance'][at][at] == pytest.approx(shift.stderr**2, rel=1e-6)
-    assert found.to_dict()['lens']['averaged_shift'][0]['e0'] == pytest.approx(shift.e0)
+    assert diagnosis_document(found)['lens']['averaged_shift'][0]['e0'] == pytest.approx(shift.e0)
 
 
 def test_the_mean_is_that_of_two_models_weighed_by_their_evidence() -> None:

@@ -210,9 +210,7 @@ def test_a_likely_shift_is_not_told_as_no_model_error(found: Diagnosis) -> None:
 
 def test_a_lens_that_is_off_is_all_that_is_wrong(found: Diagnosis) -> None:
     """The verdict was explained, and the sentence below it "no effect explains them: ."."""
-    off = replace(
-        _deciding(found, 'lens', say='recalibrate', why='the lens is off'), causes=[], remaining=[]
-    )
+    off = replace(_deciding(found, 'lens', say='recalibrate'), causes=[], remaining=[])
     wrong, gained, _ = verdict_sentences(off)
     assert off.verdict == 'explained'
     assert wrong.startswith('Nothing but the intrinsics as given is wrong in these data')

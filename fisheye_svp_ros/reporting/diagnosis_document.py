@@ -1,0 +1,74 @@
+"""diagnosis.json: facts of a diagnosis by the keys of the design, with their sentences."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from fisheye_svp_ros.diagnosis import Decision, Diagnosis
+from fisheye_svp_ros.reporting.wording.decisions import decision_reason
+from fisheye_svp_ros.scene.observations import photograph_names
+
+
+def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
+    """Return what diagnosis.json holds (design, section 7)."""
+    base, named, lens, extended = (
+        {name: value for name, value in asdict(fit).items() if value is not None}
+        for fit in d.figures[:4]
+    )
+    field = d.evaluation.written_field
+    return {
+        'verdict': d.verdict,
+        'noise_px': d.noise_px,
+        'frames': d.frames,
+        'observations': d.observations,
+        'base': base,
+        'components': [part._asdict() for part in d.components],
+        'causes': [{'effect': cause.effect, **asdict(cause)} for cause in d.causes],
+        'named': named,
+        'lens': {
+            **lens,
+            'ray_error_mrad': d.conclusion.ray_error_mrad(),
+            **d.averaged_model.to_dict(),
+            **({} if field is None else {'image_field': field.to_dict()}),
+        },
+        'extended': extended,
+        'file': d.file._asdict(),
+        'candidates': [asdict(one) for one in d.candidates],
+        'decision': {name: _decision(one) for name, one in d.decision.items()},
+        'photographs': [
+            {'frame': frame, 'camera': camera, 'name': name}
+            for (frame, camera), name in photograph_names(d.problem.observations).items()
+        ],
+        'gross': d.gross,
+        'advice': [asdict(advice) for advice in d.advice],
+        'remaining': {'structure': [s._asdict() for s in d.remaining]},
+        'untestable': [{'effect': e, 'why': why} for e, why in d.untestable.items()],
+        'gain': d.figures.gain.interval,
+        'intrinsics': {name: asdict(value) for name, value in d.intrinsics.items()},
+        'uncertainty': d.uncertainty,
+        'trace': [asdict(step) for step in d.trace],
+        **_external(d),
+        'turned': [asdict(one) for one in d.record.turned],
+        **({'hand_eye': d.hand_eye.to_dict()} if d.hand_eye else {}),
+    }
+
+
+def _decision(one: Decision) -> dict[str, Any]:
+    bound = {'bound': [asdict(bound) for bound in one.bound]} if one.bound else {}
+    return {
+        'say': one.say,
+        'why': decision_reason(one),
+        'figure': one.figure._asdict(),
+        'confidence': one.confidence,
+        **bound,
+    }
+
+
+def _external(d: Diagnosis) -> dict[str, Any]:
+    external: dict[str, Any] = {}
+    if d.cameras:
+        external['cameras'] = [pair.to_dict() for pair in d.cameras]
+    if d.against is not None:
+        external['sets'] = d.against.to_dict()
+    return {'external': external} if external else {}

@@ -1,0 +1,151 @@
+"""Why something is to be done about lens, target and photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fisheye_svp_ros.diagnosis import (
+    MIN_FRAMES,
+    Decision,
+    LensFacts,
+    LensReason,
+    PhotographsFacts,
+    PhotographsReason,
+    TargetError,
+    TargetFacts,
+    TargetReason,
+)
+
+_ONE_FRAME = 'one frame does not tell errors of the lens from those of the target'
+
+
+def decision_reason(decision: Decision) -> str:
+    """Return why, as a clause that begins in lower case and ends without a stop."""
+    return _reasons(decision.facts)[decision.reason]
+
+
+def _reasons(facts: LensFacts | TargetFacts | PhotographsFacts) -> Mapping[Any, str]:
+    if isinstance(facts, LensFacts):
+        return _lens_reasons(facts)
+    if isinstance(facts, TargetFacts):
+        return _target_reasons(facts)
+    return _photographs_reasons(facts)
+
+
+def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
+    """Return the clause of each reason."""
+    file = facts.file
+    return {
+        LensReason.FITTED_ERROR_RISES: 'the error on the fitted frames rises with the causes in '
+        'the model, so nothing is recommended',
+        LensReason.OFF: _offset(facts),
+        LensReason.ONE_FRAME: f'{_ONE_FRAME}; take {MIN_FRAMES} frames or more',
+        LensReason.INTRINSICS_WRONG: 'the lens as given is wrong in '
+        f'{", ".join(facts.wrong_intrinsics)}',
+        LensReason.PREDICTS_BETTER: 'on the same corrected target it takes the held-out error '
+        f'from {file.given_px:.3g} to {file.extended_px:.3g} px',
+        LensReason.LENS_ALONE_PREDICTS_WORSE: f'held-out error {file.extended_px:.3g} px with the '
+        f'extended lens alone, {file.given_px:.3g} px with the lens as given; only all causes '
+        'together reduce it',
+        LensReason.GAIN_UNCERTAIN: f'it is not certain that {", ".join(facts.lens_causes)} in the '
+        f'lens reduces the held-out error ({file.given_px:.3g} → {file.extended_px:.3g} px): its '
+        f'probability is {100 * file.sure:.0f} %',
+        LensReason.EFFECT_LIKELY: _likely_effects(facts),
+        LensReason.NOTHING_CONFIRMED: _nothing_confirmed(facts),
+    }
+
+
+def _offset(facts: LensFacts) -> str:
+    off = facts.offset
+    if off is None:
+        return ''
+    return (
+        f'the lens{off.camera and f" of {off.camera}"} as given is off by at least '
+        f'{off.mrad:.2g} mrad ({off.px:.2g} px) at 1 m, {off.ratio:.1f} times the combined '
+        'standard error'
+    )
+
+
+def _likely_effects(facts: LensFacts) -> str:
+    likely = facts.likely_effects
+    if not likely:
+        return ''
+    return (
+        f'likely but not confirmed: {" or ".join(one.effect for one in likely)}, '
+        f'which may cause up to {likely[0].edge_px:.2g} px at the edge'
+    )
+
+
+def _nothing_confirmed(facts: LensFacts) -> str:
+    worst = max(facts.bounds, key=lambda one: one.edge_px, default=None)
+    fit = ' and its parameters agree with these data within their errors' if facts.offset else ''
+    cost = ''
+    if worst is not None:
+        cost = (
+            f'; effects that these data do not exclude cause at most {worst.edge_px:.2g} px '
+            f'({worst.edge_mrad:.2g} mrad) at the edge'
+        )
+    return f'no cause in the lens is confirmed{fit}{cost}'
+
+
+def _target_reasons(facts: TargetFacts) -> dict[TargetReason, str]:
+    """Return the clause of each reason."""
+    local = f'local offsets cause {facts.local_px:.2g} px'
+    if facts.local_m:
+        local = (
+            f'landmarks are displaced by {1e3 * facts.local_m:.2g} mm rms, which causes '
+            f'{facts.local_px:.2g} px'
+        )
+    largest = target_error(facts.largest) if facts.largest else ''
+    return {
+        TargetReason.CAMERAS_CONTRADICT: 'the cameras contradict each other about its shape',
+        TargetReason.CORRECTION_GAINS: f'{largest}; the correction removes '
+        f'{100 * facts.gain[0]:.0f} % of the squared held-out error',
+        TargetReason.CORRECTION_GAINS_NOTHING: f'{largest}; the correction does not lower the '
+        'held-out error significantly',
+        TargetReason.CAUSE_AND_OFFSETS: f'{largest}; in addition, {local}',
+        TargetReason.ONE_FRAME: f'its errors are unknown: {_ONE_FRAME}',
+        TargetReason.OFFSETS_ABOVE_NOISE: f'{local}, more than the noise of '
+        f'{facts.noise_px:.2g} px',
+        TargetReason.OFFSETS_BELOW_NOISE: f'{local}, less than the noise',
+        TargetReason.BELOW_NOISE: 'its errors are below the noise',
+    }
+
+
+def target_error(error: TargetError) -> str:
+    """Return how large the largest error of the target is, as the start of a sentence."""
+    if error.effect == 'target_shape':
+        which = 'the board' if error.board is None else f'board {error.board}'
+        return f'{which} is bent by {1e3 * error.size:.2g} mm'
+    if error.effect == 'landmark_survey':
+        return f'{error.size:.0f} landmark{"s are" if error.size > 1 else " is"} displaced'
+    if error.effect == 'landmark_scale':
+        what = 'the board is stretched' if error.stretched else 'the scale of the board is off'
+        return f'{what} by {100 * error.size:.2g} %'
+    if error.effect == 'board_pose':
+        return 'the relative poses of its boards are wrong'
+    return f'confirmed cause: {error.effect}'
+
+
+def _photographs_reasons(facts: PhotographsFacts) -> dict[PhotographsReason, str]:
+    """Return the clause of each reason."""
+    count, unit = facts.frames, facts.unit
+    bad, unlike = len(facts.bad), len(facts.unlike)
+    wrong = 'scatter more than the others or are outliers'
+    if bad == 1:
+        wrong = 'scatters more than the others or is an outlier'
+    few = f'one {unit} is' if count == 1 else f'{count} {unit}s are'
+    remedy = 'cover the image to its edge, at different distances'
+    if facts.plannable:
+        remedy = '--next 6 lists the views that decide it'
+    rest = '; the target causes the rest' if facts.target_causes_rest else ''
+    return {
+        PhotographsReason.SOME_ARE_WRONG: f'{bad} of {count} {wrong} as a whole',
+        PhotographsReason.TOO_FEW: f'{few} too few; take {MIN_FRAMES} or more',
+        PhotographsReason.LENS_UNDECIDED: f'the lens is undecided; {remedy}',
+        PhotographsReason.NOT_PREDICTED: f'{unlike} of {count} {"are" if unlike > 1 else "is"} '
+        'not predicted by the others',
+        PhotographsReason.PREDICTED: f'{count} {unit}s, held-out error {facts.ratio:.1f} times '
+        f'what noise and scatter between frames leave{rest}',
+    }

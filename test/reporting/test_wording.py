@@ -1,0 +1,167 @@
+"""Sentences about facts: the one place where tests hold wording."""
+
+from __future__ import annotations
+
+import pytest
+
+from fisheye_svp_ros.diagnosis import (
+    Decision,
+    LensFacts,
+    LensReason,
+    PhotographsFacts,
+    PhotographsReason,
+    TargetError,
+    TargetFacts,
+    TargetReason,
+)
+from fisheye_svp_ros.diagnosis.decision import EffectBound, Figure, FileFigure, LensOffset
+from fisheye_svp_ros.reporting.wording.decisions import decision_reason, target_error
+
+LENS = LensFacts(
+    lens_causes=['sensor_tilt'],
+    causes=['sensor_tilt', 'focal_length'],
+    has_likely_shift=False,
+    named_gain=(0.1, 0.02),
+    file=FileFigure(0.123, 0.081, 0.75, 0.6, 0.84, 0.93),
+    offset=LensOffset(1.2, 3.0, 0.001, 1.5),
+    bounds=[EffectBound('viewpoint_shift', 0.0092, 'm', 2.6, 0.32, 0.58)],
+    noise_px=0.05,
+    falling=True,
+    frames=12,
+)
+TARGET = TargetFacts(
+    largest=TargetError('target_shape', 0.81e-3, board=0),
+    gain=(0.82, 0.76, 1.0),
+    named_px=0.137,
+    local_px=0.05,
+    local_m=4e-5,
+    local_p=1e-6,
+    noise_px=0.043,
+    contradicted=False,
+    frames=12,
+)
+PHOTOGRAPHS = PhotographsFacts(26, ['1.jpg'], ['1.jpg'], 0.9, 0.09, 'keep', is_target_off=True)
+_MAX_WORDS = 25
+
+
+def _reason(
+    reason: LensReason | TargetReason | PhotographsReason,
+    facts: LensFacts | TargetFacts | PhotographsFacts,
+) -> str:
+    return decision_reason(Decision('keep', reason, facts, Figure('', 0.0, ''), None))
+
+
+ALL = [
+    *((reason, LENS) for reason in LensReason),
+    *((reason, TARGET) for reason in TargetReason),
+    *((reason, PHOTOGRAPHS) for reason in PhotographsReason),
+]
+
+
+@pytest.mark.parametrize(('reason', 'facts'), ALL)
+def test_every_reason_is_a_short_clause(
+    reason: LensReason | TargetReason | PhotographsReason,
+    facts: LensFacts | TargetFacts | PhotographsFacts,
+) -> None:
+    """The first screen had "Sensor_tilt is confirmed": a sentence begins with no effect."""
+    text = _reason(reason, facts)
+    assert text and not text.endswith('.') and '_' not in text.split()[0]
+    assert all(len(clause.split()) <= _MAX_WORDS for clause in text.split(';'))
+
+
+@pytest.mark.parametrize(
+    ('reason', 'facts', 'text'),
+    [
+        (
+            LensReason.OFF,
+            LENS,
+            'the lens as given is off by at least 1.2 mrad (1.5 px) at 1 m, 3.0 times the '
+            'combined standard error',
+        ),
+        (
+            LensReason.PREDICTS_BETTER,
+            LENS,
+            'on the same corrected target it takes the held-out error from 0.123 to 0.081 px',
+        ),
+        (
+            LensReason.EFFECT_LIKELY,
+            LENS,
+            'likely but not confirmed: viewpoint_shift, which may cause up to 0.32 px at the edge',
+        ),
+        (
+            LensReason.NOTHING_CONFIRMED,
+            LENS,
+            'no cause in the lens is confirmed and its parameters agree with these data within '
+            'their errors; effects that these data do not exclude cause at most 0.32 px '
+            '(0.58 mrad) at the edge',
+        ),
+        (
+            TargetReason.OFFSETS_BELOW_NOISE,
+            TARGET,
+            'landmarks are displaced by 0.04 mm rms, which causes 0.05 px, less than the noise',
+        ),
+        (
+            TargetReason.CORRECTION_GAINS,
+            TARGET,
+            'board 0 is bent by 0.81 mm; the correction removes 82 % of the squared held-out '
+            'error',
+        ),
+        (
+            PhotographsReason.SOME_ARE_WRONG,
+            PHOTOGRAPHS,
+            '1 of 26 scatters more than the others or is an outlier as a whole',
+        ),
+        (
+            PhotographsReason.NOT_PREDICTED,
+            PHOTOGRAPHS,
+            '1 of 26 is not predicted by the others',
+        ),
+        (
+            PhotographsReason.TOO_FEW,
+            PHOTOGRAPHS._replace(unit='view', frames=1),
+            'one view is too few; take 8 or more',
+        ),
+        (
+            PhotographsReason.PREDICTED,
+            PHOTOGRAPHS,
+            '26 frames, held-out error 10.0 times what noise and scatter between frames leave; '
+            'the target causes the rest',
+        ),
+    ],
+)
+def test_why_something_is_to_be_done(
+    reason: LensReason | TargetReason | PhotographsReason,
+    facts: LensFacts | TargetFacts | PhotographsFacts,
+    text: str,
+) -> None:
+    assert _reason(reason, facts) == text
+
+
+def test_a_lens_of_a_rig_is_told_by_its_camera() -> None:
+    assert LENS.offset is not None
+    left = LENS._replace(offset=LENS.offset._replace(camera='left'))
+    assert _reason(LensReason.OFF, left).startswith('the lens of left as given is off')
+
+
+def test_views_are_planned_only_where_they_can_be() -> None:
+    reason = PhotographsReason.LENS_UNDECIDED
+    assert '--next' in _reason(reason, PHOTOGRAPHS)
+    assert '--next' not in _reason(reason, PHOTOGRAPHS._replace(plannable=False))
+
+
+@pytest.mark.parametrize(
+    ('error', 'text'),
+    [
+        (TargetError('target_shape', 0.81e-3), 'the board is bent by 0.81 mm'),
+        (TargetError('landmark_survey', 2), '2 landmarks are displaced'),
+        (TargetError('landmark_survey', 1), '1 landmark is displaced'),
+        (TargetError('landmark_scale', 0.0047), 'the scale of the board is off by 0.47 %'),
+        (
+            TargetError('landmark_scale', 0.002, stretched=True),
+            'the board is stretched by 0.2 %',
+        ),
+        (TargetError('board_pose'), 'the relative poses of its boards are wrong'),
+    ],
+)
+def test_the_largest_error_of_the_target_is_said(error: TargetError, text: str) -> None:
+    assert target_error(error) == text
