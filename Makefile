@@ -24,7 +24,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
-.PHONY: demo check test tests coverage lint paper paper-search blind blind-independent blind-images averaging image-field ray-coverage guided detectors docs bench compare decisions rectification hand-eye rigs kills mutation poses fuzz soak test-oldest clean
+.PHONY: demo check test tests coverage lint paper docs study hardening peers bench test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -53,56 +53,33 @@ lint: $(VENV)/ready
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-# The paper's tables and figures beside ours; then the search for what the paper does not print
-# (some minutes), which overwrites what it found before in config/.
+# The paper's tables and figures beside ours.
 paper: $(VENV)/ready
 	$(BIN)/fisheye-svp paper -o $(OUT)/paper
-
-paper-search: $(VENV)/ready
-	$(BIN)/python -m benchmark.paper search
-	$(BIN)/python -m benchmark.paper stopping
 
 # The site, with the Python API and a search, into out/site; needs no network.
 docs: $(VENV)/ready
 	$(BIN)/sphinx-build -W --keep-going -q docs $(OUT)/site
 
-# All blind tests of the diagnosis; takes long.
-blind: $(VENV)/ready
-	$(BIN)/python -m benchmark.blind --trials 200
-	$(BIN)/python -m benchmark.local_errors --trials 200
+# A study of simulated sets, into docs/results/: make study NAME=decisions [ARGS='--trials 20'].
+# Names are the modules of benchmark/studies/; minutes to hours.
+study: $(VENV)/ready
+	$(BIN)/python -m benchmark.studies.$(NAME) $(ARGS)
 
-# The same through rendered photographs: only the pictures are handed over; takes long, too.
-blind-images: $(VENV)/ready
-	$(BIN)/python -m benchmark.blind_images --trials 100
+# Hostile input, killed commands, small faults in the code, frozen answers:
+# make hardening NAME=fuzz, soak, kills (as root), mutation or frozen; minutes to hours.
+hardening: $(VENV)/ready
+	$(if $(filter mutation,$(NAME)),$(BIN)/pip install --quiet 'cosmic-ray>=8.3' 'pytest-cov>=7')
+	$(BIN)/python -m benchmark.hardening.$(NAME) $(ARGS)
 
-# What is decided about lenses whose truth is known, into docs/results/decisions.md.
-decisions: $(VENV)/ready
-	$(BIN)/python -m benchmark.decisions --trials 60
-
-# How accurate detected corners are, into docs/results/detectors.md.
-detectors: $(VENV)/ready
-	$(BIN)/python -m benchmark.detectors --count 60
-
-# The same with data of a generator that shares no code with the package; takes long, too, and
-# goes on where it was interrupted.
-blind-independent: $(VENV)/ready
-	$(BIN)/python -m benchmark.independent --trials 69 -o $(OUT)/blind_independent
-
-# What averaging over a viewpoint shift is worth, into docs/results/averaging.md and a picture.
-averaging: $(VENV)/ready
-	$(BIN)/python -m benchmark.averaging --sets 120
-
-# What the image field in a lens file is worth, into docs/results/image_field.md.
-image-field: $(VENV)/ready
-	$(BIN)/python -m benchmark.image_field --sets 30
-
-# Whether stated ray errors contain the true ones, into docs/results/ray_coverage.md.
-ray-coverage: $(VENV)/ready
-	$(BIN)/python -m benchmark.ray_coverage --sets 50
-
-# The live guide tried on rendered images by somebody who holds the board, into docs/results/next/.
-guided: $(VENV)/ready
-	$(BIN)/python -m benchmark.guided
+# The same corners through other tools, into docs/results/: make peers NAME=compare ARGS=DATA,
+# rectification, rigs or hand_eye; a minute to half an hour.
+PEERS_compare := .venv-compare
+PEERS_rectification := .venv-compare
+PEERS_rigs := $(VENV)
+PEERS_hand_eye := .venv-hand-eye
+peers: $(PEERS_$(NAME))/ready $(if $(filter rigs,$(NAME)),.venv-rigs/ready)
+	$(PEERS_$(NAME))/bin/python -m benchmark.peers.$(NAME) $(ARGS)
 
 # Speed beside what a user would pick instead, into docs/results/benchmarks.md; leave the machine alone.
 bench: .venv-bench/ready
@@ -118,40 +95,9 @@ bench: .venv-bench/ready
 		.venv-bench/mrcal || echo 'mrcal: no sources to be had; its rows are left out'
 	touch $@
 
-# Held-out corners of real cameras through other calibrations, and halves of their frames, into
-# docs/results/compare.md; half an hour.
-COMPARE_PYTHON ?= python3.12
-COMPARE_DATA ?= data
-compare: .venv-compare/ready
-	.venv-compare/bin/python -m benchmark.compare $(COMPARE_DATA)
-
-# Rectified pairs of a lens whose viewpoint moves beside mrcal's and OpenCV's, into
-# docs/results/rectification.md; a minute.
-rectification: .venv-compare/ready
-	.venv-compare/bin/python -m benchmark.rectification
-
-# Rigs of four cameras beside OpenCV's multiview calibration, multical and pycolmap, into
-# docs/results/rigs.md; ten minutes.
-rigs: $(VENV)/ready .venv-rigs/ready
-	$(BIN)/python -m benchmark.rigs
-
-.venv-rigs/ready:
-	$(PYTHON) -m venv .venv-rigs
-	.venv-rigs/bin/pip install --quiet multical==0.4.0 pycolmap 'numpy<2'
-	touch $@
-
-# Cameras on robots beside OpenCV's hand-eye calibration, which OpenCV 5 has no more, into
-# docs/results/hand_eye.md; five minutes.
-hand-eye: .venv-hand-eye/ready
-	.venv-hand-eye/bin/python -m benchmark.hand_eye
-
-.venv-hand-eye/ready: setup.py
-	$(PYTHON) -m venv .venv-hand-eye
-	$(QUIETLY) .venv-hand-eye/bin/pip install --quiet -e '.[fast]' 'opencv-python-headless<5'
-	touch $@
-
 # mrcal without what only its windows need, which wants to be compiled; the others without the
 # OpenCV that they ask for, which would overwrite the one that is here.
+COMPARE_PYTHON ?= python3.12
 .venv-compare/ready: setup.py
 	@echo "Installing what is compared into .venv-compare: some minutes, this once"
 	$(COMPARE_PYTHON) -m venv .venv-compare
@@ -160,29 +106,16 @@ hand-eye: .venv-hand-eye/ready
 		--no-deps $$peer || echo "$$peer: not to be had here"; done
 	touch $@
 
-# What spoilt views do to poses, into docs/results/reliability.md; ten minutes.
-poses: $(VENV)/ready
-	$(BIN)/python -m benchmark.poses
+.venv-rigs/ready:
+	$(PYTHON) -m venv .venv-rigs
+	.venv-rigs/bin/pip install --quiet multical==0.4.0 pycolmap 'numpy<2'
+	touch $@
 
-# Hostile input by the million for every reader, table and callback, into docs/results/reliability.md;
-# half an hour.
-fuzz: $(VENV)/ready
-	$(BIN)/python -m benchmark.fuzz
-
-# A million hostile messages over DDS against running nodes, into docs/results/reliability.md; half an hour.
-soak: $(VENV)/ready
-	$(BIN)/python -m benchmark.soak
-
-# What is left of a command that is killed, or may not write, into docs/results/reliability.md; needs root
-# for its small disks; an hour.
-kills: $(VENV)/ready
-	$(BIN)/python -m benchmark.kills
-
-# How many of 300 small faults the tests find, into docs/results/mutation.md; goes on where it was
-# interrupted; one and a half hours.
-mutation: $(VENV)/ready
-	$(BIN)/pip install --quiet 'cosmic-ray>=8.3' 'pytest-cov>=7'
-	$(BIN)/python -m benchmark.mutation --sample 300
+# OpenCV 5 has no hand-eye calibration any more.
+.venv-hand-eye/ready: setup.py
+	$(PYTHON) -m venv .venv-hand-eye
+	$(QUIETLY) .venv-hand-eye/bin/pip install --quiet -e '.[fast]' 'opencv-python-headless<5'
+	touch $@
 
 # The oldest versions that are supported: those of Ubuntu 24.04 and OpenCV 4.6.
 test-oldest:
@@ -200,4 +133,4 @@ $(VENV)/ready: setup.py
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-oldest .venv-bench .venv-compare $(OUT)
+	rm -rf $(VENV) .venv-oldest .venv-bench .venv-compare .venv-rigs .venv-hand-eye $(OUT)

@@ -1,4 +1,4 @@
-"""Results of studies that take minutes, as `python -m benchmark.paper` left them in config/."""
+"""Results of studies that take minutes, as `make study NAME=paper` left them in config/."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.paper.tables import CALIBRATION, LENSES
 from fisheye_svp_ros.scene.observations import RADII, SPREADS
 
-COMMAND = 'make paper-search'
+COMMAND = 'make study NAME=paper'
 NAMES = ('f', 's0', 'e0', 'e1', 'e2')
 CELLS_NEEDED = 35  # of 36 z and residual cells within 10 %: what counts as a fit
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmark.averaging import Outcome, report
-from benchmark.boards import draw_lens, draw_set, image_points
+from benchmark.studies.averaging import Outcome, report
+from benchmark.studies.boards import draw_lens, draw_set, image_points
 from benchmark.study import ray_error
 from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.optics.curves import Gennery

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from benchmark.blind import run
-from benchmark.blind_effects import HIDDEN
-from benchmark.blind_oracle import LinearScene
-from benchmark.blind_outside import OUTSIDE
-from benchmark.blind_scene import FARTHEST, NEAREST, Needs, draw_scene
-from benchmark.blind_trial import Outcome, Task, draw_case, run_trial
+from benchmark.studies.blind import run
+from benchmark.studies.blind_effects import HIDDEN
+from benchmark.studies.blind_oracle import LinearScene
+from benchmark.studies.blind_outside import OUTSIDE
+from benchmark.studies.blind_scene import FARTHEST, NEAREST, Needs, draw_scene
+from benchmark.studies.blind_trial import Outcome, Task, draw_case, run_trial
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect

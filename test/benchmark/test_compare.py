@@ -10,8 +10,9 @@ import pytest
 from helpers.targets import plane, poses_around
 
 import fisheye_svp_ros as fsvp
-from benchmark.compare.__main__ import Row, halves_table
-from benchmark.compare.halves import (
+from benchmark.peers.calibrations import PEERS, NotHereError, opencv_fisheye, vnlog, warped_places
+from benchmark.peers.compare import Row, halves_table
+from benchmark.peers.halves import (
     Difference,
     all_pairs,
     fixed_halves,
@@ -19,10 +20,9 @@ from benchmark.compare.halves import (
     honesty_table,
     whole,
 )
-from benchmark.compare.peers import PEERS, NotHereError, opencv_fisheye, vnlog, warped_places
-from benchmark.compare.python_peers import PYTHON_PEERS
-from benchmark.compare.scoring import residuals, rms
-from benchmark.compare.sets import BOARDS, Set, grid_of, one_board_a_frame
+from benchmark.peers.python_calibrations import PYTHON_PEERS
+from benchmark.peers.scoring import residuals, rms
+from benchmark.peers.sets import BOARDS, Set, grid_of, one_board_a_frame
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.curves import KannalaBrandt

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmark.decisions import KINDS, Outcome, report, run
+from benchmark.studies.decisions import KINDS, Outcome, report, run
 
 
 def test_a_sound_lens_is_kept():

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from benchmark.frozen import Case, compare, differences, outcome
+from benchmark.hardening.frozen import Case, compare, differences, outcome
 from fisheye_svp_ros.io.files import write_json
 from fisheye_svp_ros.io.share import lens_path
 

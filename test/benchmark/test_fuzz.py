@@ -1,4 +1,4 @@
-"""A few seconds of what `make fuzz` does for half an hour."""
+"""A few seconds of what `make hardening NAME=fuzz` does for half an hour."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from helpers.nodes import ROOT
 
-from benchmark.fuzz.mutations import mutated
-from benchmark.fuzz.surfaces import surfaces
-from benchmark.fuzz.trials import Outcome, trial_of, tried
+from benchmark.hardening.fuzz.mutations import mutated
+from benchmark.hardening.fuzz.surfaces import surfaces
+from benchmark.hardening.fuzz.trials import Outcome, trial_of, tried
 from fisheye_svp_ros.errors import FisheyeSvpError, LensError
 
 hypothesis = pytest.importorskip('hypothesis')
@@ -45,7 +45,7 @@ def test_a_short_run_over_all_surfaces_finds_no_fault() -> None:
         [
             sys.executable,
             '-m',
-            'benchmark.fuzz',
+            'benchmark.hardening.fuzz',
             '--inputs',
             '2500',
             '--workers',

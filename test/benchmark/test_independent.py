@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmark import independent
-from benchmark.independent import report, run
-from benchmark.independent.adjust import Free
-from benchmark.independent.background import draw_background
-from benchmark.independent.camera import (
+from benchmark.studies import independent
+from benchmark.studies.independent import report, run
+from benchmark.studies.independent.adjust import Free
+from benchmark.studies.independent.background import draw_background
+from benchmark.studies.independent.camera import (
     behind_window,
     draw_lens,
     incidence,
@@ -25,12 +25,12 @@ from benchmark.independent.camera import (
     point_jacobian,
     project,
 )
-from benchmark.independent.effects import EFFECTS
-from benchmark.independent.formation import Departure, form, observed, simulated
-from benchmark.independent.generator import CATALOGUE, SIZES, generate, plan, write
-from benchmark.independent.outside import OUTSIDE
-from benchmark.independent.scene import draw_scene, in_camera
-from benchmark.independent.score import score, stage_right
+from benchmark.studies.independent.effects import EFFECTS
+from benchmark.studies.independent.formation import Departure, form, observed, simulated
+from benchmark.studies.independent.generator import CATALOGUE, SIZES, generate, plan, write
+from benchmark.studies.independent.outside import OUTSIDE
+from benchmark.studies.independent.scene import draw_scene, in_camera
+from benchmark.studies.independent.score import score, stage_right
 from fisheye_svp_ros.cli import main
 
 SEED = 5
@@ -80,7 +80,7 @@ def test_the_package_is_not_imported():
             for name in names:
                 assert not name.startswith('fisheye_svp_ros'), path
                 assert not name.startswith('benchmark.') or name.startswith(
-                    'benchmark.independent'
+                    'benchmark.studies.independent'
                 ), path
 
 

@@ -1,6 +1,6 @@
 """What is hidden in sets like real ones is found; rates are in docs/results/local_errors.md."""
 
-from benchmark.local_errors import draw_set, report, trial
+from benchmark.studies.local_errors import draw_set, report, trial
 
 
 def test_a_shift_is_found_beside_local_errors():

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmark.paper.search import recover
-from benchmark.paper.stopping import excess_of_published, stopped_early
-from benchmark.paper.writing import (
+from benchmark.studies.paper.search import recover
+from benchmark.studies.paper.stopping import excess_of_published, stopped_early
+from benchmark.studies.paper.writing import (
     best_of,
     family_document,
     layout_document,
@@ -55,7 +55,7 @@ def test_what_is_written_is_what_was_found(found, tmp_path):
     for lens, numbers in zip(LENS_PAIR, best.lens_numbers, strict=True):
         document = yaml.safe_load(yaml.safe_dump(lens_document(lens, best, 32)))
         read = lens_from_dict(document)
-        assert 'benchmark.paper search' in document['provenance']
+        assert 'benchmark.studies.paper search' in document['provenance']
         assert read.fx == pytest.approx(numbers[0], abs=0.006)
         np.testing.assert_allclose(read.viewpoint_shift.coefficients, numbers[1:], atol=1e-7)
         assert (read.name, read.width, read.max_incidence) == (

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmark.ray_coverage import Outcome, report, trial
+from benchmark.studies.ray_coverage import Outcome, report, trial
 
 
 def test_the_extended_lens_of_a_trial_is_nearer_to_the_truth() -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from helpers.scenes import lens, observe, scene
 
-from benchmark.ray_halves import lines
+from benchmark.studies.ray_halves import lines
 from fisheye_svp_ros.solve.ray_errors import RayError
 
 

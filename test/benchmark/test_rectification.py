@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmark.rectification import errors, opencv, ours, scene
+from benchmark.peers.rectification import errors, opencv, ours, scene
 
 
 def test_near_the_lens_our_rows_and_depths_are_the_better_ones() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmark import hand_eye, rigs
+from benchmark.peers import hand_eye, rigs
 
 
 def test_a_robot_states_its_flange_with_scale_and_noise() -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmark.thirds import NAMES, agreement, report
+from benchmark.studies.thirds import NAMES, agreement, report
 
 
 def test_estimates_that_scatter_as_stated_have_a_mean_of_one():
@@ -18,5 +18,5 @@ def test_estimates_that_scatter_as_stated_have_a_mean_of_one():
 def test_a_number_that_is_left_open_counts_in_no_mean():
     values = np.full((2, len(NAMES)), 3.0)
     values[0, 0], values[:, 1] = np.nan, np.nan
-    page = report({'set | its own': values}, 2, 'python -m benchmark.thirds')
+    page = report({'set | its own': values}, 2, 'python -m benchmark.studies.thirds')
     assert '| set | its own | 3.0 | - | 3.0 |' in page

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from helpers.targets import plane, poses_around
 
-from benchmark import kills
+from benchmark.hardening import kills
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import OutputError

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.patterns import pattern_photograph
 
-from benchmark.detectors import LENS
+from benchmark.studies.detectors import LENS
 from fisheye_svp_ros.detect.grids import _ellipses, find_circles
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.points import find_points

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.patterns import pattern_photograph
 
-from benchmark.detectors import TARGET
+from benchmark.studies.detectors import TARGET
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
 from fisheye_svp_ros.detect.points import find_points

@@ -7,8 +7,8 @@ import pytest
 from helpers.scenes import lens, observe, scene
 from scipy import stats
 
-from benchmark import blind_outside
-from benchmark.blind_trial import Task, draw_case
+from benchmark.studies import blind_outside
+from benchmark.studies.blind_trial import Task, draw_case
 from fisheye_svp_ros.diagnosis import EffectTests, NullModel, diagnose
 from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain, sum_gains
 from fisheye_svp_ros.diagnosis.fitted_model import refit

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmark import two_cameras
-from benchmark.two_cameras import Hidden
+from benchmark.studies import two_cameras
+from benchmark.studies.two_cameras import Hidden
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.diagnosis import (
     Comparison,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmark.detectors import LENS, PRINTED
-from benchmark.prints import printed
+from benchmark.studies.detectors import LENS, PRINTED
+from benchmark.studies.prints import printed
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.detect.patterns import Pattern
 from fisheye_svp_ros.optics.camera import project

@@ -1,4 +1,4 @@
-"""A few seconds of what `make soak` does: hostile messages over DDS, each of them counted."""
+"""A few seconds of the soak (benchmark/hardening/soak): hostile messages, each counted."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 from geometry_msgs.msg import PoseStamped  # isort: skip
 from sensor_msgs.msg import PointCloud2  # isort: skip
 
-from benchmark.soak import hostile
+from benchmark.hardening.soak import hostile
 from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
 from fisheye_svp_ros.nodes.localizer import Localizer
 

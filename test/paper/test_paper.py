@@ -281,7 +281,7 @@ def test_the_family_holds_the_lenses_in_use():
     np.testing.assert_allclose(
         np.radians(layout['inner'] + layout['outer']), best.layout, rtol=1e-12
     )
-    assert 'benchmark.paper search' in layout['provenance']
+    assert 'benchmark.studies.paper search' in layout['provenance']
     incidence = np.degrees(best.layout[:, 0])
     assert incidence[:15].max() < 62.1 < 65.9 < incidence[15:].min()
     assert incidence.max() < 88.1

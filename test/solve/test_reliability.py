@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmark.poses import CASES, SCENES, SIGMA, UNTESTABLE, lost_minima, spoilt, tried
+from benchmark.studies.poses import CASES, SCENES, SIGMA, UNTESTABLE, lost_minima, spoilt, tried
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.lens_files import load_lens

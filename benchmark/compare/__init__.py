@@ -1,1 +1,0 @@
-"""Held-out corners of real cameras through other calibrations, beside ours."""

@@ -1,0 +1,1 @@
+"""Hostile input, killed commands, small faults, frozen answers."""

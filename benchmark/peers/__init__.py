@@ -1,0 +1,1 @@
+"""The same corners through other tools."""

@@ -1,1 +1,0 @@
-"""Hostile messages by the million over DDS against running nodes: `make soak`."""

@@ -1,0 +1,1 @@
+"""Studies: families of simulated sets, a measure, a page; `python -m benchmark.studies NAME`."""
