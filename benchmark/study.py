@@ -38,10 +38,11 @@ def parser(
     doc: str | None,
     output: Path | None = RESULTS,
     workers: bool = True,
+    room: str = 'studies',
     **options: tuple[Any, str],
 ) -> argparse.ArgumentParser:
-    """Return the parser of `python -m benchmark.STUDY`; options: default and help by name."""
-    found = argparse.ArgumentParser(description=doc, prog=f'python -m benchmark.{study}')
+    """Return the parser of `python -m benchmark.ROOM.STUDY`; options: default and help by name."""
+    found = argparse.ArgumentParser(description=doc, prog=f'python -m benchmark.{room}.{study}')
     for name, (default, text) in options.items():
         kind: dict[str, Any] = (
             {'action': 'store_true'}
@@ -123,7 +124,7 @@ def run_sets(
     """
     asked = parser(name, doc, DOCS, sets=sets).parse_args(arguments)
     outcomes = in_processes(name.replace('_', ' '), trial, range(each * asked.sets), asked.workers)
-    page = report(outcomes, f'python -m benchmark.{name} --sets {asked.sets}')
+    page = report(outcomes, f'python -m benchmark.studies.{name} --sets {asked.sets}')
     write_text(asked.output / 'results' / f'{name}.md', page)
     sys.stdout.write(page)
     return outcomes, asked.output

@@ -396,6 +396,7 @@ def main() -> int:
         'kills',
         __doc__,
         None,
+        room='hardening',
         workers=False,
         kills=(20, 'of each command by each signal'),
         seed=(0, 'of the moments'),

@@ -308,7 +308,7 @@ def page(
 
 def main() -> None:
     """Compare on every set that is there, write the page."""
-    parser = study.parser('compare', __doc__, study.RESULTS / 'compare.md')
+    parser = study.parser('compare', __doc__, study.RESULTS / 'compare.md', room='peers')
     parser.add_argument('data', type=Path)
     parser.add_argument('--only', nargs='+', choices=SETS, default=list(SETS))
     asked = parser.parse_args()

@@ -105,7 +105,9 @@ def latencies(pictures: list[Any]) -> np.ndarray:
 def main() -> None:
     """Measure, and print one line."""
     count = (
-        study.parser('detector_latency', __doc__, None, workers=False, count=(40, 'images'))
+        study.parser(
+            'detector_latency', __doc__, None, workers=False, room='speed', count=(40, 'images')
+        )
         .parse_args()
         .count
     )

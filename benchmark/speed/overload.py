@@ -105,7 +105,9 @@ class Trial:
 def main() -> None:
     """Measure, and print a table."""
     seconds = (
-        study.parser('overload', __doc__, None, workers=False, seconds=(10.0, 'at each rate'))
+        study.parser(
+            'overload', __doc__, None, workers=False, room='speed', seconds=(10.0, 'at each rate')
+        )
         .parse_args()
         .seconds
     )

@@ -115,6 +115,7 @@ def main() -> None:
         'rectifier_rate',
         __doc__,
         None,
+        room='speed',
         workers=False,
         pace=(30.0, 'images a second (30)'),
         seconds=(10.0, 'for each line (10)'),

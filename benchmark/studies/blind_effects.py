@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmark import blind_optics as optics
+from benchmark.studies import blind_optics as optics
 from benchmark.studies.blind_scene import Hidden, Needs, Scene, World, moved, plane_of
 from benchmark.studies.boards import Rng, unit
 from fisheye_svp_ros.arrays import Array

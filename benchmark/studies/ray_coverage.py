@@ -114,7 +114,7 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Draw, diagnose and compare sets."""
     study.run_sets(
-        'ray_coverage', __doc__, trial, report, arguments, (30, 'of each of four kinds'), each=4
+        'ray_coverage', __doc__, trial, report, arguments, (50, 'of each of four kinds'), each=4
     )
 
 

@@ -134,6 +134,7 @@ def main() -> int:
         'fuzz',
         __doc__,
         None,
+        room='hardening',
         inputs=(1_000_000, 'of all surfaces'),
         first=(0, 'the first seed of each surface'),
         only=('', 'surfaces whose names contain this'),

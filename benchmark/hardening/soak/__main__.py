@@ -178,6 +178,7 @@ def main() -> int:
         'soak',
         __doc__,
         None,
+        room='hardening',
         workers=False,
         messages=(1_000_000, 'hostile ones'),
         flood=(0.2, 'share of the second round'),
