@@ -7,7 +7,6 @@ in COMMANDS.  Only the module of the command that is asked for is imported.
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 import threading
@@ -18,6 +17,7 @@ from typing import NoReturn
 
 from fisheye_svp_ros import __version__
 from fisheye_svp_ros.errors import FisheyeSvpError
+from fisheye_svp_ros.io.streams import tolerant_streams
 from fisheye_svp_ros.threads import set_thread_count
 
 COMMANDS = {
@@ -60,38 +60,35 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit code: 2, after one line on stderr, for bad input."""
+    with tolerant_streams() as lost:
+        status = _status(sys.argv[1:] if arguments is None else arguments)
+        if (error := lost()) is None:
+            return status
+        if isinstance(error, BrokenPipeError):  # nobody reads on
+            return status or _BROKEN_PIPE
+        return _tell(f'standard output cannot be written ({error.strerror})')
+
+
+def _status(arguments: Sequence[str]) -> int:
     try:
-        _run(sys.argv[1:] if arguments is None else arguments)
+        _run(arguments)
     except FisheyeSvpError as error:
-        print(f'fisheye-svp: {error}', file=sys.stderr)
-        return _BAD_INPUT
+        return _tell(str(error))
     except ModuleNotFoundError as error:
         if str(error.name).startswith('fisheye_svp_ros'):
             raise
-        print(
-            f'fisheye-svp: this needs the Python package {error.name}, which is not installed',
-            file=sys.stderr,
-        )
-        return _BAD_INPUT
-    except UnicodeEncodeError as error:
-        print(
-            f'fisheye-svp: {error.object!r:.200} cannot be printed here; set a UTF-8 locale',
-            file=sys.stderr,
-        )
-        return _BAD_INPUT
-    except BrokenPipeError:
-        # Nobody reads on; give the interpreter's own last flush somewhere to go.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _BROKEN_PIPE
+        return _tell(f'this needs the Python package {error.name}, which is not installed')
     except OSError as error:  # of a path that no check has asked for
-        print(
-            f'fisheye-svp: {error.filename or "a file"!r:.200}: {error.strerror or error}',
-            file=sys.stderr,
-        )
-        return _BAD_INPUT
+        return _tell(f'{error.filename or "a file"!r:.200}: {error.strerror or error}')
     except KeyboardInterrupt:
         return _EXIT_SIGINT
     return 0
+
+
+def _tell(text: str) -> int:
+    """Print the one line of bad input; return its exit code."""
+    print(f'fisheye-svp: {text}', file=sys.stderr)
+    return _BAD_INPUT
 
 
 def _run(arguments: Sequence[str]) -> None:
@@ -127,7 +124,6 @@ def _run(arguments: Sequence[str]) -> None:
         import_module('fisheye_svp_ros.optics.engines').use(parsed.engine)
     with _tidy(named):
         parsed.run(parsed)
-    sys.stdout.flush()
 
 
 @contextmanager

@@ -72,6 +72,7 @@ COMMANDS = {
     'render': ('render', '--lens', 'fish180', '--board', _BOARD, '--count', '6', '-o', '{out}'),
     'sweep': ('sweep', '{sweep}', '-o', '{out}', '--workers', '2', '--resume'),
     'table': ('table', '{recording}', '-o', '{out}'),
+    'undistort': ('undistort', '{lens}', '{photographs}', '-o', '{out}'),
 }
 NODES = {
     'record': ('record', '-o', '{out}/recording'),

@@ -21,7 +21,7 @@ from fisheye_svp_ros.commands.outputs import output_file, output_folder
 from fisheye_svp_ros.detect.finders import DETECTORS
 from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.files import write_json, write_together
+from fisheye_svp_ros.io.files import keep_existing, write_json, write_together
 from fisheye_svp_ros.io.readers import (
     Sizes,
     photographs_beside,
@@ -80,10 +80,12 @@ def run(args: argparse.Namespace) -> None:
         if args.overlays:
             from fisheye_svp_ros.reporting.overlays import write_coverage, write_overlays
 
-            write_overlays(
-                find_photographs(args.photographs, args.every), detection, args.overlays
-            )
-            write_coverage(detection, args.overlays / 'coverage.png')
+            coverage = args.overlays / 'coverage.png'
+            with keep_existing(not coverage.exists()):  # photographs, but no earlier overlays
+                write_overlays(
+                    find_photographs(args.photographs, args.every), detection, args.overlays
+                )
+                write_coverage(detection, coverage)
 
 
 def _print(detection: Detection, board: str) -> None:

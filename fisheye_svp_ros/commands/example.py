@@ -8,7 +8,7 @@ import numpy as np
 
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.render import parabola, write_photographs
-from fisheye_svp_ros.io.files import write_text, write_together
+from fisheye_svp_ros.io.files import keep_existing, write_text, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> None:
     printed = Print(9, 6, 0.025, bow=parabola(printed.corners, 0.0015))
     poses = board_views(lens, printed, 14, (0.10, 0.30), np.random.default_rng(1))
     truth = args.output / 'truth'
-    with write_together():
+    with keep_existing(), write_together():
         write_photographs(
             {'': (lens, identity())},
             board(printed),

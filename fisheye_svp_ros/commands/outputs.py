@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from fisheye_svp_ros.errors import OutputError
+from fisheye_svp_ros.io.files import final_path
 
 _PHOTOGRAPHS = ('observations', 'photographs', 'inputs')  # arguments whose folders are read again
 _OUTPUTS = {'-o': 'output', '--overlays': 'overlays'}  # options and their arguments
@@ -18,7 +19,7 @@ def output_folder(text: str, option: str = '-o') -> Path:
     path = output_path(text, option)
     if path.exists() and not path.is_dir():
         raise OutputError(f'{option} {text}: it is a file; name a folder')
-    return path
+    return final_path(path) if path.is_symlink() and not path.exists() else path
 
 
 def output_file(text: str) -> Path:
@@ -31,9 +32,9 @@ def output_file(text: str) -> Path:
 
 def output_path(text: str, option: str = '-o') -> Path:
     """Return a path whose parents are folders that can be written, or raise OutputError."""
-    path = Path(text)
-    parent = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
-    if parent != path.absolute() and not parent.is_dir():
+    path, whole = Path(text), final_path(text)
+    parent = next(one for one in (whole, *whole.parents) if one.exists())
+    if parent != whole and not parent.is_dir():
         raise OutputError(f'{option} {text}: {parent} is not a folder; choose another')
     if not os.access(parent, os.W_OK):
         raise OutputError(f'{option} {text}: no permission to write in {parent}; choose another')

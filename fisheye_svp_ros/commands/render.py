@@ -14,7 +14,7 @@ from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.errors import GeometryError, LensError, ParameterError
-from fisheye_svp_ros.io.files import write_together
+from fisheye_svp_ros.io.files import keep_existing, write_together
 from fisheye_svp_ros.io.image_files import write_png
 from fisheye_svp_ros.io.lens_files import cameras_in
 from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses
@@ -127,7 +127,7 @@ def run(args: argparse.Namespace) -> None:
         poses = _read_poses(args.poses, cameras, boards)
     else:
         poses = _random_poses(cameras, boards, args.target, count, ranges, rng)
-    with write_together():
+    with keep_existing(), write_together():
         count = write_photographs(
             cameras,
             boards,

@@ -20,7 +20,7 @@ from fisheye_svp_ros.detect.photographs import (
     find_photographs,
 )
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.io.files import write_json, write_text, write_together
+from fisheye_svp_ros.io.files import keep_existing, write_json, write_text, write_together
 from fisheye_svp_ros.io.image_files import save_maps, write_png
 from fisheye_svp_ros.io.lens_formats.ros import camera_info_text
 from fisheye_svp_ros.io.rig_files import load_pair, pair_of_lenses
@@ -43,6 +43,7 @@ from fisheye_svp_ros.reporting.undistort_report import (
 
 # What camera_info calls the rectified cameras that it can describe, and its coefficients
 _CAMERA_INFO = {'pinhole': ('plumb_bob', 5), 'fisheye': ('equidistant', 4)}
+_RESULT = 'undistort.json'
 _PICTURES = ('mask.png', 'shift.png')  # of each camera, beside its photographs
 
 
@@ -116,7 +117,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Map the photographs, write maps and cameras, say what is left at other ranges."""
     sides, pair, paths = _rectifications(args)
-    with write_together(), progress('undistorting', count_photographs(paths)) as done:
+    # Pictures of an earlier run are replaced, those of a camera are not.
+    fresh = not (args.output / _RESULT).exists()
+    with (
+        keep_existing(fresh),
+        write_together(),
+        progress('undistorting', count_photographs(paths)) as done,
+    ):
         counts = _write_photographs(sides, pair, paths, args.output, done)
         if paths and not any(counts.values()):
             raise ObservationError(
@@ -142,7 +149,7 @@ def run(args: argparse.Namespace) -> None:
             }
         if pair and rows:
             draw_remaining(args.output / 'rows.png', pair.left, rows, 'difference of rows')
-        write_json(args.output / 'undistort.json', document)
+        write_json(args.output / _RESULT, document)
     for name, side in sides.items():
         _print_camera(side, name, left.get(name))
     if pair and rows:

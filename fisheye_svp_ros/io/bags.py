@@ -31,6 +31,7 @@ from rosbags.rosbag2.storage_mcap import McapWriter, write_channel, write_string
 from rosbags.typesys import Stores, get_typestore
 
 from fisheye_svp_ros.errors import BagError
+from fisheye_svp_ros.io.files import final_path
 from fisheye_svp_ros.io.mcap import (
     MAX_BYTES,
     RawMessage,
@@ -147,7 +148,7 @@ class BagWriter:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path = path = final_path(path)
         self.count = 0
         try:
             self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)

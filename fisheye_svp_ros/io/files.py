@@ -7,6 +7,7 @@ would be lost; nesting and counts of values beyond any use.
 
 from __future__ import annotations
 
+import filecmp
 import json
 import math
 import os
@@ -30,6 +31,7 @@ MAX_BYTES = 1 << 30  # bytes of a table or a photograph
 
 _BLOCK_BYTES = 1 << 20  # bytes
 _waiting: ContextVar[dict[Path, Path] | None] = ContextVar('_waiting', default=None)
+_keeping: ContextVar[bool] = ContextVar('_keeping', default=False)
 LARGEST_YAML = 1 << 22  # characters
 _MOST_VALUES, _DEEPEST = 100_000, 50
 
@@ -78,10 +80,10 @@ def read_text(path: str | Path, error: type[FisheyeSvpError], most: int = MAX_BY
 def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it to `path` when the block succeeds.
 
-    In a block of `write_together`, when that succeeds.  Raises OutputError, naming the path, where
-    it cannot be written.
+    In a block of `write_together`, when that succeeds.  A symbolic link stays one: the file that
+    it leads to is written.  Raises OutputError, naming the path, where it cannot be written.
     """
-    target, waiting = path_of(path), _waiting.get()
+    target, waiting = final_path(path), _waiting.get()
     if target.exists() and not target.is_file():
         raise OutputError(f'{path}: it exists and is not a regular file; choose another name')
     temporary = None
@@ -96,6 +98,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
         temporary.chmod(0o666 & ~_umask())
         with temporary.open('rb') as written:
             os.fsync(written)  # else a power cut leaves the new name with no content
+        if _keeping.get() and target.exists() and not filecmp.cmp(temporary, target, False):
+            raise OutputError(
+                f'{path}: another file is there; choose another folder, or remove it'
+            )
         if waiting is None:
             temporary.replace(target)
         else:
@@ -105,6 +111,24 @@ def replacing(path: str | Path) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+def final_path(path: str | Path) -> Path:
+    """Return where a path leads, through all symbolic links; raise OutputError for a circle."""
+    found = Path(os.path.realpath(path_of(path)))
+    if found.is_symlink():
+        raise OutputError(f'{path}: its symbolic links lead in a circle; choose another name')
+    return found
+
+
+@contextmanager
+def keep_existing(keep: bool = True) -> Iterator[None]:
+    """Have no file with another content be replaced in the block; raise OutputError instead."""
+    token = _keeping.set(keep)
+    try:
+        yield
+    finally:
+        _keeping.reset(token)
 
 
 @contextmanager
@@ -149,7 +173,7 @@ def _defer_signals() -> Iterator[None]:
 
 def written(path: Path) -> Path:
     """Return where a file is that was written before, if need be in this `write_together`."""
-    return (_waiting.get() or {}).get(path, path)
+    return (_waiting.get() or {}).get(final_path(path), path)
 
 
 def write_text(path: str | Path, text: str) -> None:

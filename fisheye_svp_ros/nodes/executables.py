@@ -17,6 +17,7 @@ from itertools import takewhile
 from typing import TYPE_CHECKING
 
 from fisheye_svp_ros import __version__
+from fisheye_svp_ros.io.streams import tolerant_streams
 from fisheye_svp_ros.nodes import NODES
 from fisheye_svp_ros.threads import set_thread_count
 
@@ -84,7 +85,13 @@ def print_parameters(name: str) -> None:
 
 
 def _main(name: str) -> int:
-    """Run a node with the arguments of its executable, which nodes commonly overlook."""
+    """Run a node with the arguments of its executable, whether or not anybody reads its output."""
+    with tolerant_streams():
+        return _run_executable(name)
+
+
+def _run_executable(name: str) -> int:
+    """Run a node; refuse or answer the arguments that nodes commonly overlook."""
     words = sys.argv[1:]
     misplaced = [word for word in takewhile('--ros-args'.__ne__, words) if word.startswith('-')]
     if {'-h', '--help'} & {*words}:

@@ -79,7 +79,7 @@ def draw_table(table: SweptTable, folder: Path) -> list[Path]:
         files.append(folder / f'heat_map_{y}_{x}.png')
         others = [name for name in swept if name not in (x, y)]
         _draw_grids(table, metrics, x, y, others, files[-1])
-    if 'localizer.rms_px' in table and any(table.get('noise_px', ())):
+    if {'localizer.rms_px', 'localizer.points'} <= {*table} and any(table.get('noise_px', ())):
         files.append(folder / 'residuals_and_noise.png')
         others = [name for name in swept if name != 'noise_px']
         few = [name for name in others if len(set(table[name])) <= 2 * _HUES]

@@ -135,7 +135,7 @@ def _density_of_chi2(x: Array, freedom: float) -> Array:
 def _numbers(table: SweptTable, name: str) -> Array:
     """Return a column, NaN = empty; of calibrations only those from all sets of a scenario."""
     cells = np.array([np.nan if v is None else v for v in table[name]], dtype=float)
-    if name.startswith('stereo_calibrator.'):
+    if name.startswith('stereo_calibrator.') and {'set', 'sets'} <= {*table}:
         cells[np.add(table['set'], 1) != table['sets']] = np.nan
     return cells
 

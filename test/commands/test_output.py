@@ -16,16 +16,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.commands import refused
 from helpers.targets import plane, poses_around
 
 from benchmark.hardening import kills
+from fisheye_svp_ros.cli import COMMANDS as COMMAND_NAMES
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import OutputError
-from fisheye_svp_ros.io.files import write_text, write_together, written
+from fisheye_svp_ros.io.files import keep_existing, write_text, write_together, written
+from fisheye_svp_ros.io.image_files import write_png
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.nodes import NODES
 from fisheye_svp_ros.simulate.simulation import simulate
 
 SWEEP = 'synthetic_camera: {ros__parameters: {sweep.seed: [1, 2, 3], noise_px: 0.2}}\n'
@@ -141,6 +145,80 @@ def test_on_a_full_disk_there_is_one_line_and_no_file(
         assert not results(out)
     else:
         assert not err and results(out)
+
+
+def png(path: Path, side: int = 1536) -> bytes:
+    """Write a photograph of a user; return its bytes."""
+    write_png(path, np.eye(side, dtype=np.uint8))
+    return path.read_bytes()
+
+
+def test_photographs_are_not_replaced(
+    given: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / 'out'
+    render = words('render', given, folder)
+    assert main(render) == 0 and main(render) == 0  # the same ones are no loss
+    whole = {path: path.read_bytes() for path in folder.iterdir()}
+    assert 'another file is there' in refused(capsys, *render, '--seed', '3')
+    assert {path: path.read_bytes() for path in folder.iterdir()} == whole
+    mine = png(tmp_path / 'camera' / '000.png')
+    given_png = tmp_path / 'given' / '000.png'
+    png(given_png)
+    for command in (
+        words('render', given, tmp_path / 'camera'),
+        ['undistort', str(given['lens']), str(given_png), '-o', str(tmp_path / 'camera')],
+        ['example', '-o', str(tmp_path / 'shown')],
+    ):
+        if command[0] == 'example':
+            mine = png(tmp_path / 'shown' / 'photographs' / '013.png')
+        assert 'another file is there' in refused(capsys, *command)
+    assert results(tmp_path / 'camera') == ['000.png']
+    assert results(tmp_path / 'shown') == ['013.png']
+    assert (tmp_path / 'camera' / '000.png').read_bytes() == mine
+
+
+def test_overlays_do_not_replace_photographs_of_others(tmp_path: Path) -> None:
+    mine = png(tmp_path / '000.png')
+    with pytest.raises(OutputError, match='another file is there'), keep_existing():
+        write_png(tmp_path / '000.png', np.zeros((3, 4), np.uint8))
+    with keep_existing(False):
+        write_png(tmp_path / 'new.png', np.zeros((3, 4), np.uint8))
+    assert (tmp_path / '000.png').read_bytes() == mine
+
+
+@pytest.mark.parametrize('name', ['localize', 'calibrate', 'plot', 'render', 'sweep'])
+def test_a_symbolic_link_is_written_through(
+    name: str, given: dict[str, Path], tmp_path: Path
+) -> None:
+    linked, out = tmp_path / 'linked', tmp_path / 'out'
+    assert main(words(name, given, tmp_path / 'plain')) == 0
+    out.mkdir()
+    for file in results(tmp_path / 'plain'):  # links to files that are to be made
+        (out / file).symlink_to(linked / file)
+    assert main(words(name, given, out)) == 0
+    assert results(linked) == results(tmp_path / 'plain')
+    assert all(path.is_symlink() for path in out.iterdir() if path.is_file())
+    # A link to a folder that is not there
+    (tmp_path / 'folder').symlink_to(tmp_path / 'made')
+    assert main(words(name, given, tmp_path / 'folder')) == 0
+    assert results(tmp_path / 'made') == results(linked)
+
+
+def test_links_in_a_circle_and_links_to_the_input(
+    given: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / 'a.yaml').symlink_to(tmp_path / 'b.yaml')
+    (tmp_path / 'b.yaml').symlink_to(tmp_path / 'a.yaml')
+    (tmp_path / 'c.yaml').symlink_to(given['lens'])
+    lens = ['lens', str(given['lens']), '-o']
+    assert 'links' in refused(capsys, *lens, tmp_path / 'a.yaml')
+    assert 'overwrite the input' in refused(capsys, *lens, tmp_path / 'c.yaml')
+    old = tmp_path / 'old.yaml'
+    old.write_text('old')
+    (tmp_path / 'd.yaml').symlink_to('old.yaml')
+    assert main([*lens, str(tmp_path / 'd.yaml')]) == 0
+    assert (tmp_path / 'd.yaml').is_symlink() and old.read_bytes() == given['lens'].read_bytes()
 
 
 @pytest.mark.parametrize('number', [errno.EACCES, errno.EROFS, errno.ENOSPC, errno.EDQUOT])
@@ -259,3 +337,9 @@ print(os.getpid())
     assert kills.files(tmp_path) == ({}, ['.a.csv.x1.csv'])
     outcome.fault('part', 'SIGKILL after 1 s')
     assert '| plan | 0 | 0 | 0 | 0 | 1 |' in kills.section({'plan': outcome}, {}, {}, 'so')
+
+
+def test_every_command_and_node_is_killed() -> None:
+    started = [words[:2] for words in kills.NODES.values()]
+    assert {*kills.COMMANDS, *(words[0] for words in started)} == {*COMMAND_NAMES}
+    assert {words[1] for words in started if words[0] == 'run'} == {*NODES}

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import pytest
 
 from fisheye_svp_ros import cli
@@ -11,6 +16,17 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     """Return the one line with which a command refuses what it is given, exit status 2."""
     capsys.readouterr()
     assert cli.main([str(argument) for argument in arguments]) == 2
-    said = capsys.readouterr().err.strip().splitlines()
+    lines = capsys.readouterr().err.strip().splitlines()
+    said = [line for line in lines if not line.endswith('%)')]  # without progress
     assert len(said) == 1
     return said[0]
+
+
+@contextmanager
+def unread(name: str = 'stdout') -> Iterator[None]:
+    """Have standard output, or `stderr`, be a pipe whose reader has gone, as after `| head -1`."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, 'w', 1) as stream, pytest.MonkeyPatch.context() as patched:
+        patched.setattr(sys, name, stream)
+        yield
