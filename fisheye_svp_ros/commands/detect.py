@@ -293,7 +293,8 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
 
 def _note_tags(detection: Detection, pattern: Pattern) -> None:
     """Say where many tags have numbers that the board, as it was described, does not have."""
-    seen, beyond = np.sum([one.tags for one in detection.searched], axis=0).tolist()
+    seen = sum(one.tags.seen for one in detection.searched)
+    beyond = sum(one.tags.beyond for one in detection.searched)
     if beyond > _MIN_BEYOND_SHARE * seen:
         words = 'tagCols and tagRows' if pattern.kind == 'aprilgrid' else 'its columns and rows'
         say(

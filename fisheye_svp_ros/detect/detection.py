@@ -14,7 +14,14 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.effort import Effort, Look
-from fisheye_svp_ros.detect.finders import FIRST_LOOKS, count_tags, default_detector, invert_image
+from fisheye_svp_ros.detect.finders import (
+    FIRST_LOOKS,
+    NO_TAGS,
+    TagReport,
+    default_detector,
+    invert_image,
+    report_tags,
+)
 from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals, of_rig, turn_field
 from fisheye_svp_ros.detect.pairing import Pairing, pair_photographs, stamp_of
 from fisheye_svp_ros.detect.patterns import Pattern, Turn, check_of_board
@@ -27,6 +34,7 @@ from fisheye_svp_ros.detect.points import (
     full_scale_share,
     goes_on,
 )
+from fisheye_svp_ros.detect.tag_grids import common_layout
 from fisheye_svp_ros.detect.workers import TimedOut, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
 from fisheye_svp_ros.io.files import read_bytes
@@ -41,6 +49,7 @@ _MIN_RIG_FRAMES = 3  # frames of two cameras that say how they stand
 _FREE = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4', 'e0')
 _ROTATION_NOTE = 'its orientation tag asks for a rotation; the pixels are used as stored'
 LARGER_BOARD = 'the board is larger: its squares continue beyond the given corners'
+_OTHER_LAYOUT = 'its tags are printed or numbered otherwise than in most photographs'
 _DAMAGE_NOTE = 'damaged: the JPEG decodes only in part; copy it again'
 
 
@@ -49,8 +58,7 @@ class SearchedPhotograph:
     """One photograph after the search; points: None where there is no board, `reason` says why.
 
     notes: what is odd about it; bright: share of the board's pixels at the end of the scale;
-    inverted: what is dark in print is bright; tags: how many there are, and how many of them the
-    board does not have.
+    inverted: what is dark in print is bright; tags: how many there are.
     """
 
     name: str
@@ -64,7 +72,7 @@ class SearchedPhotograph:
     bright: float = 0.0
     digest: str = ''
     inverted: bool = False
-    tags: tuple[int, int] = (0, 0)
+    tags: TagReport = NO_TAGS
 
 
 class Detection(NamedTuple):
@@ -152,6 +160,8 @@ def detect(
             (begun[number]._replace(look=effort.look(number, True)) for number in postponed),
             postponed,
         )
+    if pattern.kind == 'aprilgrid':
+        search(*_by_common_layout(begun, results))
     searched = _add_notes(_one_size([results[number] for number in sorted(results)]))
     if not any(one.points for one in searched):
         reasons = Counter(one.reason.partition(';')[0] for one in searched).most_common(2)
@@ -161,6 +171,28 @@ def detect(
             f'{said}; {check_of_board(pattern)}'
         )
     return _table(*_moments(searched, sync), pattern, source)
+
+
+def _by_common_layout(
+    begun: Sequence[_Task], results: dict[int, SearchedPhotograph]
+) -> tuple[list[_Task], list[int]]:
+    """Return which photographs of an AprilGrid to search again, with the layout of most.
+
+    Results with points of another layout are left out, since these are other landmarks.
+    """
+    layout = common_layout([one.tags.layouts for one in results.values()])
+    again = list[int]()
+    for number, one in results.items():
+        own = one.points.grid.layout if one.points and one.points.grid else None
+        if layout is None or not one.tags.layouts or own == layout:
+            continue
+        if layout in one.tags.layouts and isinstance(begun[number].photograph.data, Path):
+            again.append(number)
+        elif own is not None or layout not in one.tags.layouts:
+            results[number] = replace(one, points=None, reason=_OTHER_LAYOUT)
+    return [
+        begun[i]._replace(pattern=begun[i].pattern.with_layout(layout)) for i in again if layout
+    ], again
 
 
 def _moments(
@@ -194,13 +226,16 @@ def examine(task: _Task) -> SearchedPhotograph:
         if any(line.startswith('Corrupt JPEG') for line in said):
             notes = (*notes, _DAMAGE_NOTE)
         points, inverted = _look(pixels, task)
-        tags = count_tags(eight_bit(pixels), pattern)
+        grid = points.grid if isinstance(points, Points) else None
+        tags = report_tags(eight_bit(pixels), pattern, grid)
     except (FisheyeSvpError, cv2.error, MemoryError) as cause:
         text = str(cause).removeprefix(f'{photograph.name}: ')
         return replace(blank, reason=text.splitlines()[0] if text else 'not enough memory')
     blank = replace(blank, size=(int(pixels.shape[1]), int(pixels.shape[0])), tags=tags)
     if isinstance(points, str):
         return replace(blank, reason=points, notes=notes)
+    if points.grid is not None and points.grid.others:
+        notes = (*notes, f'{points.grid.others} tags of another grid are left out')
     if pattern.kind == 'chessboard' and goes_on(pixels, points, pattern):
         notes = (*notes, LARGER_BOARD)
     digest = hashlib.sha1(pixels.tobytes()).hexdigest()

@@ -7,7 +7,7 @@ aruco module changed its interface in 4.7.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.grids import find_circles, find_squares
-from fisheye_svp_ros.detect.patterns import Pattern
+from fisheye_svp_ros.detect.patterns import Found, Pattern
+from fisheye_svp_ros.detect.tag_grids import GridReading, GridSize, TagLayout, read_grid
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.registry import Registry
 
 Grey = NDArray[np.uint8]
-Found = tuple[Index, Array]
 Finder = Callable[[Grey, Pattern], Found | None]
 
 _ARUCO: Any = getattr(cv2, 'aruco', None)  # of opencv-contrib alone before 4.7
@@ -41,7 +41,7 @@ def _at_small_scale(find: Finder) -> Finder:
             return find(image, pattern)
         small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         found = find(small, pattern)
-        return None if found is None else (found[0], (found[1] + 0.5) / scale - 0.5)
+        return None if found is None else found._replace(uv=(found.uv + 0.5) / scale - 0.5)
 
     return search
 
@@ -66,13 +66,18 @@ def _sharper(find: Finder) -> Finder:
 
     def search(image: Grey, pattern: Pattern) -> Found | None:
         found = find(image, pattern)
-        if found is not None and len(found[0]) >= _MIN_SHARE * len(pattern.points):
+        if found is not None and len(found.ids) >= _MIN_SHARE * len(pattern.points):
             return found
         soft = cv2.GaussianBlur(image, (0, 0), _SHARPENING_BLUR)
         more = find(np.asarray(cv2.addWeighted(image, 3.0, soft, -2.0, 0.0), np.uint8), pattern)
-        return max(found, more, key=lambda one: 0 if one is None else len(one[0]))
+        return max(found, more, key=lambda one: 0 if one is None else len(one.ids))
 
     return search
+
+
+def _either_color(find: Finder) -> Finder:
+    """Return a finder that searches the inverted image where it finds nothing."""
+    return lambda image, pattern: find(image, pattern) or invert_image(find)(image, pattern)
 
 
 def classic(image: Grey, pattern: Pattern) -> Found | None:
@@ -98,7 +103,7 @@ def classic_subpixel(image: Grey, pattern: Pattern) -> Found | None:
     if found is None:
         return None
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
-    corners = found[1].astype(np.float32).reshape(-1, 1, 2)
+    corners = found.uv.astype(np.float32).reshape(-1, 1, 2)
     refined = cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), criteria)
     return _all_corners(True, refined)
 
@@ -130,38 +135,39 @@ def charuco(image: Grey, pattern: Pattern) -> Found | None:
         _, corners, ids = _ARUCO.interpolateCornersCharuco(tags, tag_ids, image, board)
     if ids is None or len(ids) < 4:
         return None
-    return ids.ravel().astype(np.int64), corners.reshape(-1, 2).astype(float)
+    return Found(ids.ravel().astype(np.int64), corners.reshape(-1, 2).astype(float))
 
 
 def aprilgrid(image: Grey, pattern: Pattern) -> Found | None:
-    """Kalibr's AprilGrid: tags 36h11 with a border of two cells, by cv2.aruco."""
-    known = {
-        tag: corners
-        for tag, corners in _tags(image, pattern, 2).items()
-        if tag < pattern.tag_count
-    }
-    if not known:
-        return None
-    index = np.concatenate([4 * tag + np.arange(4) for tag in known])
-    # OpenCV goes clockwise from a tag's upper left, Kalibr the other way from its lower left.
-    uv = np.concatenate([corners.reshape(4, 2)[[3, 2, 1, 0]] for corners in known.values()])
-    return index, uv.astype(float)
+    """An AprilGrid of tags 36h11, printed as Kalibr does it or otherwise, by cv2.aruco."""
+    grid = _read_aprilgrid(image, pattern)
+    return Found(grid.ids, grid.uv, grid) if len(grid.ids) else None
+
+
+def _read_aprilgrid(image: Grey, pattern: Pattern) -> GridReading:
+    """Return what the tags in an image say: with Kalibr's border of two cells, or else of one."""
+    size = GridSize(pattern.columns, pattern.rows, pattern.gap)
+    layout = pattern.layout
+    borders = (2, 1) if layout is None else (layout.border,)
+    readings = []
+    for border in borders:
+        ids, corners = _tags(image, pattern, border)
+        reading = read_grid(ids, corners, border, size, layout)
+        readings.append((len(reading.ids), len(ids), border, reading))
+        if len(reading.ids) > 4:
+            break  # by chance a tag is read with the other border, but no grid of them
+    return max(readings, key=lambda one: one[:3])[3]
 
 
 def explain_failure(image: Grey, pattern: Pattern) -> str:
     """Return why a board was not found, as far as the image tells."""
-    if pattern.kind == 'aprilgrid' and any(
-        tag < pattern.tag_count for tag in _tags(image, pattern, 1)
-    ):
-        return (
-            'no board found: its tags have a border of one cell; print the target of Kalibr, '
-            'whose border is two cells'
-        )
-    return 'no board found'
+    if pattern.kind != 'aprilgrid':
+        return 'no board found'
+    return _read_aprilgrid(image, pattern).reason or 'no board found'
 
 
-def _tags(image: Grey, pattern: Pattern, border: int) -> dict[int, Array]:
-    """Return the corners of tags by number, of any of the dictionary of a pattern.
+def _tags(image: Grey, pattern: Pattern, border: int) -> tuple[Index, Array]:
+    """Return ids (T,) and corners (T, 4, 2), px, of tags of the dictionary of a pattern.
 
     border: cells around their code.
     """
@@ -172,19 +178,36 @@ def _tags(image: Grey, pattern: Pattern, border: int) -> dict[int, Array]:
         tags, ids, _ = _ARUCO.ArucoDetector(dictionary, parameters).detectMarkers(image)
     else:
         tags, ids, _ = _ARUCO.detectMarkers(image, dictionary, parameters=parameters)
-    return (
-        {}
-        if ids is None
-        else {int(tag): corners for tag, corners in zip(ids.ravel(), tags, strict=True)}
-    )
+    if ids is None:
+        return np.empty(0, np.int64), np.empty((0, 4, 2))
+    return ids.ravel().astype(np.int64), np.asarray(tags, dtype=float).reshape(-1, 4, 2)
 
 
-def count_tags(image: Grey, pattern: Pattern) -> tuple[int, int]:
-    """Return how many tags are in an image, and how many of them a pattern does not have."""
+class TagReport(NamedTuple):
+    """How many tags are in an image, how many the pattern does not have; layouts that fit them."""
+
+    seen: int = 0
+    beyond: int = 0
+    layouts: frozenset[TagLayout] = frozenset()
+
+
+NO_TAGS = TagReport()
+
+
+def report_tags(image: Grey, pattern: Pattern, grid: GridReading | None) -> TagReport:
+    """Return what the tags in an image say besides its points; grid: as it was read."""
     if not pattern.tag_count:
-        return 0, 0
-    found = _tags(image, pattern, 2 if pattern.kind == 'aprilgrid' else 1)
-    return len(found), sum(tag >= pattern.tag_count for tag in found)
+        return NO_TAGS
+    layouts: frozenset[TagLayout] = frozenset()
+    border, first = 1, 0
+    if pattern.kind == 'aprilgrid':
+        grid = grid or _read_aprilgrid(image, pattern)
+        layouts = grid.layouts
+        layout = grid.layout or next(iter(layouts), TagLayout(2, 0, False, 0))
+        border, first = layout.border, layout.first
+    ids, _ = _tags(image, pattern, border)
+    beyond = (ids < first) | (ids >= first + pattern.tag_count)
+    return TagReport(len(ids), int(beyond.sum()), layouts)
 
 
 # Which patterns a detector is for, and its finder
@@ -195,8 +218,8 @@ DETECTORS = Registry[tuple[tuple[str, ...], Finder]](
         'quick': (('chessboard',), _search_scaled(classic)),
         'sb': (('chessboard',), sector_based),
         'classic': (('chessboard',), classic_subpixel),
-        'charuco': (('charuco',), _sharper(charuco)),
-        'aprilgrid': (('aprilgrid',), _sharper(aprilgrid)),
+        'charuco': (('charuco',), _either_color(_sharper(charuco))),
+        'aprilgrid': (('aprilgrid',), _either_color(_sharper(aprilgrid))),
         'circles': (('circles', 'asymmetric_circles'), _search_scaled(find_circles)),
         'squares': (('squares',), find_squares),
     },
@@ -216,7 +239,7 @@ def _all_corners(ok: bool, corners: Any) -> Found | None:
     if not ok:
         return None
     uv = np.asarray(corners, dtype=float).reshape(-1, 2)
-    return np.arange(len(uv)), uv
+    return Found(np.arange(len(uv)), uv)
 
 
 def dictionary_of(pattern: Pattern) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.detect.patterns import Pattern
+from fisheye_svp_ros.detect.patterns import Found, Pattern
 
 _BLOCKS = (31, 91, 271)  # px, of the local threshold
 _MIN_DARKNESS = 8  # grey levels from the mean there
@@ -42,7 +42,7 @@ class Ellipses(NamedTuple):
     matrix: Array
 
 
-def find_circles(image: NDArray[np.uint8], pattern: Pattern) -> tuple[Index, Array] | None:
+def find_circles(image: NDArray[np.uint8], pattern: Pattern) -> Found | None:
     """Return the circles of a grid in a grey image, dark or bright; None without a whole one."""
     wanted = _lattice(pattern)
     for soft, bright in itertools.product(_SMOOTHING, (False, True)):
@@ -56,7 +56,7 @@ def find_circles(image: NDArray[np.uint8], pattern: Pattern) -> tuple[Index, Arr
             grid = _grow_grid(seen, near, seed)
             found = _assign_blobs(grid, wanted) if len(grid) >= len(wanted) else None
             if found is not None:
-                return np.arange(len(found)), seen.centre[found]
+                return Found(np.arange(len(found)), seen.centre[found])
     return None
 
 
@@ -194,7 +194,7 @@ def _assign_blobs(grid: Grid, wanted: Index) -> list[int] | None:
     return found[0] if len(same) == 1 else None
 
 
-def find_squares(image: NDArray[np.uint8], pattern: Pattern) -> tuple[Index, Array] | None:
+def find_squares(image: NDArray[np.uint8], pattern: Pattern) -> Found | None:
     """Return the corners of a grid of dark squares in a grey image, None without a whole one.
 
     Corners go around each square from its corner of least x and y, squares row by row.
@@ -214,7 +214,7 @@ def find_squares(image: NDArray[np.uint8], pattern: Pattern) -> tuple[Index, Arr
             for first in range(len(squares)):
                 found = _complete_corners(_grow_squares(squares, first, step), pattern)
                 if found is not None:
-                    return np.arange(4 * pattern.columns * pattern.rows), found
+                    return Found(np.arange(4 * pattern.columns * pattern.rows), found)
     return None
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.detect.tag_grids import GridReading, TagLayout
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import read_yaml
 
@@ -48,6 +49,17 @@ class Turn(NamedTuple):
     same: bool
 
 
+class Found(NamedTuple):
+    """Which points (M,) of a pattern are in an image, and where, (M, 2), px, roughly.
+
+    grid: what tags say about an AprilGrid.
+    """
+
+    ids: Index
+    uv: Array
+    grid: GridReading | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Pattern:
     """The points of a flat board, and what a detector must know of them.
@@ -55,7 +67,8 @@ class Pattern:
     points (N, 3), m, z = 0; columns, rows: as written in `spec`; clearance: how far around a
     point, m, nothing but its own edges is printed; inward (N, 2): towards the dark corner of a
     square grid, along the board's axes; tint (N,): 1 where the square towards +x, +y is bright,
-    -1 where it is dark, 0 where there is none; marker: side of a tag, m; dictionary: of tags.
+    -1 where it is dark, 0 where there is none; marker: side of a tag, m; dictionary: of tags;
+    gap: between the tags of an AprilGrid, over their side; layout: of its tags, None unknown.
     """
 
     kind: str
@@ -69,6 +82,8 @@ class Pattern:
     size: float
     marker: float = 0.0
     dictionary: str = ''
+    gap: float = 0.0
+    layout: TagLayout | None = None
 
     @property
     def tag_count(self) -> int:
@@ -77,6 +92,18 @@ class Pattern:
             'aprilgrid': self.columns * self.rows,
             'charuco': self.columns * self.rows // 2,
         }.get(self.kind, 0)
+
+    def with_layout(self, layout: TagLayout) -> Pattern:
+        """Return the AprilGrid with its tags printed so."""
+        # A corner of a cell is nearest: the code has six cells, the border stands around it.
+        border = layout.border / (6 + 2 * layout.border)
+        clearance = self.marker * min(self.gap, border * float(np.sqrt(2)))
+        return replace(self, layout=layout, clearance=clearance)
+
+    def without_squares(self) -> Pattern:
+        """Return the AprilGrid with tags alone, whose corners are those of dark squares."""
+        inward = np.tile(1 - 2 * _CORNERS, (self.tag_count, 1))
+        return replace(self, inward=inward, tint=np.ones(len(self.points)))
 
     @cached_property
     def turns(self) -> tuple[Turn, ...]:
@@ -250,6 +277,7 @@ def _aprilgrid(spec: str, words: list[str]) -> Pattern:
         tag,
         tag,
         _APRILTAGS,
+        ratio,
     )
 
 
@@ -324,6 +352,8 @@ def _checks(columns: int, rows: int) -> Array:
 
 def check_of_board(pattern: Pattern) -> str:
     """Return what to check where a board is never found."""
+    if pattern.kind == 'aprilgrid':
+        return 'check kind, tagCols and tagRows of the board'
     counted = {
         'chessboard': ' (inner corners: one less than squares)',
         'charuco': ' (squares, columns first) and its dictionary',

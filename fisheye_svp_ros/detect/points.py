@@ -15,12 +15,12 @@ from fisheye_svp_ros.detect.finders import (
     DETECTORS,
     UNFITTED_DETECTORS,
     Finder,
-    Found,
     Grey,
     explain_failure,
 )
-from fisheye_svp_ros.detect.patterns import Pattern, local_axes
+from fisheye_svp_ros.detect.patterns import Found, Pattern, local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
+from fisheye_svp_ros.detect.tag_grids import GridReading
 from fisheye_svp_ros.detect.windows import halve_image
 
 SATURATED_SHARE = 0.02  # of a board's pixels at the end of the scale
@@ -48,7 +48,8 @@ _SMOOTHING = 1.0  # px
 class Points(NamedTuple):
     """Points (M,) of a pattern: which; uv (M, 2) and sigma (M,), px; blur and reach, px.
 
-    reach (M,): distance to the next edge of the print in the image.
+    reach (M,): distance to the next edge of the print in the image; grid: what tags say about an
+    AprilGrid.
     """
 
     ids: Index
@@ -56,6 +57,7 @@ class Points(NamedTuple):
     sigma: Array
     blur: float
     reach: Array
+    grid: GridReading | None = None
 
 
 def find_points(
@@ -88,7 +90,9 @@ def _search(
     found = found or finder(grey, pattern)
     if found is None:
         return explain_failure(grey, pattern)
-    index, uv = found
+    index, uv, grid = found
+    if grid is not None and grid.layout is not None:
+        pattern = pattern.with_layout(grid.layout)
     if len(index) < _MIN_POINTS:
         return f'{len(index)} points found; {_MIN_POINTS} are needed'
     if pattern.marker:
@@ -103,7 +107,11 @@ def _search(
         # on the dark side, but on both sides of a corner, or all around a circle, alike.
         again = _measure(pixels, index, uv, pattern, detector, censored=False)
         measured = measured if isinstance(again, str) else again
-    return measured
+    if isinstance(measured, str) and pattern.kind == 'aprilgrid':
+        # Other programs than Kalibr print no squares beyond the corners of tags.
+        again = _measure(pixels, index, uv, pattern.without_squares(), detector, censored=True)
+        measured = measured if isinstance(again, str) else again
+    return measured if isinstance(measured, str) else measured._replace(grid=grid)
 
 
 def full_scale_share(pixels: Pixels, uv: Array) -> float:
@@ -147,7 +155,9 @@ def _surroundings(index: Index, uv: Array, pattern: Pattern) -> tuple[Array, Arr
     return axes * (pattern.inward[index, :, None] if square else 1.0), reach
 
 
-def _complete_tags(pixels: Pixels, index: Index, uv: Array, pattern: Pattern) -> Found:
+def _complete_tags(
+    pixels: Pixels, index: Index, uv: Array, pattern: Pattern
+) -> tuple[Index, Array]:
     """Return the points that a finder of tags found, and those of tags that it missed.
 
     Tags that are small, or bent through a fisheye, are not decoded.  A lens fitted to the points
@@ -279,7 +289,7 @@ def _search_near(grey: Grey, pattern: Pattern, finder: Finder, near: Array) -> F
         grey[top:bottom, left:right], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
     )
     found = finder(crop, pattern)
-    return None if found is None else (found[0], (found[1] + 0.5) / scale - 0.5 + (left, top))
+    return found and found._replace(uv=(found.uv + 0.5) / scale - 0.5 + (left, top))
 
 
 def _fix_handedness(uv: Array, pattern: Pattern) -> Array:

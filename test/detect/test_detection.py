@@ -32,7 +32,7 @@ from fisheye_svp_ros import cli
 from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners
 from fisheye_svp_ros.detect.detection import Detection, _Task, detect, examine
 from fisheye_svp_ros.detect.finders import DETECTORS, dictionary_of
-from fisheye_svp_ros.detect.patterns import _MARKERS, parse_pattern
+from fisheye_svp_ros.detect.patterns import _MARKERS, Found, parse_pattern
 from fisheye_svp_ros.detect.photographs import (
     Photograph,
     decode_image,
@@ -83,7 +83,7 @@ def test_corners_do_not_depend_on_where_the_search_saw_them(
     def seen(off: float) -> np.ndarray:
         monkeypatch.setattr(
             'fisheye_svp_ros.detect.points.DETECTORS',
-            {'saddle': ((), lambda *_: (np.arange(len(true)), true + off * rough))},
+            {'saddle': ((), lambda *_: Found(np.arange(len(true)), true + off * rough))},
         )
         points = find_points(image, PATTERN, 'saddle')
         assert not isinstance(points, str)
@@ -312,7 +312,7 @@ class TestCorners:
         grid = true_corners(pose).reshape(PATTERN.rows, PATTERN.columns, 2)
         beyond = 2 * grid[:, -1:] - grid[:, -2:-1]
         off = np.concatenate([grid[:, 1:], beyond], axis=1).reshape(-1, 2)
-        found = np.arange(len(off)), off
+        found = Found(np.arange(len(off)), off)
         monkeypatch.setattr(
             'fisheye_svp_ros.detect.points.DETECTORS',
             {'saddle': (('chessboard',), lambda *_: found)},
@@ -433,7 +433,8 @@ class TestTags:
         expected = cv2.perspectiveTransform(flat_uv[None], turn)[0]
         assert np.abs(points.uv - expected).max() < 0.5
 
-    def test_tags_with_a_border_of_one_cell_are_told_from_none(self, tmp_path: Path) -> None:
+    def test_tags_alone_with_a_border_of_one_cell(self, tmp_path: Path) -> None:
+        """No squares stand beyond their corners."""
         if not hasattr(cv2, 'aruco'):
             pytest.skip('this OpenCV has no markers')
         path = tmp_path / 'april.yaml'
@@ -447,8 +448,13 @@ class TestTags:
         draw = getattr(cv2.aruco, 'generateImageMarker', None) or cv2.aruco.drawMarker
         for tag in range(2):
             flat[70:230, 60 + 208 * tag : 220 + 208 * tag] = draw(dictionary, tag, 160)
-        why = find_points(flat, pattern, 'aprilgrid')
-        assert isinstance(why, str) and 'a border of one cell' in why
+        image, turn = self.warped(flat)
+        points = find_points(image, pattern, 'aprilgrid')
+        assert not isinstance(points, str), points
+        place = pattern.points[points.ids, :2] * 1600
+        flat_uv = np.stack([60 + place[:, 0], 230 - place[:, 1]], axis=-1) - 0.5
+        expected = cv2.perspectiveTransform(flat_uv[None], turn)[0]
+        assert len(points.ids) == 8 and np.abs(points.uv - expected).max() < 1.0
 
     @pytest.mark.slow
     @pytest.mark.parametrize('spec', ['circles:6x5:40mm', 'circles:4x7:40mm:asymmetric'])

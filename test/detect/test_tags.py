@@ -80,22 +80,37 @@ def test_what_is_hidden_is_not_reached(aprilgrid: Pattern) -> None:
 
 
 @pytest.mark.parametrize(
-    ('columns', 'said'),
-    [(6, ''), (5, r'\d+ of \d+ tags have ids beyond the 5x5 board; check tagCols and tagRows')],
+    ('change', 'status', 'said'),
+    [
+        ('Cols: 6', 0, ''),
+        (
+            'Cols: 5',
+            2,
+            r'ids grow by 6 from row to row, and tagCols is 5 \(2\); check kind, tagCols',
+        ),
+        (
+            'Rows: 4',
+            0,
+            r'\d+ of \d+ tags have ids beyond the 6x4 board; check tagCols and tagRows',
+        ),
+    ],
 )
 def test_tags_beyond_the_board_are_told(
     aprilgrid: Pattern,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    columns: int,
+    change: str,
+    status: int,
     said: str,
 ) -> None:
     for number in (1, 2):
         cv2.imwrite(str(tmp_path / f'{number}.png'), pattern_photograph(aprilgrid, number)[0])
-    (tmp_path / 'target.yaml').write_text(TARGET.replace('Cols: 6', f'Cols: {columns}'))
-    assert cli.main(['detect', str(tmp_path), '--board', f'aprilgrid:{tmp_path}/target.yaml']) == 0
+    wrong = re.sub(f'{change[:4]}: .', change, TARGET)
+    (tmp_path / 'target.yaml').write_text(wrong)
+    spec = f'aprilgrid:{tmp_path}/target.yaml'
+    assert cli.main(['detect', str(tmp_path), '--board', spec]) == status
     told = capsys.readouterr().err
-    assert re.search(said, told) and ('beyond the' in told) == bool(said)
+    assert re.search(said, told) and ('beyond the' in told) == ('beyond' in said)
 
 
 @pytest.mark.slow
