@@ -20,6 +20,10 @@ from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.io.streams import tolerant_streams
 from fisheye_svp_ros.threads import set_thread_count
 
+_DESCRIPTION = (
+    'Measure what the single-viewpoint (SVP) approximation of a fisheye lens costs, and find the '
+    'model errors in calibration data.'
+)
 COMMANDS = {
     'budget': 'find the range and the angle at which the SVP error exceeds your limits',
     'calibrate': 'calibrate a lens, or a rig, from observations; no poses, no initial guess',
@@ -41,6 +45,39 @@ COMMANDS = {
     'undistort': 'undistort photographs, rectify stereo pairs, write maps for cv2.remap',
     'watch': 'show the results of running nodes live in the terminal',
 }
+# One for the help of each command.
+EXAMPLES = {
+    'budget': '--lens fish180 --range 0.5 --noise 0.3 -o budget',
+    'calibrate': 'photographs --board chessboard:9x6:25mm -o lens.yaml',
+    'demo': '-o demo',
+    'detect': 'photographs --board chessboard:9x6:25mm -o observations.csv',
+    'diagnose': 'photographs --board chessboard:9x6:25mm --lens lens.yaml -o diagnosis',
+    'example': '-o example',
+    'lens': 'camchain.yaml -o lens.yaml',
+    'localize': 'observations.csv --lens lens.yaml -o poses',
+    'paper': '-o paper',
+    'plan': '--lens lens.yaml --board chessboard:9x6:25mm --room 0.2 1 -o plan',
+    'plot': 'recording -o pictures',
+    'record': '-o recording --sweep noise',
+    'render': '--lens fish180 --board chessboard:9x6:25mm --count 12 -o rendered',
+    'run': 'localizer --ros-args -p lens:=fish180',
+    'sweep': 'noise -o sweep',
+    'table': 'recording -o table.csv',
+    'undistort': 'lens.yaml photographs --as pinhole -o undistorted',
+    'watch': '',
+}
+_FIRST = """{description}
+
+with photographs of a board:
+  fisheye-svp calibrate {calibrate}
+  fisheye-svp diagnose {diagnose}
+on a robot, or without one:
+  fisheye-svp demo {demo}
+  fisheye-svp run {run}
+  fisheye-svp sweep {sweep}
+
+all commands: fisheye-svp --help
+"""
 _SOLVING = ('budget', 'calibrate', 'demo', 'detect', 'diagnose', 'localize', 'paper', 'sweep')
 # Others project many points at once, for which the compiled engine takes every core.
 _ON_ONE_THREAD = ('calibrate', 'diagnose', 'sweep')
@@ -92,11 +129,10 @@ def _tell(text: str) -> int:
 
 
 def _run(arguments: Sequence[str]) -> None:
-    parser = _Parser(
-        prog='fisheye-svp',
-        description='Measure what the single-viewpoint (SVP) approximation of a fisheye lens '
-        'costs, and find the model errors in calibration data.',
-    )
+    if not arguments:
+        print(_FIRST.format(description=_DESCRIPTION, **EXAMPLES), end='')
+        return
+    parser = _Parser(prog='fisheye-svp', description=_DESCRIPTION)
     parser.add_argument('--version', action='version', version=f'%(prog)s {__version__}')
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
     for name, purpose in COMMANDS.items():
@@ -108,6 +144,7 @@ def _run(arguments: Sequence[str]) -> None:
         module = import_module(f'fisheye_svp_ros.commands.{named}')
         module.add_arguments(commands.choices[named])
         commands.choices[named].set_defaults(run=module.run)
+        commands.choices[named].epilog = f'example: fisheye-svp {named} {EXAMPLES[named]}'.rstrip()
     if named in _SOLVING:
         commands.choices[named].add_argument(
             '--engine',

@@ -26,15 +26,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from benchmark.studies.blind import OUTSIDE_SIZES, SIZES, tasks
-from benchmark.studies.blind_trial import MODES, Task, draw_case
+from benchmark.studies.independent.generator import GIVEN, MODES, generate, plan, write
 from benchmark.studies.two_cameras import KINDS, pair
 from benchmark.study import in_processes
 from fisheye_svp_ros.cli import main as fisheye_svp
 from fisheye_svp_ros.io.files import write_json
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import write_observations
-from fisheye_svp_ros.scene.observations import Observations
 
 RELATIVE, ABSOLUTE = 1e-6, 1e-9
 BLIND = 8  # trials of each mode
@@ -156,30 +154,14 @@ def _rendered(folder: Path) -> Iterator[Case]:
 
 
 def _blind(folder: Path) -> Iterator[Case]:
-    """Draw the trials of all modes; those of one or of outside effects are of all sizes."""
-    for mode in MODES:
-        for number, task in enumerate(list(tasks(mode, BLIND, 0))[:: _each(mode)][:BLIND]):
+    """Write the sets of all modes, and sets of one effect among the background of real data."""
+    for mode, hidden, background in (*((m, m, 0.0) for m in MODES), ('background', 'one', 0.5)):
+        for number in range(BLIND):
             name = f'blind-{mode}-{number}'
-            scene = (case := draw_case(_resized(task, number))).scene
-            write_observations(folder / f'{name}.csv', scene.table(case.given))
-            save_lens(scene.lens, folder / f'{name}.yaml')
-            extra = ['--free', 'intrinsics'] if scene.free else []
-            if scene.held_out.any():
-                test: Observations = scene.table(case.given, held_out=True)
-                write_observations(folder / f'{name}-test.csv', test)
-                extra += ['--held-out', f'{{inputs}}/{name}-test.csv']
-            yield _diagnosis(
-                name, f'{{inputs}}/{name}.csv', '--lens', f'{{inputs}}/{name}.yaml', *extra
-            )
-
-
-def _each(mode: str) -> int:
-    return len(list(tasks(mode, 1, 0)))
-
-
-def _resized(task: Task, number: int) -> Task:
-    sizes = {'one': SIZES, 'outside': OUTSIDE_SIZES}.get(task.mode)
-    return task._replace(size=sizes[number % 2]) if sizes else task
+            blind = generate(number, number, plan(hidden, number, number), background)
+            write(blind, folder / name, folder / f'{name}.json')
+            given = [f'{{inputs}}/{name}/{file}' for file in GIVEN]
+            yield _diagnosis(name, given[0], '--lens', given[1], '--held-out', given[2])
 
 
 def _calibrated(folder: Path, name: str, table: str, size: str) -> Iterator[Case]:

@@ -369,7 +369,7 @@ def report(trials: Sequence[Trial], size: float) -> list[str]:
         '# Blind tests through images',
         '',
         f'The effect was named in {_rate([t.hit for t in hidden])} of the sets. Unlike in '
-        '[blind.md](blind.md), only',
+        '[other blind tests](blind_independent.md), only',
         f'photographs are given: {PHOTOGRAPHS} of a board ({BOARD}), {LENS.width} x {LENS.height} '
         'px, rendered through a lens of',
         '94°. `detect`, `calibrate` and `diagnose` find the model error. A lens fitted without '

@@ -181,8 +181,11 @@ def _known_sizes(args: argparse.Namespace, observations: Observations, sizes: Si
     unknown = [name for name in observations.cameras if not {name, ''} & set(sizes)]
     if unknown:
         head = f'{unknown[0]}=' if unknown[0] and sizes else ''
+        seen = observations.camera == list(observations.cameras).index(unknown[0])
+        width, height = np.ceil(observations.uv[seen].max(axis=0)).astype(int)
         raise ParameterError(
-            f'{args.observations}: the image size is unknown; add --image-size {head}1280x800'
+            f'{args.observations}: the image size is unknown; points reach {width} px to the '
+            f'right and {height} px down; add --image-size {head}WIDTHxHEIGHT, that of your images'
         )
     return sizes
 

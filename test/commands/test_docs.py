@@ -94,6 +94,18 @@ def test_every_command_is_one(page: Path) -> None:
             parser.parse_args(words)  # ends the test where it does not parse
 
 
+@pytest.mark.parametrize('name', cli.COMMANDS)
+def test_the_help_of_a_command_has_an_example(name: str) -> None:
+    parser = argparse.ArgumentParser(name)
+    import_module(f'fisheye_svp_ros.commands.{name}').add_arguments(parser)
+    parser.parse_args(shlex.split(cli.EXAMPLES[name]))  # ends the test where it does not parse
+
+
+def test_without_a_command_the_first_ones_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 0
+    assert len(_COMMAND.findall(capsys.readouterr().out)) == 5
+
+
 def test_architecture_names_every_room_and_what_is_there() -> None:
     page = (ROOT / 'docs' / 'explanation' / 'architecture.md').read_text()
     paths = re.findall(r'`([\w./]+/[\w./]*|\w+\.(?:py|toml))`', page)

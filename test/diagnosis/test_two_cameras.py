@@ -134,7 +134,8 @@ def test_a_calibrated_rig_leaves_out_frames_that_contradict_it(tmp_path, capsys)
     write_observations(tmp_path / 'rig.csv', replace(seen.table, frame=np.array(frame)))
     words = ['calibrate', str(tmp_path / 'rig.csv'), '--image-size']
     assert cli.main([*words, 'left=1280x960']) == 2
-    assert 'add --image-size right=1280x800' in capsys.readouterr().err
+    text = capsys.readouterr().err
+    assert 'points reach 102' in text and 'add --image-size right=WIDTHxHEIGHT' in text
     assert cli.main([*words, 'left=1280x960,right=1024x768', '-o', str(tmp_path / 'rig')]) == 0
     said = capsys.readouterr().err
     assert f'frames {one} and {other}: its cameras contradict each other' in said

@@ -15,12 +15,15 @@ from benchmark.studies.independent.background import Background, draw_background
 from benchmark.studies.independent.camera import HEIGHTS, Array, Lens, draw_lens
 from benchmark.studies.independent.effects import EFFECTS, STEPS, Effect
 from benchmark.studies.independent.formation import Departure, form, observed, simulated
+from benchmark.studies.independent.oracle import amplitudes, finds
 from benchmark.studies.independent.outside import OUTSIDE
 from benchmark.studies.independent.scene import Scene, draw_scene
 
 Rng = np.random.Generator
 CATALOGUE = {**EFFECTS, **OUTSIDE}
 SIZES = (1.0, 0.5, 0.2)
+MODES = ('one', 'two', 'clean', 'outside')
+GIVEN = ('observations.csv', 'lens.yaml', 'held_out.csv')
 # Pairs of which nobody could say which of the two it is.
 ALIKE = (
     {'viewpoint_shift', 'flat_port'},
@@ -33,11 +36,15 @@ ALIKE = (
 
 
 class Hidden(NamedTuple):
-    """An effect, its size in noise levels and its amount in its own unit."""
+    """An effect, its size in noise levels, its amount in its own unit, and what the oracle sees.
+
+    oracle: amplitude over its standard error; None for effects without a direction.
+    """
 
     effect: str
     size: float
     amount: float
+    oracle: float | None = None
 
 
 class BlindSet(NamedTuple):
@@ -169,6 +176,8 @@ def _observe(
 ) -> BlindSet:
     background = draw_background(rng, scene, size, free)
     uv, named = observed(rng, scene, [*background.departures, *departures], background.outliers)
+    scores = amplitudes(scene, free, uv, departures)
+    hidden = tuple(h._replace(oracle=z) for h, z in zip(hidden, scores, strict=True))
     lens, rms = scene.lens, 0.0
     if scene.fitted:
         lens, rms = fit_lens(named, uv, scene.lens)
@@ -234,7 +243,12 @@ def _truth(blind: BlindSet) -> dict[str, Any]:
     scene = blind.scene
     return {
         'hidden': [
-            {**h._asdict(), 'stage': CATALOGUE[h.effect].stage, 'unit': CATALOGUE[h.effect].unit}
+            {
+                **h._asdict(),
+                'oracle_finds': h.oracle is not None and finds(h.oracle, len(EFFECTS)),
+                'stage': CATALOGUE[h.effect].stage,
+                'unit': CATALOGUE[h.effect].unit,
+            }
             for h in blind.hidden
         ],
         'background': {'outliers': blind.background.outliers, **blind.background.parts},

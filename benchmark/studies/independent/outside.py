@@ -73,12 +73,28 @@ def blurred_frames(rng: Rng, scene: Scene) -> Form:
     return lambda size: Departure(spread=level[scene.frame] ** size)
 
 
+def two_colors(rng: Rng, scene: Scene) -> Form:
+    """Every other landmark shines in another color, which the lens magnifies more."""
+    odd = (np.arange(len(scene.target.points)) % 2 - 0.5)[scene.landmark]
+    return lambda a: Departure(focal=1 + a * odd[:, None] * np.ones(2))
+
+
+def stabilizer(rng: Rng, scene: Scene) -> Form:
+    """The principal point swings with time, as a stabilizer moves the sensor."""
+    times = scene.track.times - scene.track.times[0]
+    swing = np.sin(rng.uniform(3, 8) * times + rng.uniform(0, 2 * np.pi))[scene.frame]
+    towards = rng.normal(size=2)
+    return lambda a: Departure(centre=a * swing[:, None] * towards)
+
+
 OUTSIDE: dict[str, Effect] = {
     'ripple': Effect('lens', 'px', 5.0, ripple),
     'dent': Effect('lens', 'px', 20.0, dent),
     'wobble': Effect('frame', 'px', 5.0, wobble),
     'walk': Effect('target', 'px', 5.0, walk),
     'trefoil': Effect('lens', 'px', 20.0, trefoil),
+    'two_colors': Effect('target', '1', 0.05, two_colors),
+    'stabilizer': Effect('frame', 'px', 25.0, stabilizer),
     'heavy_tails': Effect('noise', '1', 1.0, heavy_tails, direct=True),
     'blurred_frames': Effect('noise', '1', 1.0, blurred_frames, direct=True),
 }

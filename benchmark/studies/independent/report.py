@@ -24,6 +24,8 @@ held-out frames and the lens.
   and quadratic field in each view, a static field in each camera; also up to 2 % outliers.
 - An effect is named if a cause or its confounded set (`indistinguishable_from`) contains it. A
   name is false if no effect of its set is hidden.
+- The oracle is the likelihood-ratio test that knows effect and direction, at the same corrected
+  significance. Effects of noise, names and digits have no direction; it is counted for the others.
 - The stage is right if the strongest significant component (1 %) is in the stage of the hidden
   effect. It is not tested with a background, which affects every stage.
 """
@@ -94,6 +96,7 @@ def _one(runs: Mapping[float, Scores]) -> str:
                     f'{size:g}',
                     _rate(s['found'][0] for s in some),
                     _rate(s['exactly'][0] for s in some),
+                    *_beside_oracle(some),
                     _rate(s['false'] for s in some),
                     _rate(stages),
                     _verdicts(some),
@@ -114,6 +117,8 @@ def _one(runs: Mapping[float, Scores]) -> str:
                     'size',
                     'its class is named',
                     'itself',
+                    'oracle',
+                    'named of what the oracle finds',
                     'another effect named too',
                     'stage right',
                     'verdicts',
@@ -127,6 +132,13 @@ def _one(runs: Mapping[float, Scores]) -> str:
             _confusion([s for scores in runs.values() for s in scores]),
         ]
     )
+
+
+def _beside_oracle(scores: Scores) -> tuple[str, str]:
+    """Return how often the oracle finds the effect, and how often it is then named."""
+    known = [s for s in scores if s['hidden'][0].get('oracle') is not None]
+    seen = [s for s in known if s['hidden'][0]['oracle_finds']]
+    return _rate(s['hidden'][0]['oracle_finds'] for s in known), _rate(s['found'][0] for s in seen)
 
 
 def _by_size(scores: Scores) -> str:

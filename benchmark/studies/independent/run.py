@@ -19,11 +19,10 @@ from typing import Any, NamedTuple
 
 from rich.progress import track
 
-from benchmark.studies.independent.generator import generate, plan, write
+from benchmark.studies.independent.generator import GIVEN, MODES, generate, plan, write
 from benchmark.studies.independent.report import write_reports
 from benchmark.studies.independent.score import score
 
-MODES = ('one', 'two', 'clean', 'outside')
 LIMIT = 900.0
 
 
@@ -64,11 +63,11 @@ def diagnose(given: Path, output: Path) -> dict[str, Any]:
     command = [
         str(program) if program.exists() else shutil.which('fisheye-svp') or 'fisheye-svp',
         'diagnose',
-        'observations.csv',
+        GIVEN[0],
         '--lens',
-        'lens.yaml',
+        GIVEN[1],
         '--held-out',
-        'held_out.csv',
+        GIVEN[2],
         '-o',
         str(output.resolve()),
     ]

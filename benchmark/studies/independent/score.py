@@ -31,7 +31,11 @@ def score(truth: Mapping[str, Any], said: Mapping[str, Any]) -> dict[str, Any]:
         strength[stage] = strength.get(stage, 0.0) + component['sd_px'] ** 2
     return {
         'hidden': [
-            {key: h[key] for key in ('effect', 'size', 'amount', 'stage')} for h in truth['hidden']
+            {
+                key: h.get(key)
+                for key in ('effect', 'size', 'amount', 'stage', 'oracle', 'oracle_finds')
+            }
+            for h in truth['hidden']
         ],
         'said': [cause['effect'] for cause in causes],
         'classes': [sorted(members) for members in classes],
