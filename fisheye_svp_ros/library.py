@@ -178,7 +178,9 @@ def calibrate(
         check_size_given(str(observations), {}, {'': size}, 'image_size')
     progress('fitting the lens', 0.0)
     found, kept, _ = calibrate_without_outliers(
-        table, lambda rows: lens_calibration.calibrate(rows, model, size, free, name)
+        table,
+        lambda rows: lens_calibration.calibrate(rows, model, size, free, name),
+        lens_calibration.rough_lenses(model, size),
     )
     if poses is not None:
         found, _ = lens_calibration.calibrate_hand_eye(found, kept, _by_frame(poses))

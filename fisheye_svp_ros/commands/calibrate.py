@@ -49,6 +49,7 @@ from fisheye_svp_ros.solve.lens_calibration import (
     calibrate,
     calibrate_hand_eye,
     calibrate_port,
+    rough_lenses,
 )
 from fisheye_svp_ros.solve.measured_poses import posable_observations
 from fisheye_svp_ros.solve.outliers import FRAME
@@ -247,7 +248,8 @@ def _calibrate_camera(
         return calibrate(rows, args.model, size, args.free, name, port)
 
     with progress('calibrating'):
-        result, kept, gross = calibrate_without_outliers(table, fit_rows)
+        starts = () if air else rough_lenses(args.model, size)
+        result, kept, gross = calibrate_without_outliers(table, fit_rows, starts)
     note_gross_errors(table, gross)
     hand_eye = None
     if args.poses:
@@ -264,7 +266,7 @@ def _calibrate_camera(
             f'points ({cause}); check --port and --medium'
         ) from cause
     lens = with_covariance(result.adjusted.lens, trusted)
-    return CalibratedCamera(lens, result, trusted, kept, args.model, hand_eye)
+    return CalibratedCamera(lens, result, trusted, kept, args.model, hand_eye, gross.landmarks)
 
 
 def _print(found: CalibratedCamera) -> None:
@@ -297,6 +299,7 @@ def _document(found: CalibratedCamera) -> dict[str, Any]:
         'left_out': found.result.left_out,
         'beyond': found.result.beyond,
         'sigma_px': found.result.sigma,
+        'wrong_landmarks': [landmark.to_dict() for landmark in found.wrong_landmarks],
         'parameters': dict(
             zip(adjusted.names, parameter_values(adjusted.lens, adjusted.names), strict=True)
         ),

@@ -22,7 +22,13 @@ from fisheye_svp_ros.commands.lenses import (
     lenses_of,
     load_lenses,
 )
-from fisheye_svp_ros.commands.notes import note_copies, note_huge, note_left_out, note_unconnected
+from fisheye_svp_ros.commands.notes import (
+    note_copies,
+    note_huge,
+    note_left_out,
+    note_unconnected,
+    note_wrong_landmarks,
+)
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.plan import view_count, view_limits
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
@@ -183,6 +189,7 @@ def run(args: argparse.Namespace) -> None:
             with write_together():
                 _write(args, diagnosis, known, bool(names), wanted)
     _print(diagnosis, known, args, wanted)
+    note_wrong_landmarks(diagnosis.evaluation.selection.revision.outliers.landmarks)
     if not args.poses:
         note_unconnected(observations)
     if impossible is not None:

@@ -14,7 +14,13 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.commands.detect import add_observation_arguments, read_input
 from fisheye_svp_ros.commands.lenses import add_lens_argument, lenses_of, load_lenses
-from fisheye_svp_ros.commands.notes import note_doubtful, note_gross_errors, note_left_out, say
+from fisheye_svp_ros.commands.notes import (
+    note_doubtful,
+    note_gross_errors,
+    note_left_out,
+    note_wrong_landmarks,
+    say,
+)
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
@@ -88,6 +94,7 @@ def run(args: argparse.Namespace) -> None:
                 measured = localize_measured(model, table)
         title = ' '.join(filter(None, (args.observations, name)))
         _print(table, measured, uncertainty, title)
+        note_wrong_landmarks(measured.landmarks)
         note_left_out(table, measured.left_out)
         note_doubtful(table, measured.views.frame.tolist(), measured.reasons)
         if args.output:
@@ -262,6 +269,7 @@ def _write(
                 }
                 for i, j in np.argwhere(measured.gross)
             ],
+            'wrong_landmarks': [landmark.to_dict() for landmark in measured.landmarks],
             'doubtful': [
                 {'frame': int(frame), **photograph_entry(table, int(frame)), 'reason': reason}
                 for frame, reason in zip(views.frame, measured.reasons, strict=True)
@@ -317,7 +325,8 @@ def _write_rig(folder: Path, cameras: tuple[str, ...], found: RigLocalization) -
                     'px': float(px),
                     'why': why,
                 }
-                for row, px, why in zip(*found.outliers, strict=True)
+                for row, px, why in zip(*found.outliers[:3], strict=True)
             ],
+            'wrong_landmarks': [landmark.to_dict() for landmark in found.outliers.landmarks],
         },
     )

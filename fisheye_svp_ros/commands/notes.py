@@ -11,11 +11,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fisheye_svp_ros.reporting.wording.landmarks import wrong_landmark_notes
 from fisheye_svp_ros.scene.observations import frame_name, list_frames
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.scene.observations import Observations
-    from fisheye_svp_ros.solve.outliers import Outliers
+    from fisheye_svp_ros.solve.outliers import Outliers, WrongLandmark
 
 _MAX_SIMILAR_NOTES = 3  # frames whose reasons differ by numbers alone; of more, the first only
 _DAY = 86_400.0  # s
@@ -75,8 +76,16 @@ def note_huge(table: Observations) -> None:
         say(f'the target is {across:.0f} m across; x, y, z must be in m, not in mm')
 
 
+def note_wrong_landmarks(landmarks: Sequence[WrongLandmark]) -> None:
+    """Name landmarks that are not where they are said to be."""
+    for note in wrong_landmark_notes(landmarks):
+        say(note)
+
+
 def note_gross_errors(table: Observations, gross: Outliers) -> None:
-    """Say how many rows of a table are set aside, and which are furthest off."""
+    """Say which landmarks are wrong, how many other rows are rejected, and which are furthest."""
+    note_wrong_landmarks(gross.landmarks)
+    gross = gross.without_landmarks()
     if len(gross.rows):
         worst = ', '.join(
             f'{frame_name(table, int(table.frame[gross.rows[i]]))} landmark '

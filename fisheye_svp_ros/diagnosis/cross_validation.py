@@ -31,9 +31,10 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.table_checks import is_another_target
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import localize_frames
-from fisheye_svp_ros.solve.outliers import Outliers, find_outliers
+from fisheye_svp_ros.solve.outliers import NO_OUTLIERS, Outliers, find_outliers, without_points
 from fisheye_svp_ros.solve.rig_checks import has_no_rig, rig_differs, unpair_cameras
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
+from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
 
 _RESAMPLES = 2000
 _PREDICTED_RATIO = 5.0  # times the median frame
@@ -289,12 +290,16 @@ class HeldOutData:
         if has_no_rig(trained):
             table = unpair_cameras(table)
         state = valid_state(model.state, table, trained, another_target)
+        wrong = find_wrong_landmarks(table.observations, state.model, lambda _: state.model)
+        rejected = NO_OUTLIERS.append_landmarks(table.observations, wrong)
+        table = without_points(table, np.isin(table.views.row, rejected.rows))
         data, outliers = find_outliers(table, localize_frames(table, state))
         differs = rig_differs(data, state)
         if differs:
             table = unpair_cameras(table)
             data, outliers = find_outliers(table, localize_frames(table, state))
-        return cls(data, localize_frames(data, state).pose, outliers, differs, another_target)
+        pose, outliers = localize_frames(data, state).pose, outliers.join(rejected)
+        return cls(data, pose, outliers, differs, another_target)
 
 
 def valid_state(

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from fisheye_svp_ros.effects.extension import (
     on_boards,
 )
 from fisheye_svp_ros.effects.of_cameras import camera_terms
+from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
 from fisheye_svp_ros.errors import GeometryError, ObservationError, ParameterError
 from fisheye_svp_ros.mixed_model import eliminate
 from fisheye_svp_ros.optics.lens import Lens
@@ -42,9 +44,9 @@ from fisheye_svp_ros.scene.table_checks import (
 )
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.hand_eye import HandEye, fit_hand_eye, flange_poses
-from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.measured_poses import rig_lenses
-from fisheye_svp_ros.solve.outliers import Outliers, find_outliers
+from fisheye_svp_ros.solve.initial_rig import initial_state, localize_frames
+from fisheye_svp_ros.solve.measured_poses import posable_observations, rig_lenses
+from fisheye_svp_ros.solve.outliers import NO_OUTLIERS, Outliers, find_outliers, without_points
 from fisheye_svp_ros.solve.rig_checks import (
     has_few_shared_frames,
     is_unrelated,
@@ -58,7 +60,9 @@ from fisheye_svp_ros.solve.rig_state import (
     free_parameters,
     group_by_frame,
     rms_px,
+    with_effect,
 )
+from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
 
 Progress = Callable[[str, float], None]
 
@@ -159,7 +163,9 @@ class Problem:
     """Data without outliers, and the simulation as it was fitted to them.
 
     table: all points; base: the fit, with `free` intrinsics; step: of which all coordinates are
-    multiples, px, 0 for none; options: without effects that these data cannot be asked for.
+    multiples, px, 0 for none; options: without effects that these data cannot be asked for;
+    start: the fit that causes are sought from, with landmarks displaced that are clearly not where
+    they are said to be; else the base.
     """
 
     inputs: Inputs
@@ -170,6 +176,7 @@ class Problem:
     free: tuple[str, ...]
     options: DiagnosisOptions
     step: float
+    start: RigState
 
     @classmethod
     def prepare(cls, inputs: Inputs) -> Problem:
@@ -184,7 +191,9 @@ class Problem:
         if is_unrelated(table, simulated):
             table = unpair_cameras(table)
             simulated = initial_state(table, lenses[0], lenses[1:])
-        data, outliers = find_outliers(table, simulated)
+        table, believed, rejected = _displace_landmarks(table, simulated, inputs)
+        data, outliers = find_outliers(table, believed)
+        outliers = outliers.join(rejected)
         base = adjust(data, initial_state(data, lenses[0], lenses[1:]), inputs.free)
         if has_few_shared_frames(data) or rig_is_inconsistent(data, lenses, base, inputs.free):
             data = unpair_cameras(data)
@@ -195,7 +204,11 @@ class Problem:
             options = options.leave_out(*QuantisationEffect.hides)
         else:
             step = 0.0
-        return cls(inputs, table, data, outliers, base, inputs.free, options, step)
+        start = base
+        if believed is not simulated:
+            start = localize_frames(data, replace(base, terms=believed.terms, **_lenses(believed)))
+            start = adjust(data, start, inputs.free)
+        return cls(inputs, table, data, outliers, base, inputs.free, options, step, start)
 
     @cached_property
     def linear(self) -> Linearization:
@@ -217,6 +230,47 @@ class Problem:
     def given_effects(self) -> tuple[Effect, ...]:
         """The effects that the lens came with."""
         return tuple(effect for effect, _ in self.base.terms)
+
+
+def _lenses(state: RigState) -> dict[str, Any]:
+    return {'lens': state.lens, 'others': state.others}
+
+
+def _displace_landmarks(
+    table: RigViews, simulated: RigState, inputs: Inputs
+) -> tuple[RigViews, RigState, Outliers]:
+    """Find landmarks that are clearly not where they are said to be.
+
+    Returns the data without those that no place explains, the state with the others displaced,
+    and the outliers.
+    """
+    lenses, state = tuple(inputs.lenses.values()), simulated
+
+    def fit(rows: Observations) -> RigState:
+        data = group_by_frame(posable_observations(rows, inputs.lenses.get('', inputs.lenses))[0])
+        return adjust(data, initial_state(data, lenses[0], lenses[1:]), inputs.free)
+
+    observations = table.observations
+    wrong = find_wrong_landmarks(
+        observations,
+        simulated.model,
+        lambda rows: fit(rows).model if inputs.free else simulated.model,
+    )
+    lost = [landmark for landmark in wrong if not landmark.displaced]
+    rejected = NO_OUTLIERS.append_landmarks(observations, lost)
+    moved = [landmark for landmark in wrong if landmark.displaced]
+    effect = LandmarkSurveyEffect(tuple(landmark.number for landmark in moved))
+    if wrong and inputs.free:
+        numbers = [landmark.number for landmark in wrong]
+        state = replace(
+            state, **_lenses(fit(observations.take(~np.isin(observations.landmark, numbers))))
+        )
+    if moved and effect.name not in inputs.options.left_out:
+        state = with_effect(state, effect, np.concatenate([landmark.offset for landmark in moved]))
+    if wrong:
+        table = without_points(table, np.isin(table.views.row, rejected.rows))
+        state = localize_frames(table, state)
+    return table, state, rejected
 
 
 def prepare_problem(inputs: Inputs) -> tuple[Problem, bool]:

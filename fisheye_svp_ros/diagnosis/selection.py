@@ -331,7 +331,7 @@ def _include_effects(problem: Problem) -> RigState:
 
     Raises ObservationError for one that the data cannot hold.
     """
-    state = problem.base
+    state = problem.start
     if not problem.options.included:
         return state
     stated = {effect.name: effect for effect in problem.options.stated}
@@ -389,5 +389,5 @@ def reinstate_outliers(
     why = tuple(one for one, back in zip(outliers.why, again, strict=True) if not back)
     return (
         replace(data, views=views._replace(weight=weight, row=row)),
-        Outliers(outliers.rows[~again], outliers.px[~again], why),
+        outliers._replace(rows=outliers.rows[~again], px=outliers.px[~again], why=why),
     )

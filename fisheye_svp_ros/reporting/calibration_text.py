@@ -17,6 +17,7 @@ from fisheye_svp_ros.scene.observations import Observations, list_frames
 from fisheye_svp_ros.solve.hand_eye import HandEye
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured_poses import rms_px
+from fisheye_svp_ros.solve.outliers import WrongLandmark
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.solve.lens_calibration import Calibration
@@ -39,7 +40,10 @@ _MIN_MM = 100.0  # such a factor, too large for a mistaken board, is that of mm
 
 @dataclass(frozen=True)
 class CalibratedCamera:
-    """One camera's lens with its errors, the fit, its trust, its table, and the robot, if any."""
+    """One camera's lens with its errors, the fit, its trust, its table, and the robot, if any.
+
+    wrong_landmarks: that are not where the table says, their points rejected.
+    """
 
     lens: Lens
     result: Calibration
@@ -47,6 +51,7 @@ class CalibratedCamera:
     table: Observations
     model: str
     hand_eye: HandEye | None = None
+    wrong_landmarks: tuple[WrongLandmark, ...] = ()
 
     def with_lens(self, lens: Lens) -> CalibratedCamera:
         """Return the camera with a lens fitted to more, and the poses of its views by it."""

@@ -42,6 +42,7 @@ _ROUNDS = 4
 # steps; neighbouring focal lengths differ by less than a fifth.
 _CORNER_ANGLES = np.geomspace(np.radians(4.0), np.radians(160.0), 24)
 _VIEWS, _POINTS = 20, 60  # enough for a start
+_ROUGH_STEP = 3  # of those focal lengths
 _GOLDEN = (np.sqrt(5) - 1) / 2
 _LOST, _FEW_LOST = 6.0, 0.2  # times the median view; of the views
 
@@ -153,6 +154,18 @@ def calibrate_hand_eye(
     lens = replace(_with_field(adjusted, theta), calibration=block)
     found = found._replace(adjusted=adjusted._replace(lens=lens), reached=float(theta.max()))
     return found, hand_eye
+
+
+def rough_lenses(model: str, image_size: tuple[int, int]) -> list[Lens]:
+    """Return lenses without distortion, of fields of view that differ by half, likely ones first.
+
+    To begin with where wrong landmarks or image points lead every fit astray.
+    """
+    start = _start_lens(model, image_size, (), 'start')
+    focals = _focal_lengths(start)[::_ROUGH_STEP]
+    order = np.argsort(np.abs(np.arange(len(focals)) - len(focals) / 3), kind='stable')
+    lenses = [replace(start, fx=focal, fy=focal) for focal in focals[order].tolist()]
+    return [_with_corner(lens) for lens in lenses]
 
 
 def placed_names(lens: Lens) -> tuple[str, ...]:
@@ -364,13 +377,18 @@ def lost_views(lens: Lens, views: Views) -> Mask:
     return lost if lost.mean() < _FEW_LOST else np.zeros_like(lost)
 
 
-def _scan(lens: Lens, views: Views) -> tuple[Array, Pose, Array]:
-    """Return focal lengths (C,), px, the poses (C, V) under each, and rms of each view, px."""
+def _focal_lengths(lens: Lens) -> Array:
+    """Return the focal lengths (C,), px, ascending, that a scan tries."""
     corner = np.hypot(lens.width, lens.height) / 2
     heights, _ = lens.image_height.value_and_slope(
         np.minimum(_CORNER_ANGLES, monotone_limit(lens))
     )
-    focals = np.unique(corner / heights)
+    return np.unique(corner / heights)
+
+
+def _scan(lens: Lens, views: Views) -> tuple[Array, Pose, Array]:
+    """Return focal lengths (C,), px, the poses (C, V) under each, and rms of each view, px."""
+    focals = _focal_lengths(lens)
     lenses = [replace(lens, fx=focal, fy=focal) for focal in focals.tolist()]
     lenses = [replace(one, max_incidence=field_of_view(one)) for one in lenses]
     direction = np.stack([back_project(one, views.uv).direction for one in lenses])

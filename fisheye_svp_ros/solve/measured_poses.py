@@ -14,7 +14,9 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
 from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization, localize
+from fisheye_svp_ros.solve.outliers import WrongLandmark
 from fisheye_svp_ros.solve.reliability import examine
+from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
 
 _OUTSIDE_SHARE = 0.02  # of the points of a camera: more than single outliers
 _LINE = 1e-6  # width of a point set relative to its length, below which it is a line
@@ -26,7 +28,8 @@ class MeasuredPoses(NamedTuple):
     result: covariances for the noise of the data; sigma: noise of u and of v, px, estimated from
     the residuals, None where the observations bring their own; left_out: frames whose points do
     not fix a pose; gross (V, N): observations left out as outliers; reasons (V,): why a pose
-    should not be relied on, '' for a reliable one.
+    should not be relied on, '' for a reliable one; landmarks: that are not where they are said to
+    be, their points among the outliers.
     """
 
     views: Views
@@ -35,6 +38,7 @@ class MeasuredPoses(NamedTuple):
     left_out: tuple[int, ...]
     gross: Mask
     reasons: tuple[str, ...]
+    landmarks: tuple[WrongLandmark, ...] = ()
 
     @property
     def inlier_residual(self) -> Array:
@@ -47,9 +51,12 @@ def localize_measured(model: ForwardModel, observations: Observations) -> Measur
 
     Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed.
     """
-    views, left_out = posable_views(observations, model)
+    wrong = find_wrong_landmarks(observations, model, lambda _: model)
+    right = ~np.isin(observations.landmark, [landmark.number for landmark in wrong])
+    views, left_out = posable_views(observations, model, right)
     checked = examine(model, views, localize(model, views), sigma_known(observations))
-    result, gross, reasons = checked.result, checked.gross, checked.reasons
+    result, reasons = checked.result, checked.reasons
+    gross = np.asarray(checked.gross | views.used & (views.weight == 0))
     fixed = result.converged
     if not fixed.all():
         left_out = tuple(sorted((*left_out, *views.frame[~fixed].tolist())))
@@ -57,16 +64,16 @@ def localize_measured(model: ForwardModel, observations: Observations) -> Measur
         reasons = tuple(np.array(reasons, dtype=object)[fixed])
     if not len(views.frame):
         raise GeometryError(f'{observations.source}: no frame has points that determine a pose')
-    return MeasuredPoses(views, result, checked.sigma, left_out, gross, reasons)
+    return MeasuredPoses(views, result, checked.sigma, left_out, gross, reasons, wrong)
 
 
 def posable_views(
-    observations: Observations, model: ForwardModel | None = None
+    observations: Observations, model: ForwardModel | None = None, right: Mask | None = None
 ) -> tuple[Views, tuple[int, ...]]:
     """Group one camera's table into views; return those that fix a pose, and the other frames.
 
     A pose needs MIN_POINTS points that are not on one line, inside the field of view of the model
-    if one is given.
+    if one is given.  right: the rows that count; the others are without weight in the views.
     Raises ObservationError for rows of several cameras, GeometryError where no frame is left.
     """
     cameras = np.unique(observations.camera)
@@ -76,7 +83,11 @@ def posable_views(
             f'{observations.source}: it holds the cameras {names}; keep the rows of one of them'
         )
     views = group_views(observations)
-    usable = views.used if model is None else views.used & model.back_project(views.uv).valid
+    if right is not None:
+        counts = views.used & right[views.row]
+        views = views._replace(weight=np.where(counts, views.weight, 0.0))
+    usable = views.weight > 0
+    usable = usable if model is None else usable & model.back_project(views.uv).valid
     count = usable.sum(axis=1)
     inside = usable[..., None]
     centre = (views.points * inside).sum(axis=1) / np.maximum(count, 1)[:, None]

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scene.observations import Views
+from fisheye_svp_ros.scene.observations import Observations, Views
 from fisheye_svp_ros.solve.initial_rig import localize_cameras, prediction_distances
 from fisheye_svp_ros.solve.rig_state import RigState, RigViews
 
-_OUTLIER_SIGMAS = 8.0  # robust standard deviations beyond which a point is not its landmark's
+OUTLIER_SIGMAS = 8.0  # robust standard deviations beyond which a point is not its landmark's
 _SWAP_SIGMAS = 6.0  # and within which it belongs to another one
 _SWAP_CHANCE = 0.01  # that so many do by chance
 _SUSPICIOUS_SIGMAS = 6.0  # below this no point is worth a robust fit
+LANDMARK = 'its landmark is not where the table says'
 SWAPPED_POINT = 'at the predicted place of another landmark'
 FAR_POINT = 'far from its prediction'
 VIEW = 'all points of the view are off: check their order'
@@ -29,18 +31,42 @@ _FRAME_RATIO = 6.0  # times the median frame: cameras that contradict each other
 _MAX_INCONSISTENT_SHARE = 0.5  # of the views that another camera can contradict: a minority
 _CAUCHY_SCALE = 2.0
 _STEP_TOLERANCE = 0.1  # of the scale: how little predictions may move
-_UNSEEN_PX = 1e9  # px, for points out of the field of view: further off than any other
-_MIN_RESIDUAL_PX = 1e-6  # px: no residual of computed points is smaller
-_MEDIAN_NORM = 1.1774  # of the norm of two standard normal coordinates
+UNSEEN_PX = 1e9  # px, for points out of the field of view: further off than any other
+MIN_RESIDUAL_PX = 1e-6  # px: no residual of computed points is smaller
+MEDIAN_NORM = 1.1774  # of the norm of two standard normal coordinates
 _MAX_ITERATIONS = 8
 
 
+class WrongLandmark(NamedTuple):
+    """A landmark that is not where the table says.
+
+    number; points: of it in the table; px: median distance of these from their predictions;
+    offset (3,): from the stated place to where the rays meet, m, NaN where they do not.
+    """
+
+    number: int
+    points: int
+    px: float
+    offset: Array
+
+    @property
+    def displaced(self) -> bool:
+        """Whether another place explains its points."""
+        return bool(np.isfinite(self.offset).all())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what files hold; offset: m, None where no place explains the points."""
+        offset = self.offset.tolist() if self.displaced else None
+        return {'landmark': self.number, 'points': self.points, 'px': self.px, 'offset': offset}
+
+
 class Outliers(NamedTuple):
-    """Outliers of a table: which rows of it, how far (px), and why."""
+    """Outliers of a table: which rows of it, how far (px), and why; landmarks that are wrong."""
 
     rows: Index
     px: Array
     why: tuple[str, ...]
+    landmarks: tuple[WrongLandmark, ...] = ()
 
     def join(self, other: Outliers) -> Outliers:
         """Return these and other rows."""
@@ -48,11 +74,25 @@ class Outliers(NamedTuple):
             np.concatenate([self.rows, other.rows]),
             np.concatenate([self.px, other.px]),
             (*self.why, *other.why),
+            (*self.landmarks, *other.landmarks),
         )
 
     def append(self, rows: Index, px: Array, why: str) -> Outliers:
         """Return these and other rows, of one reason."""
         return self.join(Outliers(rows, px, (why,) * len(rows)))
+
+    def append_landmarks(self, table: Observations, wrong: Sequence[WrongLandmark]) -> Outliers:
+        """Return these and all points of wrong landmarks of a table."""
+        px = {landmark.number: landmark.px for landmark in wrong}
+        rows = np.flatnonzero(np.isin(table.landmark, list(px)))
+        off = np.array([px[number] for number in table.landmark[rows].tolist()])
+        return self.append(rows, off, LANDMARK)._replace(landmarks=(*self.landmarks, *wrong))
+
+    def without_landmarks(self) -> Outliers:
+        """Return those that are not of wrong landmarks."""
+        kept = np.array([why != LANDMARK for why in self.why], dtype=bool)
+        why = tuple(why for why in self.why if why != LANDMARK)
+        return Outliers(self.rows[kept], self.px[kept], why)
 
     @property
     def swap_count(self) -> int:
@@ -76,7 +116,7 @@ def find_outliers(data: RigViews, state: RigState) -> tuple[RigViews, Outliers]:
     typical = float(np.median(scale))
     whole = scale[:, 0] > max(_VIEW_RATIO * typical, _MIN_VIEW_PX)
     whole = np.asarray(whole & (whole.mean() < 0.2))
-    limit = _OUTLIER_SIGMAS * np.maximum(scale, of_landmark)
+    limit = OUTLIER_SIGMAS * np.maximum(scale, of_landmark)
     far = views.used & (offset > limit) & ~whole[:, None]
     swapped = _find_swaps(model, pose, views, far, _SWAP_SIGMAS * typical)
     torn, apart = _inconsistent_frames(data, state, alone, typical)
@@ -160,9 +200,9 @@ def cross_camera_offsets(data: RigViews, state: RigState, alone: Pose) -> tuple[
         for mine in (np.flatnonzero(data.frame_of == f) for f in range(data.frames)):
             other[mine] = np.roll(mine, step)
         offset = prediction_distances(model, body.take(other).compose(place), views)
-        median = np.nanmedian(np.minimum(offset, _UNSEEN_PX), axis=1)
+        median = np.nanmedian(np.minimum(offset, UNSEEN_PX), axis=1)
         mine = (other != np.arange(len(other))) & (median < misfit)
-        apart[mine], misfit[mine] = np.nan_to_num(offset[mine], posinf=_UNSEEN_PX), median[mine]
+        apart[mine], misfit[mine] = np.nan_to_num(offset[mine], posinf=UNSEEN_PX), median[mine]
     return misfit, apart
 
 
@@ -215,11 +255,10 @@ def relative_sigma(views: Views) -> Array:
 def robust_scale(offset: Array) -> Array:
     """Robust standard deviation of a coordinate, one a view (S, 1), from offsets (S, N)."""
     median, typical = (
-        np.nanmedian(np.minimum(offset, _UNSEEN_PX), axis=axis, keepdims=True)
-        for axis in (1, None)
+        np.nanmedian(np.minimum(offset, UNSEEN_PX), axis=axis, keepdims=True) for axis in (1, None)
     )
-    least = np.maximum(typical, _MIN_RESIDUAL_PX)
-    return np.asarray(np.maximum(median, least) / _MEDIAN_NORM)
+    least = np.maximum(typical, MIN_RESIDUAL_PX)
+    return np.asarray(np.maximum(median, least) / MEDIAN_NORM)
 
 
 def _landmark_scale(views: Views, offset: Array) -> Array:
@@ -227,5 +266,5 @@ def _landmark_scale(views: Views, offset: Array) -> Array:
     scale = np.zeros_like(offset)
     for landmark in np.unique(views.landmark[views.used]):
         mine = views.used & (views.landmark == landmark)
-        scale[mine] = np.median(offset[mine]) / _MEDIAN_NORM
+        scale[mine] = np.median(offset[mine]) / MEDIAN_NORM
     return scale

@@ -30,7 +30,7 @@ _FADE = 2.0  # standard deviations at which a point's weight falls to about half
 _MEDIAN = 1.1774  # median length of a plane Gaussian vector of unit deviation
 _INFINITE = 1e6  # standard deviations: what is more is as good as infinite
 _MAX_RANGE = 100.0  # m, a range at which landmarks are probably not in meters
-_NOISIEST = 2.0  # px, that a detector leaves
+NOISIEST_PX = 2.0  # px, that a detector leaves
 # Where sigma is unknown: a view may misfit this many times as much as most do; how many views
 # can be held against each other; and px below which residuals are rounding.
 _TOLERANCE, _OTHERS, _EXACT = 2.0, 4, 1e-6
@@ -76,10 +76,10 @@ def examine(
     result, passed = checked.result, np.array([not reason for reason in checked.reasons])
     passed &= result.converged
     some = passed if passed.any() else result.converged
-    rows = 2 * (views.used & ~checked.gross)[some].sum()
+    rows = 2 * ((views.weight > 0) & ~checked.gross)[some].sum()
     sigma = noise_sigma(result.cost[some].sum(), int(rows), 6 * int(some.sum()))
     reasons = checked.reasons
-    if sigma > _NOISIEST:
+    if sigma > NOISIEST_PX:
         noisy = (
             f'the noise would be {sigma:.3g} px, more than any detector has: check lens, '
             'image size, landmarks and their unit'
@@ -190,7 +190,7 @@ def _consensus_pose(
     enough = max(MIN_POINTS + _SPARE_POINTS, _MIN_AGREEMENT * used.sum())
     if (used & model.back_project(view.uv).valid).sum() < enough:
         return None
-    start = _consensus(model, view, found, sigma)
+    start = consensus_pose(model, view, found, sigma)
     for _ in range(_ROUNDS):
         inside = _lengths(model, start, view) < _GROSS * tolerance * sigma
         if inside.sum() < enough:
@@ -222,7 +222,7 @@ def _suspect(views: Views, found: Localization, freedom: Array, allowed: float) 
         return np.asarray(misfit_fails(found.cost / allowed, freedom) | stands_out)
 
 
-def _consensus(model: ForwardModel, view: Views, found: Localization, sigma: float) -> Pose:
+def consensus_pose(model: ForwardModel, view: Views, found: Localization, sigma: float) -> Pose:
     """Return the pose (1,) that the points agree on best, from minimal subsets of them."""
     rays = model.back_project(view.uv)
     usable = np.flatnonzero((view.weight[0] > 0) & rays.valid[0])

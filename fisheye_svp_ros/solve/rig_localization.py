@@ -8,16 +8,18 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import Observations, select_cameras
 from fisheye_svp_ros.solve.initial_rig import localize_frames
-from fisheye_svp_ros.solve.measured_poses import posable_observations, sigma_known
+from fisheye_svp_ros.solve.measured_poses import posable_observations, rig_lenses, sigma_known
 from fisheye_svp_ros.solve.outliers import Outliers, find_outliers
 from fisheye_svp_ros.solve.reliability import noise_sigma
 from fisheye_svp_ros.solve.rig_checks import is_unrelated, rig_differs
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
+from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
 
 
 class RigLocalization(NamedTuple):
@@ -58,6 +60,10 @@ def localize_rig(
             f'in the rig, which has {", ".join(cameras)}'
         )
     rows, left_out = posable_observations(table, lenses)
+    models = ForwardModel(list(rig_lenses(rows, lenses).values()))
+    if wrong := find_wrong_landmarks(rows, models, lambda _: models):
+        right = ~np.isin(table.landmark, [landmark.number for landmark in wrong])
+        rows, left_out = posable_observations(table.take(right), lenses)
     present = [name for name in cameras if name in np.array(rows.cameras)[rows.camera]]
     rows = select_cameras(rows, present)
     own = [lenses[name] for name in present]
@@ -92,7 +98,7 @@ def localize_rig(
     covariance = np.asarray((sigma or 1.0) ** 2 * np.linalg.inv(information))
     return RigLocalization(
         rows,
-        outliers,
+        outliers._replace(landmarks=wrong),
         np.unique(data.views.frame),
         state.pose,
         covariance,

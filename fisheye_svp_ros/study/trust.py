@@ -17,6 +17,7 @@ from fisheye_svp_ros.diagnosis import (
     total_errors,
 )
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.mixed_model import pseudo_inverse
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import Pose, axis_angle_between, identity
@@ -28,6 +29,7 @@ from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measure
 from fisheye_svp_ros.solve.outliers import NO_OUTLIERS, Outliers, find_outliers
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 from fisheye_svp_ros.solve.stereo_depth import triangulate
+from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
 
 _SHIFT_NAMES = ('s0', 'e0', 'e1', 'e2', 'thickness')
 _INTERVAL_SIGMAS = 2.0  # standard errors of an interval
@@ -71,17 +73,27 @@ class LensTrust:
 
 
 def calibrate_without_outliers(
-    observations: Observations, calibrate: Callable[[Observations], Calibration]
+    observations: Observations,
+    calibrate: Callable[[Observations], Calibration],
+    starts: Sequence[Lens] = (),
 ) -> tuple[Calibration, Observations, Outliers]:
     """Calibrate a lens of one camera anew for as long as outliers are found.
 
-    calibrate: fits a lens to some of the rows.  Returns the last lens, the rows that it is of, and
-    those that are set aside.
+    calibrate: fits a lens to some of the rows; starts: rough lenses, to find wrong landmarks with
+    where it fails.  Returns the last lens, the rows that it is of, and those that are rejected.
     """
-    rows = np.arange(len(observations))
-    rejected, rounds = NO_OUTLIERS, 0
+    result = _fit_if_possible(calibrate, observations)
+    wrong = find_wrong_landmarks(
+        observations,
+        result and ForwardModel(result.adjusted.lens),
+        lambda some: ForwardModel(calibrate(some).adjusted.lens),
+        map(ForwardModel, starts),
+    )
+    rejected, rounds = NO_OUTLIERS.append_landmarks(observations, wrong), 0
+    rows = np.delete(np.arange(len(observations)), rejected.rows)
     while True:
-        result = calibrate(observations.take(rows))
+        if result is None or rounds or wrong:
+            result = calibrate(observations.take(rows))
         rows = rows[~np.isin(observations.frame[rows], result.left_out)]
         table = observations.take(rows)
         data = group_by_frame(table)
@@ -91,6 +103,16 @@ def calibrate_without_outliers(
             return result, table, rejected
         rejected = rejected.join(found._replace(rows=rows[found.rows]))
         rows = np.delete(rows, found.rows)
+
+
+def _fit_if_possible(
+    calibrate: Callable[[Observations], Calibration], observations: Observations
+) -> Calibration | None:
+    """Return a lens of all rows; None where wrong landmarks, perhaps, leave none to fit."""
+    try:
+        return calibrate(observations)
+    except GeometryError:
+        return None
 
 
 def assess_lens(observations: Observations, lens: Lens, names: Sequence[str]) -> LensTrust:
