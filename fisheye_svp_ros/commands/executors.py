@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import pickle
@@ -9,8 +10,14 @@ import signal
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import (
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+)
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -90,7 +97,7 @@ def _written(folder: str, fn: Callable[..., Any], *args: Any, **kwargs: Any) -> 
 def dask(address: str) -> Iterator[Workers]:
     """Yield the workers of a Dask cluster, which outlives the sweep.
 
-    Raises SweepError where there is none or where it gives up on a task.
+    Raises SweepError where there is none, where it goes away or gives up on a task.
     """
     try:
         import distributed
@@ -99,23 +106,36 @@ def dask(address: str) -> Iterator[Workers]:
         raise SweepError(
             'dask.distributed is not installed; install the extra `dask` of this package'
         ) from cause
-    try:
-        client = distributed.Client(address, timeout=_PATIENCE, set_as_default=False)
-    except (OSError, ValueError) as cause:
-        raise SweepError(f'{address}: no Dask scheduler answers there ({cause})') from cause
-    with client:
+    with ExitStack() as stack:
+        try:
+            client = distributed.Client(address, timeout=_PATIENCE, set_as_default=False)
+        except (OSError, ValueError) as cause:
+            raise SweepError(f'{address}: no Dask scheduler answers there ({cause})') from cause
+        stack.enter_context(_no_logging())  # what it tells of a scheduler that died, one line says
+        stack.enter_context(client)
         try:
             client.wait_for_workers(1, timeout=_PATIENCE)
-        except TimeoutError as cause:
+            ahead = _TASKS_PER_WORKER * sum(client.nthreads().values())
+        except (OSError, CancelledError) as cause:
             raise SweepError(f'{address}: the Dask cluster has no worker; start one') from cause
-        ahead = _TASKS_PER_WORKER * sum(client.nthreads().values())
         try:
             yield Workers(client.get_executor(pure=False), ahead)
-        except (distributed.KilledWorker, CommClosedError) as cause:
+        except (distributed.KilledWorker, CommClosedError, CancelledError) as cause:
+            reason = str(cause) or 'its scheduler is gone'
             raise SweepError(
-                f'the Dask cluster gave up ({cause}); finished parts are kept; '
+                f'{address}: the Dask cluster gave up ({reason}); finished parts are kept; '
                 'continue with --resume'
             ) from cause
+
+
+@contextmanager
+def _no_logging() -> Iterator[None]:
+    before = logging.root.manager.disable
+    logging.disable()
+    try:
+        yield
+    finally:
+        logging.disable(before)
 
 
 def _end_with_parent() -> None:

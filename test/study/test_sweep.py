@@ -456,6 +456,11 @@ def test_workers_end_with_a_sweep_that_is_killed(
     assert not alive and len(gone) == len(children)
 
 
+def read_address(place: Path) -> str:
+    """Return the address in a file of a Dask scheduler."""
+    return str(json.loads(place.read_text())['address'])
+
+
 class TestDask:
     @pytest.fixture
     def cluster(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
@@ -485,6 +490,38 @@ class TestDask:
         _, err = process.communicate(timeout=60)
         assert process.returncode == 0, err
         assert files_of(out) == files_of(undisturbed)
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM])
+    def test_a_scheduler_that_dies_is_one_line(
+        self, number: signal.Signals, write: Callable[[str], Path], tmp_path: Path
+    ) -> None:
+        pytest.importorskip('distributed', reason='dask.distributed is not installed')
+        place, out = tmp_path / 'scheduler.json', tmp_path / 'out'
+        begun: list[subprocess.Popen[bytes]] = []
+        try:
+            for name, more in (('scheduler', ['--port', '0']), ('worker', ['--nthreads', '1'])):
+                command = [sys.executable, '-m', f'distributed.cli.dask_{name}', '--no-dashboard']
+                begun.append(
+                    subprocess.Popen(
+                        [*command, *more, '--scheduler-file', str(place)],
+                        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+                        stdout=subprocess.DEVNULL,
+                        stderr=subprocess.DEVNULL,
+                    )
+                )
+            until(place.exists)
+            process = start(write(LONG), '-o', out, '--dask', read_address(place))
+            until(lambda: parts_in(out) >= 1)
+            begun[0].send_signal(number)
+            _, err = process.communicate(timeout=60)
+        finally:
+            for one in reversed(begun):
+                one.terminate()
+                one.wait(60)
+        lines = [line for line in err.splitlines() if not line.endswith('%)')]
+        assert process.returncode == 2 and len(lines) == 1
+        assert 'continue with --resume' in lines[0] and parts_in(out) >= 1
 
     def test_no_scheduler_is_one_line(
         self,
