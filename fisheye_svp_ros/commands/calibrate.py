@@ -18,7 +18,13 @@ from fisheye_svp_ros.commands.detect import (
     search_options,
 )
 from fisheye_svp_ros.commands.lenses import add_port_arguments, load_with_notes, port_of
-from fisheye_svp_ros.commands.notes import counted, note_gross_errors, note_huge, say
+from fisheye_svp_ros.commands.notes import (
+    counted,
+    note_gross_errors,
+    note_huge,
+    note_reader_limit,
+    say,
+)
 from fisheye_svp_ros.commands.outputs import output_file, output_path
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, ParameterError
 from fisheye_svp_ros.io.files import write_json, write_text, write_together
@@ -406,6 +412,8 @@ def write_rig(found: RigCalibration, folder: Path) -> None:
     )
     try:
         write_text(folder / 'camchain.yaml', kalibr.write_chain(found.lenses, found.steps()))
+        for lens in found.lenses:
+            note_reader_limit(lens, 'kalibr')
     except FisheyeSvpError as cause:
         say(f'camchain.yaml of Kalibr is not written: {cause}')
 

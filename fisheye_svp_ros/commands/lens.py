@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from fisheye_svp_ros.commands.lenses import load_with_notes
-from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.notes import note_reader_limit, say
 from fisheye_svp_ros.commands.outputs import output_file
 from fisheye_svp_ros.effects.extension import LANDMARKS
 from fisheye_svp_ros.effects.forward import project
@@ -26,7 +26,7 @@ from fisheye_svp_ros.rectify.maps import MAX_RANGE, nearest_svp_lens
 from fisheye_svp_ros.reporting.terminal import print_table, range_text
 from fisheye_svp_ros.scene.observations import STEREO
 
-_ANGLES, _RANGES = (20, 40, 60, 75, 85, 95), (0.1, 0.2, 0.5, 2.0)  # deg, m
+_ANGLES, _RANGES = (20, 40, 60, 75, 85, 95, 105), (0.1, 0.2, 0.5, 2.0)  # deg, m
 _AZIMUTHS = np.radians(np.arange(0, 360, 15))  # the axis
 _VISIBLE_PX = 5e-4  # px
 
@@ -121,6 +121,7 @@ def _convert(lens: Lens, args: argparse.Namespace) -> None:
     written = read_foreign(args.output, text)
     if written is not None:
         _print_loss(lens, next(iter(written.lenses.values())), ranges, args.range_m is None)
+    note_reader_limit(given, args.format)
 
 
 def _print_rig(steps: Sequence[Pose]) -> None:
@@ -155,16 +156,22 @@ def _print_loss(lens: Lens, written: Lens, ranges: Sequence[float], as_it_stands
     )
     distance = np.minimum(ranges, MAX_RANGE)
     points = distance[:, None, None] * around[:, None]
-    off = np.linalg.norm(project(lens, points).uv - project(written, points).uv, axis=-1)
-    worst = np.fmax.reduce(off, axis=-1)
+    uv = project(lens, points).uv
+    half = np.array([lens.width, lens.height]) / 2
+    inside = (np.abs(uv + 0.5 - half) <= half).all(axis=-1)
+    off = np.linalg.norm(uv - project(written, points).uv, axis=-1)
+    worst = np.fmax.reduce(np.where(inside, off, np.nan), axis=-1)
     if np.fmax.reduce(worst, axis=None) > _VISIBLE_PX:
         print_table(
-            'largest error of image points without it, px',
+            'largest error of points in the image, px',
             ('deg', *map(range_text, ranges)),
             [
                 (str(angle), *('-' if np.isnan(value) else f'{value:.3f}' for value in row))
                 for angle, row in zip(angles, worst, strict=True)
+                if not np.isnan(row).all()
             ],
         )
         if as_it_stands and 'the viewpoint shift' in named:
             print('  --range M fits the curve at one range, without error there')
+        elif as_it_stands and written.viewpoint_shift is not None:
+            print('  --range M fits a splined model at one range, without the viewpoint shift')

@@ -11,10 +11,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fisheye_svp_ros.io.lens_formats import READERS_TO_90_DEG, share_beyond_90_deg
 from fisheye_svp_ros.reporting.wording.landmarks import wrong_landmark_notes
 from fisheye_svp_ros.scene.observations import frame_name, list_frames
 
 if TYPE_CHECKING:
+    from fisheye_svp_ros.optics.lens import Lens
     from fisheye_svp_ros.scene.observations import Observations
     from fisheye_svp_ros.solve.outliers import Outliers, WrongLandmark
 
@@ -27,6 +29,16 @@ _MAX_TARGET_SIZE = 20.0  # m; a target larger than this was measured in other un
 def say(note: str) -> None:
     """Print a note."""
     print(f'fisheye-svp: note: {note}', file=sys.stderr)
+
+
+def note_reader_limit(lens: Lens, form: str) -> None:
+    """Say it where the readers of a format end at 90 degrees, and the image of a lens does not."""
+    share = share_beyond_90_deg(lens) if form in READERS_TO_90_DEG else 0.0
+    if share:
+        say(
+            f'{100 * share:.2g} % of the image of {lens.name} lies beyond 90 deg, where '
+            f'{READERS_TO_90_DEG[form]} ends; basalt, nerfstudio and mrcal reach further'
+        )
 
 
 def counted(count: int, noun: str) -> str:

@@ -12,6 +12,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
+from fisheye_svp_ros.effects.forward import back_project
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -35,6 +38,14 @@ FORMATS = (
     'rig',
 )
 WRITABLE = ('kalibr', 'ros', 'opencv', 'basalt', 'mrcal', 'colmap', 'nerfstudio')
+# Whose readers project nothing, or something else, from 90 degrees off the axis on
+READERS_TO_90_DEG = {
+    'kalibr': 'Kalibr',
+    'ros': 'image_proc (cv2.fisheye)',
+    'opencv': 'cv2.fisheye',
+    'colmap': 'COLMAP',
+}
+_GRID = 100  # image points along each axis
 READABLE = (
     'ROS camera_info, Kalibr, OpenCV, Basalt, mrcal, EuRoC, COLMAP, ORB-SLAM3, CamOdoCal, '
     'nerfstudio, Metashape, OCamCalib and BoofCV'
@@ -103,10 +114,19 @@ def read_foreign(path: str | Path, text: str) -> Foreign | None:
     return None
 
 
+def share_beyond_90_deg(lens: Lens) -> float:
+    """Return the share of the image, within the field of view, from 90 degrees off the axis on."""
+    across, down = (np.linspace(0, side - 1, _GRID) for side in (lens.width, lens.height))
+    rays = back_project(lens, np.stack(np.meshgrid(across, down), axis=-1))
+    beyond = rays.direction[rays.valid][:, 2] <= 0
+    return float(beyond.mean()) if len(beyond) else 0.0
+
+
 def write_foreign(lens: Lens, form: str) -> str:
     """Return a lens in another tool's form; a viewpoint shift stays behind, but for mrcal.
 
-    Raises LensError for a lens that the form cannot say to a hundredth of a pixel.
+    Raises LensError for a lens that the form cannot say to a hundredth of a pixel; CAHVORE, the
+    only form with a shift, is the nearest one.
     """
     if form not in WRITABLE:
         raise LensError(f'format {form!r} is unknown; known are {", ".join(WRITABLE)}')

@@ -130,25 +130,18 @@ def _read_stereographic(size: list[int], values: list[float], where: str) -> For
 def write(lens: Lens) -> str:
     """Return the lens as CAHVORE of linearity 0, its shift included.
 
-    Without a shift, and with an image field or a curve that three radial terms do not say to a
-    hundredth of a pixel, it is a splined model; raises LensError for such a curve with a shift.
+    A curve that three radial terms do not say is the nearest one.  Without a shift, and with an
+    image field or a curve that they do not say to a hundredth of a pixel, it is a splined model.
     """
     theta = np.linspace(0.0, lens.max_incidence, _GRID)[1:]
     heights = lens.image_height.value_and_slope(theta)[0]
     powers = theta[:, None] ** np.arange(1, 2 * _TERMS, 2)
     terms = np.linalg.lstsq(powers, heights, rcond=None)[0]
     worst = float(np.abs(powers @ terms - heights).max() * max(lens.fx, lens.fy))
-    shift = lens.viewpoint_shift
+    # Of a lens with a shift that CAHVORE has not, the curve is written.
+    shift = lens.viewpoint_shift if isinstance(lens.viewpoint_shift, Gennery) else None
     if shift is None and (lens.image_field is not None or worst > _TOLERANCE):
         return _document(*_fit_splined(lens), (0.0, 0.0, 0.0), lens)
-    if worst > _TOLERANCE:
-        raise LensError(
-            f'lens {lens.name!r}: its curve is {worst:.2g} px from any CAHVORE, and '
-            'mrcal has no other fisheye model with a viewpoint shift; --range writes '
-            'it for one distance, without the shift'
-        )
-    if shift is not None and not isinstance(shift, Gennery):
-        raise LensError(f'lens {lens.name!r}: CAHVORE has no viewpoint shift but gennery')
     e = [shift.e0, shift.e1, shift.e2] if shift is not None else [0.0] * 3
     intrinsics = [
         lens.fx,
