@@ -31,10 +31,16 @@ from fisheye_svp_ros.io.rig_files import load_cameras
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.terminal import noise_text, print_table, progress
-from fisheye_svp_ros.scene.observations import Observations, frame_name, photograph_entry
+from fisheye_svp_ros.scene.observations import (
+    Observations,
+    frame_name,
+    list_frames,
+    photograph_entry,
+)
 from fisheye_svp_ros.solve.localization import sight
 from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measured, rms_px
 from fisheye_svp_ros.solve.rig_localization import RigLocalization, localize_rig
+from fisheye_svp_ros.solve.weak_geometry import is_ambiguous, pose_odds
 
 _Parts = dict[str, dict[str, float]]  # root mean squares by quantity and part
 _MAX_ROWS = 40  # frames in the table for people
@@ -97,6 +103,8 @@ def run(args: argparse.Namespace) -> None:
         note_wrong_landmarks(measured.landmarks)
         note_left_out(table, measured.left_out)
         note_doubtful(table, measured.views.frame.tolist(), measured.reasons)
+        if frames := measured.views.frame[is_ambiguous(measured.result)].tolist():
+            say(second_pose_note(list_frames(table, frames), len(frames)))
         if args.output:
             with write_together():
                 _write(args.output / name, model, table, measured, uncertainty)
@@ -260,6 +268,12 @@ def _write(
             'observations': int(used.sum()),
             'left_out': measured.left_out,
             'sigma_px': measured.sigma,
+            'poses': [
+                {'frame': int(frame), 'ambiguous': bool(second), 'odds': float(odds)}
+                for frame, second, odds in zip(
+                    views.frame, is_ambiguous(result), pose_odds(result), strict=True
+                )
+            ],
             'gross': [
                 {
                     'frame': int(views.frame[i]),

@@ -426,7 +426,7 @@ class LensErrors:
         linear = self.linearize(views, solved.pose)
         maps = pose_maps(linear.frame_columns)
         parts = self.model.propagate(linear, maps)
-        excess = np.trace(solved.covariance, axis1=1, axis2=2)
+        excess = np.trace(solved.covariance - solved.added, axis1=1, axis2=2)
         excess = excess / np.trace(parts.noise, axis1=1, axis2=2) / (sigma or 1.0) ** 2
         if sigma is None:
             weight = linear.data.blocks(views.weight[..., None] * np.ones(2))
@@ -434,7 +434,8 @@ class LensErrors:
         else:
             of_noise = np.full(maps.shape[::2], self.noise**2)
         parts = parts._replace(noise=(maps * of_noise[:, None]) @ np.swapaxes(maps, -1, -2))
-        return ErrorParts(*(part * excess[:, None, None] for part in parts))
+        parts = ErrorParts(*(part * excess[:, None, None] for part in parts))
+        return parts._replace(noise=parts.noise + solved.added)
 
     def linearize(self, views: Views, pose: Pose) -> Linearization:
         """Linearise views of this lens, with the numbers that are uncertain free."""

@@ -32,7 +32,7 @@ def lenses_of(settings: SolverSettings, cameras: Sequence[str]) -> dict[str, Len
 def lens_of(name: str, scale: float, settings: SolverSettings) -> Lens:
     """Return a lens as it is to be solved with; raise FisheyeSvpError where it cannot be."""
     lens = true_lens(name, scale)
-    return lens.svp() if settings.solves_svp else lens
+    return lens.approximate() if settings.solves_svp else lens
 
 
 def shift_scale(text: str) -> float:

@@ -30,7 +30,8 @@ class Lens:
     lens's own that have no other place in it, by name, as `effects.base.Effect.to_dict` gives
     them; target: those of the target that they were found on, and its landmarks, see
     `effects.extension`; both are changed by `effects.extension.extend_lens`.  calibration: where a
-    fit came from; uncertainty: of what a diagnosis found, see `diagnosis.lens_errors`.
+    fit came from; uncertainty: of what a diagnosis found, see `diagnosis.lens_errors`; neglected:
+    the lens that this one approximates on purpose, see `approximate`.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Lens:
     target: Mapping[str, Any] = field(default_factory=dict, repr=False)
     calibration: Mapping[str, Any] | None = field(default=None, repr=False)
     uncertainty: Mapping[str, Any] | None = field(default=None, repr=False)
+    neglected: Lens | None = field(default=None, repr=False, compare=False)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -96,6 +98,10 @@ class Lens:
     def svp(self) -> Lens:
         """Return the same lens under the single-viewpoint approximation, in air."""
         return replace(self, viewpoint_shift=None, port=None)
+
+    def approximate(self) -> Lens:
+        """Return the lens as `svp` does, to be solved with by who knows what it neglects."""
+        return self if self.is_svp else replace(self.svp(), neglected=self)
 
     def with_shift(self, shift: ViewpointShift) -> Lens:
         """Return the lens with a viewpoint shift added to its own."""

@@ -264,7 +264,7 @@ def model_of(lens: str, shift_scale: float, svp: bool) -> ForwardModel:
     Raises LensError where there is none.
     """
     loaded = true_lens(lens, shift_scale)
-    return ForwardModel(loaded.svp() if svp else loaded)
+    return ForwardModel(loaded.approximate() if svp else loaded)
 
 
 def scenario_landmarks(scenario: Scenario) -> Landmarks:

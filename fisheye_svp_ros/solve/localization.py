@@ -23,6 +23,7 @@ from fisheye_svp_ros.solve.least_squares import (
 
 MIN_POINTS, FEW_POINTS = 4, 6
 _MOTIONS = 3  # times that velocities and poses follow from each other
+_MIN_SEPARATION = 0.01  # squared Mahalanobis distance of two minima
 _UNDETERMINED_EIGENVALUE = 1e-13  # of the information, relative; rounding leaves about 1e-15
 
 
@@ -76,13 +77,30 @@ def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localiza
 def _improve(
     model: ForwardModel, views: Views, found: Localization, rows: Index, start: Pose
 ) -> None:
-    """Write what fits better from further starts (R, C) of some views (R,), in place."""
+    """Write what fits better from further starts (R, C) of views (R,), and the second best."""
     repeated = np.repeat(rows, start.shape[1])
     other, _ = _solve_from(model, views.take(repeated), start.reshape(-1))
     cost = np.where(other.converged, other.cost, np.inf).reshape(start.shape)
+    before = found.take(rows)
+    known = Pose.stack([before.pose, before.other])
+    minima = Pose(
+        *(
+            np.concatenate([np.moveaxis(old, 0, 1), new], axis=1)
+            for old, new in zip(known, other.pose.reshape(*start.shape), strict=True)
+        )
+    )
+    costs = np.stack([before.cost, before.cost + before.gap], axis=1)
+    costs = np.concatenate([costs, cost], axis=1)
     best = np.argmin(cost, axis=1) + start.shape[1] * np.arange(len(rows))
-    better = other.cost[best] < found.cost[rows]
+    better = cost.min(axis=1) < before.cost
     found.put(rows[better], other.take(best[better]))
+    now = found.take(rows)
+    away = minima.difference(now.pose.take((slice(None), None)))
+    costs[~(squared_distances(away, now.covariance) > _MIN_SEPARATION)] = np.inf
+    second = np.arange(len(rows)), np.argmin(costs, axis=1)
+    found.other.put(rows, minima.take(second))
+    base = np.where(now.converged, now.cost, -np.inf)
+    found.gap[rows] = np.maximum(costs[second] - base, 0.0)
 
 
 def _solve_from(model: ForwardModel, views: Views, start: Pose) -> tuple[Localization, bool]:
@@ -106,7 +124,7 @@ def _by_reference(model: ForwardModel, views: Views, start: Pose) -> Localizatio
     covariance, fixed = _covariance(solved.normal[0])
     fixed &= solved.converged
     covariance[~fixed] = np.nan
-    return Localization(
+    return Localization.of_one_minimum(
         pose, covariance, residuals(model, pose, views), solved.cost, fixed, solved.iterations
     )
 
@@ -175,6 +193,13 @@ def check_views(views: Views, minimum: int, what: str = 'in it') -> None:
             f'frame {views.frame[poor[0]]} has {counts[poor[0]]} usable points {what}; '
             f'at least {minimum} are needed'
         )
+
+
+def squared_distances(change: Array, covariance: Array) -> Array:
+    """Return Mahalanobis squares (S, K) of changes (S, K, 6) by covariances (S, 6, 6)."""
+    relative, scale = with_unit_diagonal(covariance, 0.0)
+    unit = change / scale[:, None]
+    return np.asarray((unit * (unit @ never_singular(np.linalg.inv, relative))).sum(axis=-1))
 
 
 def _covariance(hessian: Array) -> tuple[Array, Mask]:

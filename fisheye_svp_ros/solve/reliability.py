@@ -19,6 +19,7 @@ from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization, localize, residuals
 from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
+from fisheye_svp_ros.solve.weak_geometry import hold_weak_geometry
 
 _FALSE_ALARM = 1e-4  # probability that a clean view fails the test of its misfit
 _MAX_RESIDUAL_RATIO = 3.8  # a residual beside the root mean square of all, which starts a search
@@ -43,13 +44,15 @@ class Examination(NamedTuple):
     result: covariances for what the residuals show where that is more than sigma; gross (S, N):
     observations left out as outliers; reasons (S,): why a pose should not be relied on as it
     is, '' for a reliable one; sigma: noise of u and of v, px, estimated from the
-    views that pass, None where weights are known.
+    views that pass, None where weights are known; excess (S,): factor by which residuals are more
+    than that, where the covariance is scaled by its square.
     """
 
     result: Localization
     gross: Mask
     reasons: tuple[str, ...]
     sigma: float | None
+    excess: Array
 
 
 def examine(
@@ -67,7 +70,9 @@ def examine(
     """
     model = model.seeing(views)
     if sigma_known:
-        return _examine(model, views, found, 1.0, 1.0, searched)
+        checked = _examine(model, views, found, 1.0, 1.0, searched)
+        inliers, result = _inliers(views, checked), checked.result
+        return checked._replace(result=hold_weak_geometry(model, inliers, result, checked.excess))
     freedom = np.maximum(2 * (views.weight > 0).sum(axis=1) - 6, 1)
     usual = float(np.sqrt(np.median(found.cost / freedom)))
     if len(freedom) < _OTHERS:
@@ -85,9 +90,13 @@ def examine(
             'image size, landmarks and their unit'
         )
         reasons = tuple(_join_reasons(noisy, reason) for reason in reasons)
-    return Examination(
-        result._replace(covariance=result.covariance * sigma**2), checked.gross, reasons, sigma
-    )
+    result = result._replace(covariance=result.covariance * sigma**2)
+    result = hold_weak_geometry(model, _inliers(views, checked), result, sigma * checked.excess)
+    return Examination(result, checked.gross, reasons, sigma, checked.excess)
+
+
+def _inliers(views: Views, checked: Examination) -> Views:
+    return views._replace(weight=np.where(checked.gross, 0.0, views.weight))
 
 
 def _examine(
@@ -105,8 +114,8 @@ def _examine(
     result, reasons = found, _far_reasons(views, found)
     gross = np.zeros(views.used.shape, dtype=bool)
     if not suspect.any():
-        return Examination(result, gross, tuple(reasons), None)
-    result = Localization.concatenate([found])  # a copy
+        return Examination(result, gross, tuple(reasons), None, np.ones(len(freedom)))
+    result, excess = Localization.concatenate([found]), np.ones(len(freedom))  # a copy
     for i in np.flatnonzero(suspect):
         view = views.take([i])
         other = (
@@ -119,13 +128,14 @@ def _examine(
             why = _gross_reason(view, gross[i], result.residual[i])
             reasons[i] = _join_reasons(why, reasons[i])
         elif result.converged[i] and misfit_fails(result.cost[i] / allowed, freedom[i]):
-            excess = float(result.cost[i]) / max(freedom[i], 1) / sigma**2
-            result.covariance[i] *= excess
+            variance = float(result.cost[i]) / max(freedom[i], 1) / sigma**2
+            excess[i] = np.sqrt(variance)
+            result.covariance[i] *= variance
             reasons[i] = _join_reasons(
-                f'{misfit_reason(excess, int(freedom[i]))}; the covariance is scaled by it',
+                f'{misfit_reason(variance, int(freedom[i]))}; the covariance is scaled by it',
                 reasons[i],
             )
-    return Examination(result, gross, tuple(reasons), None)
+    return Examination(result, gross, tuple(reasons), None, excess)
 
 
 def doubt_of_pairs(

@@ -21,6 +21,7 @@ from fisheye_svp_ros.solve.localization import Localization, localize, sight
 from fisheye_svp_ros.solve.reliability import examine, misfit_fails, misfit_reason
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate, triangulate_optimally
+from fisheye_svp_ros.solve.weak_geometry import hold_weak_geometry, is_ambiguous, pose_odds
 
 T = TypeVar('T')
 Pair = tuple[ForwardModel, ForwardModel]  # of the left and the right camera
@@ -39,7 +40,7 @@ _POSE = (
     'rotation_error_rad',
     'axis_error_rad',
 )
-LOCALIZATION_METRICS = (*_FIT_METRICS, *_POSE)
+LOCALIZATION_METRICS = (*_FIT_METRICS, *_POSE, 'odds', 'ambiguous')
 STEREO_CALIBRATION_METRICS = ('views', *_FIT_METRICS, *_POSE)
 STEREO_DEPTH_METRICS = (
     'points',
@@ -104,7 +105,13 @@ def localize_sets(
         checked = examine(model, views, found, searched=searched)
         found, reasons = checked.result, checked.reasons
         residual = np.where(checked.gross[..., None], np.nan, found.residual)
-    metrics = localization_metrics(found.pose, residual, true)
+    else:
+        found = hold_weak_geometry(model, views, found)
+    metrics = {
+        **localization_metrics(found.pose, residual, true),
+        'odds': pose_odds(found),
+        'ambiguous': is_ambiguous(found).astype(float),
+    }
     return SetSolutions(found, metrics, found.converged, _NO_POSE, reasons)
 
 
@@ -169,7 +176,7 @@ class Summary(NamedTuple):
 
 
 def localization_metrics(pose: Pose, residual: Array, true: Pose | None = None) -> Metrics:
-    """Return LOCALIZATION_METRICS of poses (S,), residuals (S, N, 2), px, NaN = no point.
+    """Return the metrics of poses (S,) and of residuals (S, N, 2), px, NaN = no point.
 
     rms_px: root mean square of the 2-D residual norm; mean_residual_px: mean norm, as Kita's
     tables have it; position errors in the frame of the poses; axis: the viewing axis.

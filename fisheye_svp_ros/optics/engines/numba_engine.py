@@ -95,7 +95,7 @@ def localize(
     if numbers is None:
         return None
     systems, count = row.shape
-    found = Localization(
+    found = Localization.of_one_minimum(
         Pose(start.rotation.copy(), start.position.copy()),
         np.empty((systems, 6, 6)),
         np.empty((systems, count, 2)),
@@ -103,7 +103,7 @@ def localize(
         np.empty(systems, dtype=np.bool_),
         np.empty(systems, dtype=np.int64),
     )
-    arrays = (*_contiguous(*seen, row), *found.pose, *found[1:])
+    arrays = (*_contiguous(*seen, row), *found.pose, *found[1:6])
     if systems == 1:  # by the shortest way: it is called for every frame of a camera
         return found, *entries.localize(numbers, minimum, limit, *arrays)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from fisheye_svp_ros.arrays import Array, Batch, Index, Mask
 from fisheye_svp_ros.pose import Pose
 
@@ -31,6 +33,9 @@ class _Localization(NamedTuple):
     cost: Array
     converged: Mask
     iterations: Index
+    other: Pose
+    gap: Array
+    added: Array
 
 
 class Localization(_Localization, Batch):
@@ -38,11 +43,37 @@ class Localization(_Localization, Batch):
 
     pose: camera in the world; covariance (S, 6, 6), m and rad, of the change in `Pose.retract`;
     residual (S, N, 2), px, measured minus predicted, NaN for padding; cost (S,): whitened sum of
-    squares; converged, iterations (S,).  A view whose points do not fix a pose (they lie on one
-    line, say) has not converged; where that is so the covariance is NaN.
+    squares; converged, iterations (S,).  other (S,): the second minimum, as far as one is known,
+    and gap (S,): by how much its cost is larger, infinite where none is known.  added (S, 6, 6):
+    what the covariance holds beyond the linearized noise, see `solve.weak_geometry`.  A view whose
+    points do not fix a pose (they lie on one line, say) has not converged; where that is so the
+    covariance is NaN.
     """
 
     __slots__ = ()
+
+    @classmethod
+    def of_one_minimum(
+        cls,
+        pose: Pose,
+        covariance: Array,
+        residual: Array,
+        cost: Array,
+        converged: Mask,
+        iterations: Index,
+    ) -> Localization:
+        """Return poses of which no second minimum is known."""
+        return cls(
+            pose,
+            covariance,
+            residual,
+            cost,
+            converged,
+            iterations,
+            Pose(pose.rotation.copy(), pose.position.copy()),
+            np.full(len(cost), np.inf),
+            np.zeros_like(covariance),
+        )
 
 
 class Rigs(NamedTuple):
