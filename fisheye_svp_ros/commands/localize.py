@@ -31,6 +31,7 @@ from fisheye_svp_ros.io.rig_files import load_cameras
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.terminal import noise_text, print_table, progress
+from fisheye_svp_ros.reporting.wording.poses import second_pose_note
 from fisheye_svp_ros.scene.observations import (
     Observations,
     frame_name,

@@ -1,0 +1,12 @@
+"""What is to be said of poses."""
+
+from __future__ import annotations
+
+
+def second_pose_note(frames: str, count: int) -> str:
+    """Say which frames a second pose explains about as well; frames: as they are enumerated."""
+    poses = 'pose is' if count == 1 else 'poses are'
+    return (
+        f'{count} {poses} ambiguous ({frames}): the target may be tilted the other way, odds in '
+        'localize.json; go nearer, or add landmarks'
+    )
