@@ -461,13 +461,14 @@ def _observations(
     def column(values: list[float]) -> Array:
         return np.repeat(np.array(values, dtype=float), count)
 
+    t = [one.t for one in found]
     table = make_observations(
         column([number[one.key] for one in found]).astype(np.int64),
         index,
         np.concatenate([one.uv for one in points]),
         pattern.points[index],
         camera=column([cameras.index(one.camera) for one in found]).astype(np.int64),
-        t=column([one.t for one in found]),
+        t=column(t if np.isfinite(t).all() else [np.nan] * len(t)),
         cameras=cameras,
         source=source,
         sigma=np.concatenate([one.sigma for one in points]),

@@ -89,6 +89,14 @@ class CsvTable:
             self.refuse(np.abs(column) > _MAX_VALUE, name, needed)
         return values
 
+    def known_numbers(self, name: str) -> Array:
+        """Return a column of numbers (N,), NaN for empty cells."""
+        cells = self._columns[name]
+        empty = np.array([not cell.strip() for cell in cells])
+        # Any number stands in for what is empty, so that errors name the line of the others.
+        self._columns[name] = tuple(cell if cell.strip() else '1' for cell in cells)
+        return np.where(empty, np.nan, self.numbers(name)[:, 0])
+
     def integers(self, name: str, most: int = 2**53) -> Index:
         """Return a column of whole numbers (N,) from 0 to `most`."""
         values = self._numbers(name)
@@ -221,7 +229,7 @@ def read(path: str | Path) -> Observations:
     )
     uv = table.numbers('u', 'v')
     _refuse_unseen(table, np.stack([frame, camera], axis=-1), uv)
-    sigma = table.numbers('sigma')[:, 0] if 'sigma' in table else None
+    sigma = table.known_numbers('sigma') if 'sigma' in table else None
     if sigma is not None:
         table.refuse(sigma <= 0, 'sigma', 'a number above 0')
     return make_observations(
@@ -259,8 +267,8 @@ def _refuse_unseen(table: CsvTable, view: Index, uv: Array) -> None:
 def write_observations(path: str | Path, observations: Observations) -> None:
     """Write observations so that `read` gives the same table; optional columns where known.
 
-    Raises ObservationError where t or sigma is known for some rows only, OutputError where the
-    file cannot be written.
+    An unknown sigma is an empty cell.  Raises ObservationError where t is known for some rows
+    only, OutputError where the file cannot be written.
     """
     if not isinstance(observations, Observations):
         raise ParameterError(
@@ -281,12 +289,13 @@ def write_observations(path: str | Path, observations: Observations) -> None:
         columns['camera'] = np.array(table.cameras)[table.camera]
     if table.board.any():
         columns['board'] = table.board
-    for name, values in (('t', table.t), ('sigma', table.sigma)):
-        known = np.isfinite(values)
-        if known.any() and not known.all():
-            raise ObservationError(f'{table.source}: {name} is known for some rows only')
-        if known.any():
-            columns[name] = values
+    timed, known = np.isfinite(table.t), np.isfinite(table.sigma)
+    if timed.any() and not timed.all():
+        raise ObservationError(f'{table.source}: t is known for some rows only')
+    if timed.any():
+        columns['t'] = table.t
+    if known.any():
+        columns['sigma'] = np.where(known, table.sigma.astype(object), '')
     write_table(path, columns)
 
 

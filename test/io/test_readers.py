@@ -119,11 +119,23 @@ class TestObservationsCsv:
         assert (tmp_path / 'few.csv').read_text().splitlines()[0] == HEADER
         assert same(read_observations(tmp_path / 'few.csv'), table)
 
-    def test_half_known_sigma_is_not_written(self, tmp_path, csv):
+    def test_half_known_sigma_is_an_empty_cell(self, tmp_path, csv):
         table = read_observations(csv(f'{HEADER}\n{ROWS}'))
         table = replace(table, sigma=np.array([0.1, np.nan, 0.1]))
-        with pytest.raises(ObservationError, match='sigma is known for some rows only'):
-            write_observations(tmp_path / 'half.csv', table)
+        write_observations(tmp_path / 'half.csv', table)
+        assert same(read_observations(tmp_path / 'half.csv'), table)
+        text = (tmp_path / 'half.csv').read_text()
+        assert len([line for line in text.splitlines() if line.endswith(',')]) == 1
+        (tmp_path / 'half.csv').write_text(text.replace('0.1\n', '-1\n', 1))
+        with pytest.raises(ObservationError, match=r'line 2: sigma is .-1.; a number above 0'):
+            read_observations(tmp_path / 'half.csv')
+
+    def test_half_known_times_are_not_written(self, tmp_path, csv):
+        table = read_observations(csv(f'{HEADER}\n{ROWS}'))
+        with pytest.raises(ObservationError, match='t is known for some rows only'):
+            write_observations(
+                tmp_path / 'half.csv', replace(table, t=np.array([0.1, np.nan, 0.1]))
+            )
         assert not (tmp_path / 'half.csv').exists()
 
     def test_an_impossible_place_to_write(self, tmp_path, csv):
@@ -173,7 +185,6 @@ class TestObservationsCsv:
             ('camera', '', "camera is ''; a name, as '1' elsewhere, is needed"),
             ('sigma', '0', "sigma is '0'; a number above 0"),
             ('sigma', '-0.1', "sigma is '-0.1'; a number above 0"),
-            ('sigma', '', "sigma is ''; a number"),
             ('t', 'noon', "t is 'noon'; a number"),
             ('t', 'nan', "t is 'nan'; a finite number"),
             ('board', '0.5', "board is '0.5'; a whole number"),
