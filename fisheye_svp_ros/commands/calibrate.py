@@ -14,6 +14,7 @@ import numpy as np
 from fisheye_svp_ros.commands.detect import (
     add_observation_arguments,
     image_sizes,
+    note_side_by_side,
     read_input,
     search_options,
 )
@@ -128,6 +129,8 @@ def run(args: argparse.Namespace) -> None:
         )
     observations, sizes = read_input(args.observations, args)
     sizes = _known_sizes(args, observations, sizes)
+    if not args.board:
+        note_side_by_side(observations, sizes)
     if args.output:
         _check_output(args, observations)
     found: dict[str, CalibratedCamera] = {}

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'photographs',
         nargs='+',
         metavar='PHOTOS',
-        help='image files or folders (left/ and right/ for a rig), videos, '
+        help='image files, folders or videos (left and right in their names for a rig), '
         'rosbag2 recordings with Image or CompressedImage',
     )
     add_board_arguments(parser, required=True)
@@ -83,7 +83,9 @@ def run(args: argparse.Namespace) -> None:
             coverage = args.overlays / 'coverage.png'
             with keep_existing(not coverage.exists()):  # photographs, but no earlier overlays
                 write_overlays(
-                    find_photographs(args.photographs, args.every), detection, args.overlays
+                    find_photographs(args.photographs, args.every, args.split),
+                    detection,
+                    args.overlays,
                 )
                 write_coverage(detection, coverage)
 
@@ -93,7 +95,7 @@ def _print(detection: Detection, board: str) -> None:
     print(
         f'{board}: found in {len(found)} of {len(detection.searched)} photographs, '
         f'{len(table)} points'
-        + ('' if np.isnan(table.sigma).any() else f', sigma {np.median(table.sigma):.3f} px')
+        + (f', sigma {np.nanmedian(table.sigma):.3f} px' if np.isfinite(table.sigma).any() else '')
     )
     pairing, cameras = detection.pairing, detection.observations.cameras
     if len(cameras) > 1:
@@ -175,6 +177,18 @@ def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False)
         help='for a rig: largest difference between the stamps of simultaneous '
         'images (of messages, or in file names); default: 5ms',
     )
+    add_split_argument(parser)
+
+
+def add_split_argument(parser: argparse.ArgumentParser) -> None:
+    """Declare --split, of photographs in which several cameras lie side by side."""
+    parser.add_argument(
+        '--split',
+        type=positive_count,
+        metavar='N',
+        help='cameras side by side in each image: it is cut into N parts of equal width, left '
+        'and right or cam0, cam1, ...; default: 2 where both halves of wide images show the board',
+    )
 
 
 def search_options(args: argparse.Namespace) -> tuple[str, ...]:
@@ -182,6 +196,7 @@ def search_options(args: argparse.Namespace) -> tuple[str, ...]:
     options = ['--board', args.board]
     options += ['--detector', args.detector] if args.detector else []
     options += ['--sync', f'{args.sync}s'] if args.sync else []
+    options += ['--split', str(args.split)] if args.split else []
     return (*options, *(['--every', str(args.every)] if args.every > 1 else []))
 
 
@@ -244,17 +259,25 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
         doubtful_folders,
         find_photographs,
     )
+    from fisheye_svp_ros.detect.side_by_side import count_cameras
     from fisheye_svp_ros.reporting.terminal import progress
 
     pattern = parse_pattern(args.board)
     if args.detector and pattern.kind not in DETECTORS[args.detector][0]:
         raise ParameterError(f'--detector {args.detector} does not find {args.board}')
-    count = count_photographs(paths, args.every)
     for line in doubtful_folders(paths):
         say(line)
+    if args.split is None:
+        args.split = count_cameras(find_photographs(paths, args.every), pattern, args.detector)
+        if args.split > 1:
+            say(
+                'both halves of these wide images show the board: they are split into left and '
+                'right; --split 1 keeps them whole'
+            )
+    count = count_photographs(paths, args.every, args.split)
     with progress('searching', count) as done:
         detection = detect(
-            find_photographs(paths, args.every),
+            find_photographs(paths, args.every, args.split),
             pattern,
             args.detector,
             progress=done,
@@ -277,6 +300,17 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
             f'{unsure} photographs: their orientation is less than {100 * _UNCERTAIN:.0f} % sure, '
             f'since {args.board} looks the same when turned'
         )
+    unknown = [
+        Path(one.name).name
+        for one in detection.searched
+        if one.points and np.isnan(one.points.sigma).any()
+    ]
+    if unknown:
+        more = ', ...' if len(unknown) > _MAX_LISTED else ''
+        say(
+            f'{len(unknown)} photographs have centers of unknown sigma, since no lens fits each '
+            f'by itself: {", ".join(unknown[:_MAX_LISTED])}{more}'
+        )
     found = sum(one.points is not None for one in detection.searched)
     larger = sum(LARGER_BOARD in one.notes for one in detection.searched)
     if larger and larger >= _MIN_LARGER_SHARE * found:
@@ -285,6 +319,7 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
             'again, otherwise photographs may number different corners alike'
         )
     _note_tags(detection, pattern)
+    note_side_by_side(detection.observations, detection.image_sizes)
     if 2 * found < len(detection.searched):
         counted = ' (inner corners)' if pattern.kind == 'chessboard' else ''
         say(f'no {args.board} in most photographs; check kind and size{counted} of the board')
@@ -301,6 +336,20 @@ def _note_tags(detection: Detection, pattern: Pattern) -> None:
             f'{beyond} of {seen} tags have ids beyond the {pattern.columns}x{pattern.rows} board; '
             f'check {words}'
         )
+
+
+def note_side_by_side(table: Observations, sizes: Sizes) -> None:
+    """Say where the frames of a camera look like those of two, whose images are joined."""
+    from fisheye_svp_ros.detect.side_by_side import looks_side_by_side
+
+    for number, camera in enumerate(table.cameras):
+        size = sizes.get(camera) or sizes.get('')
+        if size and looks_side_by_side(table.take(table.camera == number), size):
+            say(
+                f'{table.source}: no frame lies across the middle of images of '
+                f'{size[0]}x{size[1]} px: if two cameras lie side by side, search the '
+                'photographs with --split 2'
+            )
 
 
 def _note_alone(detection: Detection) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from fisheye_svp_ros.commands.detect import (
     add_observation_arguments,
+    note_side_by_side,
     read_input,
     search_options,
 )
@@ -256,6 +257,8 @@ def _read(
     except LensError as cause:
         raise LensError(f'{path}: {cause}') from cause
     check_sizes(path, sizes, lenses)
+    if not args.board:
+        note_side_by_side(table, {name: (one.width, one.height) for name, one in lenses.items()})
     one = set(given) == {''} and not (given.in_file and len(table.cameras) > 1)
     lens = next(iter(lenses.values())) if one else lenses
     observations, left_out = posable_observations(table, lens)

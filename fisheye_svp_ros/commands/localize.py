@@ -12,7 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.commands.detect import add_observation_arguments, read_input
+from fisheye_svp_ros.commands.detect import (
+    add_observation_arguments,
+    note_side_by_side,
+    read_input,
+)
 from fisheye_svp_ros.commands.lenses import add_lens_argument, lenses_of, load_lenses
 from fisheye_svp_ros.commands.notes import (
     note_doubtful,
@@ -84,6 +88,10 @@ def run(args: argparse.Namespace) -> None:
     observations, sizes = read_input(args.observations, args)
     lenses = lenses_of(observations.cameras, given)
     check_sizes(args.observations, sizes, lenses)
+    if not args.board:
+        note_side_by_side(
+            observations, {name: (one.width, one.height) for name, one in lenses.items()}
+        )
     if args.rig:
         _localize_rig(observations, lenses, args)
         return

@@ -31,11 +31,13 @@ class _CallablePackage(ModuleType):
         detector: str = '',
         every: int = 1,
         sync: float | None = None,
+        split: int | None = None,
     ) -> Detection:
         """Search photographs (files, folders, videos, recordings) for a board.
 
         board: as in `--board`; every: take one of so many; sync: largest difference, s, of the
-        stamps of one moment of a rig.  The result has `observations` and `searched`.
+        stamps of one moment of a rig; split: cameras side by side in each image, None: 2 where
+        both halves of wide images show the board.  The result has `observations` and `searched`.
         Raises ObservationError where no photograph shows the board, ParameterError for a board
         that cannot be, and for a detector that does not find it.
         """
@@ -43,6 +45,7 @@ class _CallablePackage(ModuleType):
         from fisheye_svp_ros.detect.finders import DETECTORS
         from fisheye_svp_ros.detect.patterns import parse_pattern
         from fisheye_svp_ros.detect.photographs import find_photographs
+        from fisheye_svp_ros.detect.side_by_side import count_cameras
         from fisheye_svp_ros.errors import ParameterError
 
         given = [photographs] if isinstance(photographs, str | Path) else photographs
@@ -59,9 +62,11 @@ class _CallablePackage(ModuleType):
             raise ParameterError(f'every is {every}; 1 or more is needed')
         if sync is not None and (isinstance(sync, str) or not sync >= 0):
             raise ParameterError(f'sync is {sync!r}; seconds are needed, 0 or more')
-        return detect(
-            find_photographs(paths, every), pattern, detector, source=', '.join(paths), sync=sync
-        )
+        if split is not None and split < 1:
+            raise ParameterError(f'split is {split}; 1 or more is needed')
+        split = split or count_cameras(find_photographs(paths, every), pattern, detector)
+        found = find_photographs(paths, every, split)
+        return detect(found, pattern, detector, source=', '.join(paths), sync=sync)
 
 
 sys.modules[__name__].__class__ = _CallablePackage

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fisheye_svp_ros.detect.camera_names import alike_series, names_a_camera, split_names
 from fisheye_svp_ros.detect.image_messages import image_pixels
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.bags import Bag
@@ -27,8 +28,6 @@ Pixels = NDArray[Any]  # (H, W), uint8 or uint16, grey
 
 IMAGES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp', '.jp2')
 VIDEOS = ('.mp4', '.avi', '.mov', '.mkv', '.webm', '.m4v')
-# Files of a rig in one folder: left01.png, right01.png; cam0_0001.png, cam1_0001.png
-_PREFIX = re.compile(r'(left|right|cam\d+)[_-]?(.+)', re.IGNORECASE)
 _COMPRESSED_SUFFIX = '/compressed'
 _MOST_SCANS = 32  # of a JPEG, each of which may take as long as the whole image; ten are usual
 _PNG = b'\x89PNG\r\n\x1a\n'
@@ -42,7 +41,8 @@ _ORIENTATION = re.compile(
 class Photograph:
     """One photograph: its name for people, which instant and camera, t in s (NaN: unknown).
 
-    data: a path or bytes of an image file, or pixels.
+    data: a path or bytes of an image file, or pixels; part: which of how many cameras that lie
+    side by side in it.
     """
 
     name: str
@@ -50,41 +50,57 @@ class Photograph:
     camera: str
     t: float
     data: Path | bytes | Pixels
+    part: tuple[int, int] = (0, 1)
 
     def pixels(self, color: bool = False) -> Pixels:
         """Return the image in grey; raise ObservationError, one line, where there is none.
 
         color: of a colored image file blue, green and red, (H, W, 3).
         """
-        if isinstance(self.data, np.ndarray):
-            return self.data
         data = self.data
         if isinstance(data, Path):
             data = read_bytes(data, ObservationError)
-        return decode_image(data, self.name, color)
+        whole = data if isinstance(data, np.ndarray) else decode_image(data, self.name, color)
+        part, count = self.part
+        width = whole.shape[1] // count
+        return np.ascontiguousarray(whole[:, part * width : (part + 1) * width])
+
+    def split(self, count: int) -> Iterator[Photograph]:
+        """Yield the photographs of so many cameras that lie side by side in this one."""
+        if count == 1:
+            yield self
+            return
+        for part in range(count):
+            own = STEREO[part] if count == len(STEREO) else f'cam{part}'
+            yield replace(
+                self,
+                name=f'{self.name}#{own}',
+                camera='_'.join(filter(None, (self.camera, own))),
+                part=(part, count),
+            )
 
 
-def find_photographs(paths: Sequence[str], every: int = 1) -> Iterator[Photograph]:
-    """Yield the photographs of files, folders, videos and rosbag2 recordings, in their order.
+def find_photographs(paths: Sequence[str], every: int = 1, split: int = 1) -> Iterator[Photograph]:
+    """Yield the photographs of files, folders, videos and recordings, in their order.
 
-    Subfolders such as left/ and right/, file names that begin so, or topics in such namespaces are
-    the cameras of a rig; equal file names, and equal stamps, are the same instant.  A name that a
-    camera had in an earlier path is another instant: the number of its path stands before it.
-    every: take one of so many.
+    Subfolders such as left/ and right/, names of files, folders and videos with such a word, or
+    topics in such namespaces are the cameras of a rig; equal names, and equal stamps, are the same
+    instant.  A name that a camera had in an earlier path is another instant: the number of its
+    path stands before it.  every: take one of so many; split: cameras side by side in each.
     Raises ObservationError for a path without any.
     """
     earlier: set[tuple[str, str]] = set()
-    for place, path in enumerate(map(Path, paths)):
+    given = [*map(Path, paths)]
+    named = _path_cameras(given)
+    for place, path in enumerate(given):
         number, own = -1, set()
-        for number, photograph in enumerate(_source(path)):
+        for number, photograph in enumerate(_source(path, *named.get(path, ('', '')))):
             if number % every == 0:
                 name = photograph.camera, photograph.key
                 own.add(name)
-                yield (
-                    photograph
-                    if name not in earlier
-                    else replace(photograph, key=f'{place}/{photograph.key}')
-                )
+                if name in earlier:
+                    photograph = replace(photograph, key=f'{place}/{photograph.key}')
+                yield from photograph.split(split)
         earlier |= own
         if number < 0:
             raise ObservationError(
@@ -92,60 +108,97 @@ def find_photographs(paths: Sequence[str], every: int = 1) -> Iterator[Photograp
             )
 
 
-def count_photographs(paths: Sequence[str], every: int = 1) -> int | None:
+def count_photographs(paths: Sequence[str], every: int = 1, split: int = 1) -> int | None:
     """Return how many photographs `find_photographs` yields; None for videos and recordings."""
     count = 0
     for path in map(Path, paths):
-        if path.suffix.lower() in VIDEOS or is_recording(path):
+        folders = photograph_folders(path) if path.is_dir() else []
+        files = [file for folder in folders for file in _media(folder)] or [path]
+        if is_recording(path) or any(file.suffix.lower() in VIDEOS for file in files):
             return None
-        count += -(-sum(1 for _ in _source(path)) // every)
+        count += split * -(-sum(1 for _ in _source(path)) // every)
     return count
 
 
 def doubtful_folders(paths: Sequence[str]) -> Iterator[str]:
-    """Yield what `find_photographs` makes of folders and may not be meant: a line each.
+    """Yield what `find_photographs` makes of files and folders and may not be meant: a line each.
 
     Beside images of the folder itself those of its subfolders may be anything, pictures of results
     say; and files called after cameras are those of one where others are called otherwise.
     """
     given = [*map(Path, paths)]
-    names = {folder: {p.stem for p in _images(folder)} for folder in given if folder.is_dir()}
+    folders = [path for path in given if path.is_dir() and not is_recording(path)]
+    if not split_names([_name(path) for path in given], False):
+        yield from _equal_names(folders)
+    loose = [path for path in given if not path.is_dir()]
+    yield from _doubtful_names('the files', loose)
+    for folder in folders:
+        yield from _skipped(folder, given)
+        yield from _doubtful_names(str(folder), _media(folder))
+
+
+def _equal_names(folders: Sequence[Path]) -> Iterator[str]:
+    names = {folder: {p.stem for p in _media(folder)} for folder in folders}
     for before, after in itertools.pairwise(names):
         if names[before] & names[after]:
             yield (
                 f'{before}, {after}: photographs of equal names are different frames of one '
                 'camera; for the cameras of a rig give the folder above'
             )
-    for folder in given:
-        if not folder.is_dir() or is_recording(folder):
-            continue
-        files = _images(folder)
-        for above in photograph_folders(folder):
-            for sub in (p for p in sorted(above.iterdir()) if p.is_dir() and p not in given):
-                if count := sum(len(_images(one)) for one in (sub, *_folders(sub))):
-                    yield (
-                        f'{sub}: its {count} images are skipped, since the folder above holds '
-                        'images too; give it alone, or move the others into a subfolder'
-                    )
-        named = {p.name: match[1].lower() for p in files if (match := _PREFIX.fullmatch(p.stem))}
-        other = next((p.name for p in files if p.name not in named), '')
-        if other and len({*named.values()}) > 1:
+
+
+def _skipped(folder: Path, given: Sequence[Path]) -> Iterator[str]:
+    """Yield which subfolders, and videos beside images, are not searched."""
+    for above in photograph_folders(folder):
+        for sub in (p for p in sorted(above.iterdir()) if p.is_dir() and p not in given):
+            if count := sum(len(_media(one)) for one in (sub, *_folders(sub))):
+                yield (
+                    f'{sub}: its {count} images are skipped, since the folder above holds '
+                    'images too; give it alone, or move the others into a subfolder'
+                )
+        if (videos := _files(above, VIDEOS)) and _images(above):
             yield (
-                f'{folder}: all images count as those of one camera, since {other} names none, '
-                f'unlike {next(iter(named))}; rename or remove it'
+                f'{above}: its {len(videos)} videos are skipped, since it holds images too; give '
+                'the videos themselves'
             )
+
+
+def _doubtful_names(where: str, files: Sequence[Path]) -> Iterator[str]:
+    """Yield why files count as those of one camera, where some or all may be those of several."""
+    videos = [p for p in files if p.suffix.lower() in VIDEOS]
+    if len(videos) > 1 and not split_names([p.stem for p in videos], False):
+        yield (
+            f'{", ".join(p.name for p in videos[:3])}: these videos count as those of one camera; '
+            'call those of a rig left and right, or cam0, cam1, ...'
+        )
+    images = [p for p in files if p.suffix.lower() in IMAGES]
+    stems = [p.stem for p in images]
+    named = [stem for stem in stems if names_a_camera(stem)]
+    others = [p.name for p in images if p.stem not in named]
+    if others and split_names(named):
+        first = next(p.name for p in images if p.stem in named)
+        yield (
+            f'{where}: all images count as those of one camera, since {others[0]} names none, '
+            f'unlike {first}; rename or remove it'
+        )
+    elif not named and (series := alike_series(stems)):
+        yield (
+            f'{where}: images named {" and ".join(series[:3])} with equal numbers count as those '
+            'of one camera; put those of a rig into a folder for each camera'
+        )
 
 
 def is_photographs(path: Path) -> bool:
     """Say whether a path is taken for photographs rather than for observations."""
     if path.is_dir():
-        return any(p.suffix.lower() in IMAGES for p in (*path.glob('*'), *path.glob('*/*')))
+        kinds = (*IMAGES, *VIDEOS)
+        return any(p.suffix.lower() in kinds for p in (*path.glob('*'), *path.glob('*/*')))
     return path.suffix.lower() in (*IMAGES, *VIDEOS)
 
 
 def photograph_folders(path: Path) -> list[Path]:
     """Return the folders whose images are the photographs of a folder: itself, or those in it."""
-    return [path] if _images(path) else _folders(path)
+    return [path] if _media(path) else _folders(path)
 
 
 def decode_image(data: bytes, name: str, color: bool = False) -> Pixels:
@@ -221,50 +274,102 @@ def message_pixels(message: Any, typename: str, name: str) -> Pixels:
     return image_pixels(message, name)
 
 
-def _source(path: Path) -> Iterator[Photograph]:
+def _name(path: Path) -> str:
+    return path.resolve().name if path.is_dir() else path.stem
+
+
+def _path_cameras(given: Sequence[Path]) -> dict[Path, tuple[str, str]]:
+    """Return camera, and what else its name says, of each path that is called after one.
+
+    Images without a camera in their own names have that of their folders.
+    """
+    found: dict[Path, tuple[str, str]] = {}
+    images = [p for p in given if p.suffix.lower() in IMAGES and not p.is_dir()]
+    others = [p for p in given if p not in images]
+    parents = [*dict.fromkeys(p.parent for p in images)]
+    if parts := split_names([p.stem for p in images]):
+        found |= zip(images, parts, strict=True)
+    elif parts := split_names([_name(p) for p in parents], False):
+        camera = dict(zip(parents, parts, strict=True))
+        for path in images:
+            own, rest = camera[path.parent]
+            found[path] = own, '/'.join(filter(None, (rest, path.stem)))
+    if parts := split_names([_name(p) for p in others], False):
+        found |= zip(others, parts, strict=True)
+    return found
+
+
+def _source(path: Path, camera: str = '', rest: str = '') -> Iterator[Photograph]:
+    """Yield the photographs of a path; camera, rest: what its name says, '' nothing."""
     if not path.exists():
         raise ObservationError(f'{path}: no such file or folder; check the path')
     if is_recording(path):
-        return _recording(path)
-    if path.is_dir():
-        return _folder(path)
-    return _video(path) if path.suffix.lower() in VIDEOS else iter([_file(path)])
+        found = _recording(path)
+    elif path.is_dir():
+        found = _folder(path)
+    else:
+        return _open(path, camera, rest)
+    return (
+        replace(
+            one,
+            camera=one.camera or camera,
+            key='/'.join(filter(None, (rest, one.key))),
+        )
+        for one in found
+    )
 
 
-def _file(path: Path, camera: str = '') -> Photograph:
-    return Photograph(str(path), path.stem, camera, np.nan, path)
+def _open(path: Path, camera: str = '', key: str = '') -> Iterator[Photograph]:
+    """Yield the photographs of a file: itself, or those of a video."""
+    if path.suffix.lower() in VIDEOS:
+        return _video(path, camera, key)
+    return iter([Photograph(str(path), key or path.stem, camera, np.nan, path)])
+
+
+def _files(path: Path, kinds: Sequence[str]) -> list[Path]:
+    return sorted((p for p in path.iterdir() if p.suffix.lower() in kinds), key=_natural)
 
 
 def _images(path: Path) -> list[Path]:
-    return sorted((p for p in path.iterdir() if p.suffix.lower() in IMAGES), key=_natural)
+    return _files(path, IMAGES)
+
+
+def _media(path: Path) -> list[Path]:
+    """Return the images of a folder, or else its videos."""
+    return _images(path) or _files(path, VIDEOS)
 
 
 def _folders(path: Path) -> list[Path]:
-    return [p for p in sorted(path.iterdir()) if p.is_dir() and _images(p)]
+    return [p for p in sorted(path.iterdir()) if p.is_dir() and _media(p)]
 
 
 def _folder(path: Path) -> Iterator[Photograph]:
-    files = _images(path)
+    files = _media(path)
     folders = [] if files else photograph_folders(path)
     for folder in folders:
         camera = folder.name if len(folders) > 1 or folder.name in STEREO else ''
-        yield from (_file(p, camera) for p in _images(folder))
-    named = [_PREFIX.fullmatch(p.stem) for p in files]
-    if len({match and match[1] for match in named}) > 1 and all(named):
-        yield from (
-            Photograph(str(p), match[2], match[1].lower(), np.nan, p)
-            for p, match in zip(files, named, strict=True)
-            if match
-        )
-    else:
-        yield from map(_file, files)
+        own = _media(folder)
+        for file in own:
+            # Of a single video numbers tell which frames are simultaneous, whatever it is called.
+            video = file.suffix.lower() in VIDEOS
+            yield from _open(file, camera, '' if video and len(own) == 1 else file.stem)
+    videos = bool(files) and files[0].suffix.lower() in VIDEOS
+    named = split_names([p.stem for p in files], not videos) or [
+        ('', p.stem if len(files) > 1 else '') for p in files
+    ]
+    for file, (camera, rest) in zip(files, named, strict=True):
+        yield from _open(file, camera, rest)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(w), '') if w.isdigit() else (-1, w) for w in re.split(r'(\d+)', path.name)]
 
 
-def _video(path: Path) -> Iterator[Photograph]:
+def _video(path: Path, camera: str = '', key: str = '') -> Iterator[Photograph]:
+    """Yield the frames of a video; key: its name among others of its camera.
+
+    Of one among others the time is not known, since nothing says when it began.
+    """
     if not path.is_file():
         raise ObservationError(f'{path}: it must be a regular file')
     video = cv2.VideoCapture(str(path))
@@ -275,7 +380,9 @@ def _video(path: Path) -> Iterator[Photograph]:
         if not ok:
             break
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        yield Photograph(f'{path} #{number}', f'{number:09d}', '', number / rate, grey)
+        t = np.nan if camera and key else number / rate
+        name = '/'.join(filter(None, (key, f'{number:09d}')))
+        yield Photograph(f'{path} #{number}', name, camera, t, grey)
         number += 1
     video.release()
 
