@@ -13,6 +13,7 @@ from fisheye_svp_ros.commands.node_sweeps import start_in_step, values
 from fisheye_svp_ros.commands.notes import note_formats
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.processes import Processes, missing_rclpy
+from fisheye_svp_ros.commands.record import TOPICS
 from fisheye_svp_ros.errors import OutputError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import write_columns
@@ -130,7 +131,9 @@ def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float])
     shutil.rmtree(bag, ignore_errors=True)
     cameras = []
     with Processes(logs) as processes:
-        processes.start('recorder', ['record', '-o', str(bag)])
+        # Markers too: the layouts in config/layouts show them.
+        topics = f'{TOPICS}|.*/markers'
+        processes.start('recorder', ['record', '-o', str(bag), '--topics', topics])
         for task in TASKS:
             cameras.append(f'camera_{task.name}')
             start_in_step(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -104,6 +105,18 @@ def test_everything_is_recorded(demo: Any) -> None:
     pose = types['/localization/localizer/pose']
     assert pose == 'geometry_msgs/msg/PoseWithCovarianceStamped'
     assert types['/depth/stereo_depth/metrics/error3_m'] == 'std_msgs/msg/Float64'
+
+
+def test_every_topic_of_a_layout_is_recorded(demo: Any) -> None:
+    everything = Bag(demo[0] / 'recording').records(lambda topic, typename: True)
+    recorded = {record.topic for record in everything}
+    layouts = [path.read_text() for path in (ROOT / 'config' / 'layouts').iterdir()]
+    shown = {
+        topic
+        for text in layouts
+        for topic in re.findall(r'["\s](/(?:localization|depth)/[\w/]+?)(?://|["\s.])', text)
+    }
+    assert len(shown) == 6 and shown <= recorded
 
 
 def test_as_observations_it_says_how_to_record_one_of_its_namespaces(demo: Any) -> None:
