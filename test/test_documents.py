@@ -87,3 +87,18 @@ def test_a_diagnosis_is_what_its_schema_says() -> None:
     assert document['causes']
     validator.validate(json.loads(json.dumps(document)))
     assert not validator.is_valid({**document, 'verdict': 'good'})
+
+
+def test_the_figures_of_the_first_pages_are_those_of_the_results() -> None:
+    sys.path.insert(0, str(ROOT / 'docs'))
+    try:
+        import measured
+    finally:
+        sys.path.remove(str(ROOT / 'docs'))
+    undated = [re.sub(r'\| [\d-]* \|$', '', line) for line in measured.index().splitlines()]
+    page = measured.INDEX.read_text(encoding='utf-8').splitlines()
+    assert [re.sub(r'\| [\d-]* \|$', '', line) for line in page] == undated
+    text = measured.README.read_text(encoding='utf-8')
+    assert measured.readme(text) == text and len(text.splitlines()) <= 110
+    pages = {path.stem for path in measured.RESULTS.glob('*.md')}
+    assert {claim.page for claim in measured.CLAIMS} <= pages

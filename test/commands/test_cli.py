@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.data import DATA, NO_DATA
 from helpers.nodes import hears_sigint, until
 from helpers.targets import plane, poses_around
 
@@ -34,7 +35,7 @@ from fisheye_svp_ros.solve.outliers import Outliers
 pytestmark = pytest.mark.usefixtures('undrawn')
 
 ROOT = Path(__file__).resolve().parents[2]
-OV_PLANE = ROOT.parent / 'shared' / 'data' / 'ov_plane'
+OV_PLANE = DATA / 'ov_plane'
 LENS = Lens('made', 1280, 960, 700.0, 700.0, 650.0, 470.0, Equidistant(), 1.1)
 
 
@@ -606,7 +607,7 @@ class TestCommandLine:
         assert err.startswith('fisheye-svp: ') and err.count('\n') == 1
 
 
-@pytest.mark.skipif(not OV_PLANE.exists(), reason='the measured data are not here')
+@pytest.mark.skipif(not OV_PLANE.exists(), reason=NO_DATA)
 def test_measured_data(tmp_path):
     lens = tmp_path / 'lens.yaml'
     assert (

@@ -15,12 +15,14 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from helpers.data import DATA, NO_DATA
 from helpers.nodes import ROOT, need_ros
 
 from fisheye_svp_ros import cli
 
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 _BLOCK = re.compile(r'<!-- a test runs this -->\n```(?:ba)?sh\n(.*?)```', re.DOTALL)
+_ON_MEASURED_DATA = re.compile(_BLOCK.pattern.replace('this', 'this on measured data'), re.DOTALL)
 _COMMAND = re.compile(r'^ *fisheye-svp (.*?)(?:  +#.*| [|&>;].*)?$', re.MULTILINE)
 _ALL = {
     f'{page.name} {number}': block
@@ -46,6 +48,33 @@ def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int)
                 pytest.skip('somebody else has a Dask scheduler on port 8786')
     if 'fisheye-svp record' in block:
         need_ros()
+    run(block, tmp_path)
+
+
+# Where a page that clones public repositories has what is here in DATA.
+CLONES = {
+    'babelcalib/data/ov_plane/corners': 'ov_plane/raw',
+    'BoofCV-Data/example/calibration/fisheye': 'photos',
+}
+ON_MEASURED_DATA = [
+    pytest.param(block, id=f'{page.name} {number}', marks=pytest.mark.slow)
+    for page in PAGES
+    for number, block in enumerate(_ON_MEASURED_DATA.findall(page.read_text()))
+]
+
+
+@pytest.mark.parametrize('block', ON_MEASURED_DATA)
+def test_commands_on_measured_data_run_as_they_stand(block: str, tmp_path: Path) -> None:
+    for clone, name in CLONES.items():
+        if clone in block and not (DATA / name).exists():
+            pytest.skip(NO_DATA)
+        (tmp_path / clone).parent.mkdir(parents=True)
+        (tmp_path / clone).symlink_to(DATA / name)
+    run(block, tmp_path)
+
+
+def run(block: str, tmp_path: Path) -> None:
+    """Run a block of a page in a folder; fail where it fails."""
     tools = tmp_path / 'bin'
     tools.mkdir()
     for name, module in (('fisheye-svp', 'fisheye_svp_ros.cli'), ('dask', 'dask')):

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 from helpers.commands import refused
+from helpers.data import DATA, NO_DATA
 from helpers.kalibr import write_camchain
-from helpers.nodes import SHARED
 from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, write
 
 import fisheye_svp_ros as fsvp
@@ -31,7 +31,7 @@ from fisheye_svp_ros.scene.rigs import rig
 
 pytestmark = pytest.mark.usefixtures('undrawn')
 
-PHOTOS = SHARED / 'photos'
+PHOTOS = DATA / 'photos'
 
 
 @pytest.fixture(scope='module')
@@ -401,7 +401,7 @@ def test_what_does_not_fit_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     assert 'does not fit this lens' in said
 
 
-@pytest.mark.skipif(not PHOTOS.exists(), reason='the photographs are not here')
+@pytest.mark.skipif(not PHOTOS.exists(), reason=NO_DATA)
 @pytest.mark.parametrize(
     ('folder', 'board', 'frames', 'rms'),
     [

@@ -14,8 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.data import DATA
 from helpers.memory import page_faults
-from helpers.nodes import SHARED
 from helpers.patterns import pattern_photograph
 from helpers.photographs import (
     BOARD,
@@ -873,7 +873,7 @@ def test_fits_that_diverge_say_nothing() -> None:
 
 @pytest.mark.parametrize('name', ['half_hidden_charuco.png', 'gapped_chessboard.png'])
 def test_odd_boards_leave_no_warnings(name: str, capfd: pytest.CaptureFixture[str]) -> None:
-    path = SHARED.parent / 'faults' / 'numpy_warnings' / name
+    path = DATA.parent / 'faults' / 'numpy_warnings' / name
     if not path.exists():
         pytest.skip('the photographs are not here')
     if 'charuco' in name and not hasattr(cv2, 'aruco'):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.nodes import ROOT
+from helpers.data import DATA, NO_DATA
 from helpers.targets import plane, poses_around
 
 from fisheye_svp_ros import cli
@@ -123,9 +123,9 @@ def test_reversed_photographs_are_found_where_no_row_has_a_corner() -> None:
 
 def test_photographs_of_a_real_board_are_found_by_where_its_clip_is(tmp_path: Path) -> None:
     """In 8.jpg and 9.jpg the clip of the clipboard is at the other end than in all others."""
-    folder = ROOT.parent / 'shared' / 'data' / 'photos' / 'chessboard'
+    folder = DATA / 'photos' / 'chessboard'
     if not folder.exists():
-        pytest.skip(f'{folder} is not there')
+        pytest.skip(NO_DATA)
     table, lens, out = tmp_path / 'corners.csv', tmp_path / 'lens.yaml', tmp_path / 'diagnosis'
     assert (
         cli.main(['detect', str(folder), '--board', 'chessboard:4x6:30mm', '-o', str(table)]) == 0

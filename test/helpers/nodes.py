@@ -19,7 +19,6 @@ from fisheye_svp_ros.commands.processes import missing_rclpy
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT = 60.0  # s; only a hang takes this long, however busy the machine is
-SHARED = ROOT.parent / 'shared' / 'data'
 
 
 def need_ros() -> None:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from helpers.nodes import SHARED
+from helpers.data import DATA, NO_DATA
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands.lenses import load_lenses
@@ -307,9 +307,9 @@ def test_a_double_sphere_is_read_up_to_where_its_curve_turns_back(tmp_path: Path
 
 
 def test_boofcv() -> None:
-    path = SHARED / 'photos' / 'chessboard' / 'fisheye.yaml'
+    path = DATA / 'photos' / 'chessboard' / 'fisheye.yaml'
     if not path.exists():
-        pytest.skip('the photographs are not here')
+        pytest.skip(NO_DATA)
     lens = load_lens(path)
     assert (lens.width, lens.height) == (640, 720)
     assert 80 < np.degrees(lens.max_incidence) < 120

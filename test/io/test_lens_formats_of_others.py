@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers.nodes import SHARED
+from helpers.data import DATA
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.effects.forward import project
@@ -572,7 +572,7 @@ def test_other_units_in_a_lens_file_are_told(
 
 
 def test_files_that_others_wrote() -> None:
-    folder = SHARED.parent / 'faults' / 'lens_files'
+    folder = DATA.parent / 'faults' / 'lens_files'
     if not folder.exists():
         pytest.skip('the files are not here')
     for path in folder.iterdir():

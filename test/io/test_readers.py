@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.data import DATA, NO_DATA
 
 from fisheye_svp_ros.errors import ObservationError, OutputError
 from fisheye_svp_ros.io.readers import (
@@ -16,7 +17,7 @@ from fisheye_svp_ros.io.readers import (
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import make_observations
 
-OV_PLANE = Path(__file__).resolve().parents[3] / 'shared' / 'data' / 'ov_plane'
+OV_PLANE = DATA / 'ov_plane'
 HEADER = 'frame,landmark,u,v,x,y,z'
 ROWS = '0,4,10.5,20.25,0.1,0.2,0.3\n0,5,11,21,0.4,0.5,0.6\n2,4,12,22,0.1,0.2,0.3\n'
 
@@ -423,7 +424,7 @@ class TestOrpc:
         csv('num_corners: 0\n', 'set/image.orpc')
         fails(tmp_path / 'set', 'hold no corner')
 
-    @pytest.mark.skipif(not OV_PLANE.exists(), reason='the measured data are not here')
+    @pytest.mark.skipif(not OV_PLANE.exists(), reason=NO_DATA)
     @pytest.mark.parametrize('part', ['train', 'test'])
     def test_gives_the_same_table_as_the_csv(self, part):
         orpc = read_observations(OV_PLANE / 'raw' / part)

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import yaml
 from helpers import graph  # noqa: F401 - skips where there is no rclpy
+from helpers.data import DATA, NO_DATA
 from helpers.nodes import ROOT, NodeProcess, until
 from mcap.reader import make_reader
 from mcap.records import Channel
@@ -522,10 +523,10 @@ def test_bad_arguments_of_record(command: Callable[..., NodeProcess], tmp_path: 
     assert not (tmp_path / 'new').exists()
 
 
-DATA = ROOT.parent / 'shared' / 'data' / 'ov_plane'
+OV_PLANE = DATA / 'ov_plane'
 
 
-@pytest.mark.skipif(not DATA.exists(), reason='the real data is not here')
+@pytest.mark.skipif(not OV_PLANE.exists(), reason=NO_DATA)
 def test_measured_camera_and_localizer_agree_with_the_command(
     command: Callable[..., NodeProcess], tmp_path: Path
 ) -> None:
@@ -534,7 +535,7 @@ def test_measured_camera_and_localizer_agree_with_the_command(
         main(
             [
                 'calibrate',
-                str(DATA / 'train.csv'),
+                str(OV_PLANE / 'train.csv'),
                 '--model',
                 'kannala_brandt',
                 '--image-size',
@@ -545,9 +546,8 @@ def test_measured_camera_and_localizer_agree_with_the_command(
         )
         == 0
     )
-    assert (
-        main(['localize', str(DATA / 'test.csv'), '--lens', str(lens), '-o', str(tmp_path)]) == 0
-    )
+    test = str(OV_PLANE / 'test.csv')
+    assert main(['localize', test, '--lens', str(lens), '-o', str(tmp_path)]) == 0
     recorder = command('record', '-o', str(tmp_path / 'bag'))
     localizer = command(
         'run', 'localizer', '--ros-args', '-p', f'lens:={lens}', '-p', 'wait_for_subscribers:=2'

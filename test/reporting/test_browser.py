@@ -11,14 +11,14 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from helpers.nodes import ROOT
+from helpers.data import DATA, NO_DATA
 
 from fisheye_svp_ros import cli
 
 BROWSER = next(
     filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), None
 )
-PHOTOGRAPHS = ROOT.parent / 'shared' / 'data' / 'photos' / 'chessboard'
+PHOTOGRAPHS = DATA / 'photos' / 'chessboard'
 # One process makes both reports once.
 pytestmark = [pytest.mark.xdist_group('browser'), pytest.mark.slow]
 SIZES = ((1280, 800), (390, 844))
@@ -41,7 +41,7 @@ _FRAME = '<body><iframe style="width: {}px; height: {}px; border: 0" srcdoc="{}"
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the reports of a calibration and a diagnosis of photographs."""
     if not PHOTOGRAPHS.exists():
-        pytest.skip(f'{PHOTOGRAPHS} is not there')
+        pytest.skip(NO_DATA)
     found = tmp_path_factory.mktemp('reports')
     board = ['--board', 'chessboard:4x6:30mm']
     lens = str(found / 'lens.yaml')

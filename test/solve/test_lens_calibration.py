@@ -1,11 +1,11 @@
 """Lens calibration: from nothing, for every model, and with the covariance it claims."""
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.data import DATA, NO_DATA
 from helpers.targets import cube, plane, poses_around
 
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -22,7 +22,7 @@ from fisheye_svp_ros.solve.lens_calibration import _check_focal, calibrate
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured_poses import localize_measured, posable_views, rms_px
 
-OV_PLANE = Path(__file__).resolve().parents[3] / 'shared' / 'data' / 'ov_plane'
+OV_PLANE = DATA / 'ov_plane'
 SIZE = (1280, 960)
 SAMPLES = 120
 CURVED = (-0.05, 0.01, -0.003, 0.0002)
@@ -331,7 +331,7 @@ class TestBadInput:
             calibrate(mixed, 'equidistant', SIZE)
 
 
-@pytest.mark.skipif(not OV_PLANE.exists(), reason='the measured data are not here')
+@pytest.mark.skipif(not OV_PLANE.exists(), reason=NO_DATA)
 class TestMeasuredData:
     @pytest.fixture(scope='class')
     @classmethod

@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.data import DATA, NO_DATA
 from helpers.robot import LENS
 from helpers.targets import cube, plane, poses_around
 
@@ -19,7 +19,6 @@ from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
 from fisheye_svp_ros.study.trust import calibrate_without_outliers
 
 SIZE = (LENS.width, LENS.height)
-DATA = Path(__file__).resolve().parents[3] / 'shared' / 'data'
 fit = partial(calibrate, model='kannala_brandt', image_size=SIZE)
 
 
@@ -121,7 +120,7 @@ def test_a_wrong_lens_is_no_wrong_landmark():
 def test_real_boards_lose_no_landmark_even_where_it_is_asked_for(name, monkeypatch):
     path = DATA / f'{name}.csv'
     if not path.exists():
-        pytest.skip(f'{path} is not there')
+        pytest.skip(NO_DATA)
     monkeypatch.setattr(
         'fisheye_svp_ros.solve.wrong_landmarks._Landmarks.is_suspicious', lambda *_: True
     )

@@ -1,0 +1,183 @@
+"""Writes docs/results/index.md and the evidence of README.md from the pages of results.
+
+Each claim names its page, a pattern that finds its numbers there, and the command that measures
+them; a test compares.  Run: python docs/measured.py
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / 'docs' / 'results'
+README = ROOT / 'README.md'
+INDEX = RESULTS / 'index.md'
+_MARKS = '<!-- evidence -->', '<!-- end of evidence -->'
+_HEAD = """# Measured results
+
+Each figure stands on its page with how it was measured; this table is made from the pages
+(`python docs/measured.py`). The date is that of the figure's last change.
+
+| claim | figure | against | command | page | date |
+|---|---|---|---|---|---|
+"""
+
+
+class Claim(NamedTuple):
+    """A claim; figure: with {0}, {1}, ... for the groups of a pattern in its page."""
+
+    text: str
+    page: str
+    pattern: str
+    figure: str
+    against: str
+    command: str
+    first: bool = False  # in README, too
+
+
+CLAIMS = (
+    Claim(
+        'The extended lens is closer to the truth than a calibration that neglects its causes',
+        'ray_coverage',
+        r'\| all \| (\d+) \|.*\| (0\.\d+) \|\n',
+        'ray error x {1} on {0} simulated cameras (geometric mean)',
+        '`calibrate` alone',
+        'make study NAME=ray_coverage',
+        first=True,
+    ),
+    Claim(
+        'Stated ray errors hold',
+        'ray_coverage',
+        r'\| all \| \d+ \| \d+ % \| (\d+) % \|.*?\| \d+ % \| (\d+) % \| \d+ % \| 0\.\d+ \| 0',
+        '{0} % (given lens) and {1} % (extended) within their 95 % intervals',
+        'the truth',
+        'make study NAME=ray_coverage',
+    ),
+    Claim(
+        "Kita's tables 1 and 2 are reproduced",
+        'paper',
+        r'z and residual \| (\d+ of \d+) within 10 %.*?\| (\d+) and (\d+) \|',
+        '{1} of 36 cells within 10 %, {2} within 5 %',
+        'the published tables',
+        'make paper',
+        first=True,
+    ),
+    Claim(
+        'Transforms of a camera on a robot arm',
+        'hand_eye',
+        r'\| ours \| ([\d.]+) \|.*?OpenCV, Park \| ([\d.]+)',
+        '{0} mm, against {1} mm (median)',
+        "OpenCV's best",
+        'make peers NAME=hand_eye',
+    ),
+    Claim(
+        'Rigs of four cameras',
+        'rigs',
+        r'\| ours \| \d+ \| ([\d.]+).*?multical \| \d+ \| ([\d.]+).*?OpenCV \| \d+ \| ([\d.]+)',
+        '{0} mm, against {1} and {2} mm (median rms)',
+        'multical, OpenCV',
+        'make peers NAME=rigs',
+    ),
+    Claim(
+        'Corners of a chessboard',
+        'detectors',
+        r'scatters by ([\d.]+) px near.*?cornerSubPix` scatters by ([\d.]+) px',
+        '{0} px, against {1} px',
+        '`cv2.cornerSubPix`',
+        'make study NAME=detectors',
+    ),
+    Claim(
+        'Corrupted views give no wrong pose without a warning',
+        'reliability',
+        r'Of ([\d ]+) corrupted views, (none)',
+        '{1} of {0}',
+        'the truth',
+        'make study NAME=poses',
+        first=True,
+    ),
+    Claim(
+        'Photographs that determine a viewpoint shift',
+        'next_photographs',
+        r'have \| (\d+) \| \d+ \| ([\d.]+) \|',
+        '{0} chosen ones do what {1} random ones do (median)',
+        'random photographs',
+        'python -m benchmark.studies.next_photographs --cameras 100',
+    ),
+    Claim(
+        'Stereo calibration, NumPy and Numba',
+        'benchmarks',
+        r'Kannala-Brandt \| numpy \| cv2\.fisheye\.stereoCalibrate \| 4 × \| ([\d.]+) ×'
+        r'.*?numba \| cv2\.fisheye\.stereoCalibrate \| 20 × \| ([\d.]+) ×',
+        '{0} and {1} times as fast',
+        '`cv2.fisheye.stereoCalibrate`',
+        'make bench',
+    ),
+    Claim(
+        'Small faults put into the code are found by the tests',
+        'mutation',
+        r'\| all \| (\d+) \| (\d+) \| (\d+)% \|',
+        '{1} of {0} ({2} %)',
+        'a random sample',
+        'make hardening NAME=mutation',
+    ),
+)
+
+
+def found(claim: Claim) -> re.Match[str]:
+    """Return where a page has the figure of a claim; ValueError where it has none."""
+    page = RESULTS / f'{claim.page}.md'
+    match = re.search(claim.pattern, page.read_text(encoding='utf-8'), re.DOTALL)
+    if not match:
+        raise ValueError(f'{page}: nothing like {claim.pattern}')
+    return match
+
+
+def figure(claim: Claim) -> str:
+    """Return the figure of a claim, from its page."""
+    return claim.figure.format(*found(claim).groups())
+
+
+def date(claim: Claim) -> str:
+    """Return the date of the commit that wrote the figure of a claim."""
+    page, text = str(RESULTS / f'{claim.page}.md'), found(claim)[0]
+    command = ['git', 'log', '-1', '--format=%cs', '-S', text, '--', page]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout.strip()
+
+
+def index() -> str:
+    """Return the page of all claims."""
+    rows = [
+        f'| {c.text} | {figure(c)} | {c.against} | `{c.command}` | [{c.page}]({c.page}.md) '
+        f'| {date(c)} |'
+        for c in CLAIMS
+    ]
+    return _HEAD + '\n'.join(rows) + '\n'
+
+
+def evidence() -> str:
+    """Return the list of README's claims."""
+    return '\n'.join(
+        f'- {c.text}: **{figure(c)}**, against {c.against} ([how](docs/results/{c.page}.md)).'
+        for c in CLAIMS
+        if c.first
+    )
+
+
+def readme(text: str) -> str:
+    """Return README with its evidence written anew."""
+    begin, end = _MARKS
+    head, _, rest = text.partition(begin)
+    return f'{head}{begin}\n{evidence()}\n{end}{rest.partition(end)[2]}'
+
+
+def main() -> None:
+    """Write both files."""
+    INDEX.write_text(index(), encoding='utf-8')
+    README.write_text(readme(README.read_text(encoding='utf-8')), encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()
