@@ -15,6 +15,7 @@ from typing import Any
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import pytest
+from helpers.data import DATA, NO_DATA
 from helpers.nodes import ROOT, TIMEOUT, NodeProcess
 
 EXAMPLES = ROOT / 'examples'
@@ -25,7 +26,7 @@ SCRIPTS = {
     'stereo_depth_error': ('full lens: baseline 150.0', []),
 }
 NODE_SCRIPTS = {'publish_image_points', 'compose_nodes'}
-NOTEBOOKS = ('viewpoint_shift', 'diagnosis')
+NOTEBOOKS = ('viewpoint_shift', 'diagnosis', 'paper_result', 'real_data')
 
 
 def test_every_example_is_tested() -> None:
@@ -96,6 +97,9 @@ def test_nodes_are_composed(ros_domain: int, monkeypatch: pytest.MonkeyPatch) ->
 def test_a_notebook_prints_what_it_shows(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if name == 'real_data' and not (DATA / 'ov_plane').exists():
+        pytest.skip(NO_DATA)
+    monkeypatch.setenv('FISHEYE_SVP_DATA', str(DATA))
     monkeypatch.chdir(tmp_path)
     notebook = json.loads((EXAMPLES / f'{name}.ipynb').read_text(encoding='utf-8'))
     names: dict[str, Any] = {}
