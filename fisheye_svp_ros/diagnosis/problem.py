@@ -298,7 +298,7 @@ def find_hand_eye(linear: Linearization, poses: dict[int, Pose]) -> HandEye:
     except GeometryError as cause:
         raise ObservationError(
             f'{data.observations.source}: the given poses fit neither the camera in the world nor '
-            f'a flange that carries it: {cause}; or leave the poses out'
+            f'a flange that carries it or the target: {cause}; or leave the poses out'
         ) from cause
 
 

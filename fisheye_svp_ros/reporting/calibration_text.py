@@ -14,7 +14,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, vector_from_rotation
 from fisheye_svp_ros.reporting.terminal import UNITS, interval, with_error
 from fisheye_svp_ros.scene.observations import Observations, list_frames
-from fisheye_svp_ros.solve.hand_eye import HandEye
+from fisheye_svp_ros.solve.hand_eye import MAX_ODDS, HandEye
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured_poses import rms_px
 from fisheye_svp_ros.solve.outliers import WrongLandmark
@@ -162,10 +162,13 @@ class CalibratedCamera:
 
 
 def hand_eye_sentence(found: HandEye) -> str:
-    """Return how many poses there are, the noise of the robot, and the scale."""
+    """Return how many poses there are, what the flange carries, the robot's noise, the scale."""
     scale, error = found.scale, found.stderr[-1]
+    carried = 'target, the camera is fixed' if found.fixed_camera else 'camera'
+    sure = '' if found.odds < MAX_ODDS else 'more than '
     return (
-        f'{len(found.frame)} poses of the flange; noise of the robot '
+        f'{len(found.frame)} poses of the flange, which carries the {carried} (odds '
+        f'{sure}{found.odds:.3g} to 1); noise of the robot '
         f'{1e3 * found.noise_m:.3f} mm and {np.degrees(found.noise_rad):.4f} deg an axis; '
         f'lengths of the target are {scale:.5f} ± {error:.5f} times those of the robot'
     )
@@ -174,14 +177,19 @@ def hand_eye_sentence(found: HandEye) -> str:
 def hand_eye_rows(found: HandEye) -> list[tuple[str, ...]]:
     """Return both transforms as ROBOT_HEADER has them, each with its standard errors below it."""
     return [
-        *_rows('camera in flange', found.camera, found.stderr[:6]),
-        *_rows('target in base', found.target, found.stderr[6:12]),
+        *_rows(found.places[0], found.camera, found.stderr[:6]),
+        *_rows(found.places[1], found.target, found.stderr[6:12]),
     ]
 
 
 def hand_eye_warnings(found: HandEye) -> list[str]:
     """Return what there is to say against the poses."""
     warnings, factor = [], max(found.scale, 1 / found.scale)
+    if found.fixed_camera:
+        warnings.append(
+            'the poses are those of a flange that carries the target before a fixed camera; if it '
+            'carries the camera, they are inverted: give the flange in the base'
+        )
     if factor > _MAX_SCALE:
         longer = 'the poses' if found.scale < 1 else 'the target'
         likely = f': {longer} may be in mm' if factor > _MIN_MM else ''

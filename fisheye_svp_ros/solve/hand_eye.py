@@ -1,5 +1,8 @@
 """Hand-eye calibration: where a camera sits in the flange of a robot, and the target in its base.
 
+Or, the other way round, where a fixed camera stands in the base, and the target on the flange:
+that is the same with the inverses of the flange's poses.  Both are solved, the likelier is fitted.
+
 The robot states poses of its flange in its base; the images state poses of the camera in the
 target.  One transform each, one scale of lengths, and the noise of the robot's poses, in m and
 rad, are fitted together with poses, intrinsics and effects; the two variances are those that the
@@ -38,7 +41,9 @@ from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 PARAMETERS = 13  # camera in flange, target in base, scale
 MIN_FRAMES = 4
 _MIN_TURN = 1e-3  # second singular value of the turns relative to the first: two axes
-_MAX_SHARE = 0.3  # of the camera's distance, and of a radian: more is no noise of a robot
+_MAX_SHARE, _MAX_TURN = 0.03, 0.05  # of the camera's distance, and rad: more is no robot's noise
+_MIN_ODDS = 20.0  # of an arrangement against the other
+MAX_ODDS = 1e6  # what is more is as good as certain
 _MIN_NOISE = 1e-7  # m, rad: what is written has no more digits
 _ROUNDS = 40
 _TOLERANCE = 1e-3  # relative, of the noise
@@ -67,10 +72,12 @@ class Transforms(NamedTuple):
 class HandEye:
     """A hand-eye calibration.
 
-    camera: in the flange; target: in the base; scale: of the robot's lengths to those of the
-    target; covariance (13, 13): of the changes of the two in `Pose.retract` and of the scale;
-    noise_m, noise_rad: standard deviations of the robot's poses, one axis; frame (F,): the frames
-    that have a pose; residual (F, 6): flange by the images minus flange by the robot, m, rad.
+    camera: in the flange; target: in the base; or, of a fixed camera, camera: in the base; target:
+    in the flange; odds: of this arrangement against the other, MAX_ODDS at most; scale: of the
+    robot's lengths to those of the target; covariance (13, 13): of the changes of the two in
+    `Pose.retract` and of the scale; noise_m, noise_rad: standard deviations of the robot's poses,
+    one axis; frame (F,): the frames that have a pose; residual (F, 6): flange by the images minus
+    flange by the robot, m, rad.
     """
 
     camera: Pose
@@ -81,6 +88,15 @@ class HandEye:
     noise_rad: float
     frame: Index
     residual: Array
+    fixed_camera: bool = False
+    odds: float = MAX_ODDS
+
+    @property
+    def places(self) -> tuple[str, str]:
+        """What the two transforms are called."""
+        if self.fixed_camera:
+            return 'camera in base', 'target in flange'
+        return 'camera in flange', 'target in base'
 
     @property
     def stderr(self) -> Array:
@@ -100,9 +116,11 @@ class HandEye:
                 'quaternion': quaternion_from_rotation(pose.rotation).tolist(),
             }
 
+        camera, target = (place.replace(' ', '_') for place in self.places)
         return {
-            'camera_in_flange': entry(self.camera),
-            'target_in_base': entry(self.target),
+            camera: entry(self.camera),
+            target: entry(self.target),
+            'odds': self.odds,
             'scale': self.scale,
             'covariance': self.covariance.tolist(),
             'noise_m': self.noise_m,
@@ -184,17 +202,14 @@ def fit_hand_eye(
     `known` (F,), which have a pose of the robot.
     Raises GeometryError where the poses do not determine the transform, or fit none.
     """
-    start = solve_hand_eye(state.pose.take(known), flange.take(known))
     linear = Linearization(data, state, free)
     unknowns = 6 * data.frames + linear.shared_columns.shape[-1]
     given = bool(np.isfinite(data.observations.sigma).all())
     sigma = (
         1.0 if given else noise_sigma(linear.sum_of_squares, int(linear.row_mask.sum()), unknowns)
     )
-    robot = _Robot(flange, known, sigma)
-    residual = robot.residual(start, state.pose)[known]
-    noise = np.maximum(np.sqrt((residual.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2))), _MIN_NOISE)
-    _check_noise(noise, state.pose)
+    start, robot, noise, odds = _likelier_arrangement(state.pose, flange, known, sigma)
+    _check_noise(noise, state.pose.take(known), odds)
     for _ in range(_ROUNDS):
         problem = _HandEyeAdjustment(data, state, free, robot, noise)
         found = levenberg_marquardt(problem, problem.pack_all(state, start))
@@ -212,30 +227,75 @@ def fit_hand_eye(
         float(noise[1]),
         _frame_numbers(data)[known],
         robot.residual(start, state.pose)[known],
+        robot.fixed_camera,
+        odds,
     )
 
 
-def _check_noise(noise: Array, camera: Pose) -> None:
+def _likelier_arrangement(
+    camera: Pose, flange: Pose, known: Mask, sigma: float
+) -> tuple[Transforms, _Robot, Array, float]:
+    """Return transforms, robot and noise (2,) with the camera on the flange, or with the target.
+
+    And the odds of that arrangement against the other: both have as many parameters, so that they
+    are those of the noise that each leaves.
+    """
+    found: list[tuple[float, Transforms, _Robot, Array]] = []
+    problem: GeometryError | None = None
+    freedom = 3 * int(known.sum()) - PARAMETERS / 2  # of positions, and of turns
+    for fixed in (False, True):
+        stated = flange.inverse() if fixed else flange
+        try:
+            start = solve_hand_eye(camera.take(known), stated.take(known))
+        except GeometryError as cause:
+            problem = problem or cause
+            continue
+        robot = _Robot(flange, known, sigma, fixed)
+        off = robot.residual(start, camera)[known].reshape(-1, 2, 3)
+        noise = np.maximum(np.sqrt((off**2).mean(axis=(0, 2))), _MIN_NOISE)
+        # Of the robot, in its own lengths: a scale near zero would explain any position.
+        own = noise / [max(abs(start.scale), _MIN_NOISE), 1.0]
+        found.append((-freedom * float(np.log(own).sum()), start, robot, noise))
+    if not found:
+        assert problem is not None
+        raise problem
+    likelihood, start, robot, noise = max(found, key=lambda one: one[0])
+    other = min(one[0] for one in found) if len(found) > 1 else -np.inf
+    odds = min(float(np.exp(min(likelihood - other, 100.0))), MAX_ODDS)
+    return start, robot, noise, odds
+
+
+def _check_noise(noise: Array, camera: Pose, odds: float) -> None:
     distance = float(np.median(np.linalg.norm(camera.position, axis=1)))
-    if noise[0] > _MAX_SHARE * distance or noise[1] > _MAX_SHARE:
+    if noise[0] > _MAX_SHARE * distance or noise[1] > _MAX_TURN:
         raise GeometryError(
-            f'no hand-eye transform explains the poses of the robot: {1000 * noise[0]:.0f} mm and '
-            f'{np.degrees(noise[1]):.1f} degrees are left; check that frames, units and the order '
-            'of the quaternion (x, y, z, w) belong together'
+            'no hand-eye transform explains the poses of the robot, with camera or target on the '
+            f'flange: {1000 * noise[0]:.0f} mm and {np.degrees(noise[1]):.1f} degrees are left; '
+            'check that frames, units and the order of the quaternion (x, y, z, w) belong together'
+        )
+    if odds < _MIN_ODDS:
+        raise GeometryError(
+            'the poses of the robot do not show whether camera or target is on the flange (odds '
+            f'{odds:.2g} to 1); turn the flange farther, and take more poses'
         )
 
 
 class _Robot(NamedTuple):
-    """Poses of the flange (F,), the frames that have one, and the noise of the images, px."""
+    """Poses of the flange (F,), the frames that have one, and the noise of the images, px.
+
+    fixed_camera: the target is on the flange, so that the transforms give the flange's inverse.
+    """
 
     flange: Pose
     known: Mask
     sigma: float
+    fixed_camera: bool = False
 
     def residual(self, transforms: Transforms, camera: Pose) -> Array:
         """Return flange by the images minus flange by the robot (F, 6), zero where unknown."""
         stated = Pose(self.flange.rotation, transforms.scale * self.flange.position)
-        off = transforms.flange(camera).difference(stated)
+        found = transforms.flange(camera)
+        off = (found.inverse() if self.fixed_camera else found).difference(stated)
         return np.where(self.known[:, None], off, 0.0)
 
     def columns(self, transforms: Transforms, camera: Pose) -> tuple[Array, Array]:
@@ -243,19 +303,32 @@ class _Robot(NamedTuple):
         found = transforms.flange(camera)
         base = np.broadcast_to(transforms.target.rotation, found.rotation.shape)
         lever = cross_matrix(found.rotation @ transforms.camera.position)
-        turned = log_derivative(self.residual(transforms, camera)[:, 3:])
         frame = np.zeros((len(base), 6, 6))
-        frame[:, :3, :3], frame[:, :3, 3:], frame[:, 3:, 3:] = base, lever @ base, turned @ base
+        frame[:, :3, :3], frame[:, :3, 3:], frame[:, 3:, 3:] = base, lever @ base, base
         shared = np.zeros((len(base), 6, PARAMETERS))
         shared[:, :3, :3] = -found.rotation
         shared[:, :3, 3:6] = -found.rotation @ cross_matrix(transforms.camera.position)
-        shared[:, 3:, 3:6] = -turned @ found.rotation
+        shared[:, 3:, 3:6] = -found.rotation
         shared[:, :3, 6:9] = np.eye(3)
         shared[:, :3, 9:12] = -cross_matrix(found.position - transforms.target.position)
-        shared[:, 3:, 9:12] = turned
+        shared[:, 3:, 9:12] = np.eye(3)
+        if self.fixed_camera:
+            inverse = _inverse_derivative(found)
+            frame, shared = inverse @ frame, inverse @ shared
+        turned = log_derivative(self.residual(transforms, camera)[:, 3:])
+        frame[:, 3:], shared[:, 3:] = turned @ frame[:, 3:], turned @ shared[:, 3:]
         shared[:, :3, 12] = -self.flange.position
         mask = self.known[:, None, None]
         return np.where(mask, frame, 0.0), np.where(mask, shared, 0.0)
+
+
+def _inverse_derivative(pose: Pose) -> Array:
+    """Return the change (F, 6, 6) of the inverses of poses (F,) by that of the poses."""
+    inverse = pose.inverse()
+    change = np.zeros((len(inverse.position), 6, 6))
+    change[:, :3, :3] = change[:, 3:, 3:] = -inverse.rotation
+    change[:, :3, 3:] = -inverse.rotation @ cross_matrix(pose.position)
+    return change
 
 
 class _HandEyeAdjustment(Adjustment):

@@ -124,7 +124,7 @@ def calibrate_port(
 def calibrate_hand_eye(
     found: Calibration, observations: Observations, poses: dict[int, Pose]
 ) -> tuple[Calibration, HandEye]:
-    """Fit a calibrated lens anew, together with the robot that carried the camera.
+    """Fit a calibrated lens anew, together with the robot that carried the camera, or the target.
 
     found: the calibration of the observations without poses; poses: of the flange, by frame; a
     frame may have none.
@@ -139,7 +139,7 @@ def calibrate_hand_eye(
     except GeometryError as cause:
         raise ObservationError(
             f'{observations.source}: the given poses are not those of a flange '
-            f'that carries the camera: {cause}'
+            f'that carries the camera or the target: {cause}'
         ) from cause
     linear = Linearization(data, state, names)
     # The covariances stay those of the images alone, which are no smaller.

@@ -29,15 +29,18 @@ def robot(
     noise: tuple[float, float] = (3e-4, 1e-3),
     lens: Lens = LENS,
     truth: Transforms = TRUTH,
+    fixed_camera: bool = False,
 ) -> tuple[Observations, Pose, dict[int, Pose]]:
     """Return observations, poses of the camera (F,), and the robot's poses of its flange.
 
-    noise: of the robot, m and rad.
+    noise: of the robot, m and rad; fixed_camera: the robot carries the target, so that the truth
+    is of the camera in the base, and of the target in the flange.
     """
     rng = np.random.default_rng(seed)
     camera = poses_around(plane(), frames, rng, widest=1.1)
     table = simulate(ForwardModel(lens), plane(), camera, 0.1, rng)
     stated = truth.flange(camera)
+    stated = stated.inverse() if fixed_camera else stated
     stated = Pose(stated.rotation, stated.position / truth.scale).retract(
         rng.normal(size=(frames, 6)) * np.repeat(noise, 3)
     )

@@ -11,10 +11,16 @@ from helpers.robot import LENS, TRUTH, robot
 
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
-from fisheye_svp_ros.reporting.calibration_text import hand_eye_warnings
+from fisheye_svp_ros.reporting.calibration_text import (
+    hand_eye_rows,
+    hand_eye_sentence,
+    hand_eye_warnings,
+)
 from fisheye_svp_ros.solve.hand_eye import (
+    MAX_ODDS,
     HandEye,
     Transforms,
+    _check_noise,
     _Robot,
     fit_hand_eye,
     flange_poses,
@@ -71,10 +77,11 @@ def test_a_camera_whose_own_poses_are_known_is_at_the_flange() -> None:
     assert found.noise_m < 5e-5
 
 
-def test_derivatives() -> None:
-    _, camera, poses = robot(2, frames=5)
+@pytest.mark.parametrize('fixed_camera', [False, True])
+def test_derivatives(fixed_camera: bool) -> None:
+    _, camera, poses = robot(2, frames=5, fixed_camera=fixed_camera)
     known = np.array([True, True, False, True, True])
-    one = _Robot(Pose.stack(list(poses.values())), known, 1.0)
+    one = _Robot(Pose.stack(list(poses.values())), known, 1.0, fixed_camera)
     frame, shared = one.columns(TRUTH, camera)
 
     def moved(change: np.ndarray) -> np.ndarray:
@@ -153,5 +160,43 @@ def test_poses_of_other_frames_are_refused() -> None:
     table, _, poses = robot(6)
     alone = calibrate(table, 'kannala_brandt', (1280, 960), ('f', 'cx', 'cy', 'k1'))
     shuffled = dict(zip(poses, [poses[(7 * i + 3) % 18] for i in range(18)], strict=True))
-    with pytest.raises(ObservationError, match='not those of a flange that carries the camera'):
+    with pytest.raises(ObservationError, match='not those of a flange that carries the camera or'):
         calibrate_hand_eye(alone, table, shuffled)
+
+
+@pytest.mark.parametrize('fixed_camera', [False, True])
+@pytest.mark.parametrize('noise', [(3e-4, 1e-3), (3e-3, 1e-2)])
+def test_the_arrangement_is_found_with_its_errors(
+    noise: tuple[float, float], fixed_camera: bool
+) -> None:
+    found = [fit(seed, noise=noise, fixed_camera=fixed_camera)[1] for seed in range(8)]
+    assert all(one.fixed_camera == fixed_camera and one.odds == MAX_ODDS for one in found)
+    z = np.array([errors(one) / one.stderr for one in found])
+    assert 0.75 < np.sqrt((z**2).mean()) < 1.3
+    sizes = np.array([(one.noise_m, one.noise_rad) for one in found])
+    np.testing.assert_allclose(np.sqrt((sizes**2).mean(axis=0)), noise, rtol=0.2)
+    written = found[0].to_dict()
+    assert ('camera_in_base' in written) == fixed_camera
+    assert ('target_in_base' in written) != fixed_camera
+
+
+def test_a_fixed_camera_is_told_with_its_odds() -> None:
+    found = fit(3, fixed_camera=True)[1]
+    assert 'which carries the target, the camera is fixed (odds more than 1e+06 to 1)' in (
+        hand_eye_sentence(found)
+    )
+    assert [row[0] for row in hand_eye_rows(found)][::2] == ['camera in base', 'target in flange']
+    (warning,) = hand_eye_warnings(found)
+    assert 'if it carries the camera, they are inverted' in warning
+    assert 'which carries the camera (odds more than' in hand_eye_sentence(fit(3)[1])
+
+
+@pytest.mark.parametrize('fixed_camera', [False, True])
+def test_noise_that_no_robot_has_is_refused(fixed_camera: bool) -> None:
+    with pytest.raises(GeometryError, match='with camera or target on the flange'):
+        fit(4, noise=(0.06, 0.15), fixed_camera=fixed_camera)
+
+
+def test_poses_that_show_no_arrangement_are_refused() -> None:
+    with pytest.raises(GeometryError, match='whether camera or target is on the flange'):
+        _check_noise(np.array([1e-3, 1e-3]), robot(1)[1], 3.0)
