@@ -10,6 +10,7 @@ from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
 from fisheye_svp_ros.diagnosis.problem import Inputs, prepare_problem
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
+from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
 from fisheye_svp_ros.solve.hand_eye import Transforms
 
 pytestmark = pytest.mark.usefixtures('undrawn')
@@ -30,7 +31,7 @@ def test_no_cause_in_the_lens_comes_from_a_robot(truth: Transforms) -> None:
     assert robot_found is not None
     off = robot_found.camera.difference(truth.camera) / robot_found.stderr[:6]
     assert (np.abs(off) < 4).all()
-    written = found.to_dict()['hand_eye']
+    written = diagnosis_document(found)['hand_eye']
     assert written['camera_in_flange']['position'] == robot_found.camera.position.tolist()
 
 
