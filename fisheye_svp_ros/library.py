@@ -48,6 +48,7 @@ from fisheye_svp_ros.rectify.cameras import camera_for
 from fisheye_svp_ros.rectify.maps import RANGE, Rectification, RectifiedPair, rectify_pair
 from fisheye_svp_ros.scene.observations import STEREO, Observations, stereo_views
 from fisheye_svp_ros.scene.rigs import BASELINE, rig
+from fisheye_svp_ros.scene.table_checks import check_sigma
 from fisheye_svp_ros.simulate import scenario as scenarios
 from fisheye_svp_ros.solve import lens_calibration, stereo_calibration
 from fisheye_svp_ros.solve.measured_poses import localize_measured, rms_px, sigma_known
@@ -433,7 +434,7 @@ def table_of(given: AnyObservations) -> Observations:
         raise ParameterError(
             f'observations are of type {type(given).__name__}; a table or a path is needed'
         )
-    return given if isinstance(given, Observations) else read_observations(given)
+    return check_sigma(given) if isinstance(given, Observations) else read_observations(given)
 
 
 def check_images(given: AnyObservations, lenses: Mapping[str, Lens]) -> None:

@@ -21,6 +21,7 @@ from fisheye_svp_ros.commands.detect import (
 from fisheye_svp_ros.commands.lenses import add_port_arguments, load_with_notes, port_of
 from fisheye_svp_ros.commands.notes import (
     counted,
+    note_copies,
     note_gross_errors,
     note_huge,
     note_reader_limit,
@@ -51,6 +52,7 @@ from fisheye_svp_ros.reporting.calibration_text import (
 )
 from fisheye_svp_ros.reporting.terminal import print_table, progress, stages
 from fisheye_svp_ros.scene.observations import Observations, list_frames, rig_cameras
+from fisheye_svp_ros.scene.table_checks import check_frames_differ, remove_copies
 from fisheye_svp_ros.solve.lens_calibration import (
     Calibration,
     calibrate,
@@ -131,6 +133,9 @@ def run(args: argparse.Namespace) -> None:
     sizes = _known_sizes(args, observations, sizes)
     if not args.board:
         note_side_by_side(observations, sizes)
+    check_frames_differ(observations)
+    given, (observations, again) = observations, remove_copies(observations)
+    note_copies(given, again)
     if args.output:
         _check_output(args, observations)
     found: dict[str, CalibratedCamera] = {}
@@ -270,9 +275,10 @@ def _calibrate_camera(
         with stages(f'{values}; computing their standard errors'):
             trusted = assess_lens(kept, result.adjusted.lens, result.adjusted.names)
     except np.linalg.LinAlgError as cause:
+        remedy = 'check --port and --medium' if port else 'add views from other sides'
         raise GeometryError(
             f'{table.source}: the fitted lens has no rays to some of the observed '
-            f'points ({cause}); check --port and --medium'
+            f'points ({cause}); {remedy}'
         ) from cause
     lens = with_covariance(result.adjusted.lens, trusted)
     return CalibratedCamera(lens, result, trusted, kept, args.model, hand_eye, gross.landmarks)

@@ -317,7 +317,9 @@ def refit(data: RigViews, state: RigState, free: Sequence[str], variances: Varia
 
     All steps are solved with the equations of the first: its columns change little.
     """
-    fitted = FittedModel.of_state(Linearization(data, state, free), variances)
+    linear = Linearization(data, state, free)
+    linear.check_images()
+    fitted = FittedModel.of_state(linear, variances)
     eq = fitted.factored.equations
 
     def solve(residual: Array, state: RigState) -> tuple[Array, Array]:

@@ -159,6 +159,7 @@ class NullModel:
     ) -> NullModel:
         """Return the model before any variance is known; alive: its components, None for all."""
         linear = Linearization(data, state, free)
+        linear.check_images()
         fixed, random = FixedColumns.gather(linear, left_out), make_random_effects(linear, finest)
         if alive is not None:
             random = random.select(alive)

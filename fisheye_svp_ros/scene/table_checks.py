@@ -7,14 +7,37 @@ from itertools import combinations
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras, select_cameras
 
 ROUNDING = 1e-7  # px: what is simulated without noise scatters by less, nothing measured does
+_MIN_SIGMA, _MIN_SIGMA_SHARE = 1e-6, 1e-3  # px, and of the median
+SIGMA_BOUND = f'{_MIN_SIGMA:g} px or more, and {_MIN_SIGMA_SHARE:g} of the median or more'
 _COPIED_SHARE = 0.5  # of the image points: no two photographs have so many alike
 _PLACE_TOLERANCE = 1e-3  # of a target's extent: more than places that are written less exactly
 _MANY_POINTS, _MIN_POINTS = 1500, 24  # of a thinned table, and of a view that stays whole
+
+
+def too_exact(sigma: Array) -> Mask:
+    """Return which standard deviations (N,), px, no detector has beside the others.
+
+    So large a weight leaves nothing else to be seen.
+    """
+    known = sigma[np.isfinite(sigma)]
+    typical = float(np.median(known)) if len(known) else 0.0
+    return np.asarray(sigma < max(_MIN_SIGMA, _MIN_SIGMA_SHARE * typical))
+
+
+def check_sigma(table: Observations) -> Observations:
+    """Return the table; raise ObservationError for a sigma that no detector has."""
+    bad = np.flatnonzero(too_exact(table.sigma))
+    if len(bad):
+        raise ObservationError(
+            f'{table.source}: sigma of frame {table.frame[bad[0]]}, landmark '
+            f'{table.landmark[bad[0]]} is {table.sigma[bad[0]]:g} px; {SIGMA_BOUND} is needed'
+        )
+    return table
 
 
 def order_cameras(table: Observations, cameras: tuple[str, ...]) -> Observations:
@@ -47,6 +70,16 @@ def check_distinct(observations: Observations, other: Observations) -> None:
         raise ObservationError(
             f'{other.source}: these image points are those of '
             f'{observations.source}; other photographs are needed'
+        )
+
+
+def check_frames_differ(observations: Observations) -> None:
+    """Raise ObservationError where all frames of a camera repeat the image points of one."""
+    kept, again = remove_copies(observations)
+    if again and len(kept.frames) == 1:
+        raise ObservationError(
+            f'{observations.source}: {len(again)} frames repeat the image points of frame '
+            f'{kept.frames[0]}; take photographs of the target from other sides'
         )
 
 

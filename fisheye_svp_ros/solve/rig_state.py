@@ -11,6 +11,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.base import Effect, Scene, noise_scale
 from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews, Term
+from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, intrinsic_names, parameter_values
 from fisheye_svp_ros.pose import Pose, cross_matrix
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
@@ -220,6 +221,16 @@ class Linearization:
             self._d_pose = self._d_pose @ turn[:, None]
         self._camera = pose  # (S,) in the frame of the first board, as the derivatives by it
         self.frame_columns = self.whiten(self._frame_columns())
+
+    def check_images(self) -> None:
+        """Raise GeometryError where the state has no image of some of the points."""
+        lost = self.row_mask & ~np.isfinite(self.residual)
+        if lost.any():
+            named = ', '.join(effect.name for effect, _ in self.state.terms)
+            raise GeometryError(
+                f'{int(lost.sum() + 1) // 2} points lie out of sight of the fitted lens'
+                + (f' with {named}' if named else '')
+            )
 
     @cached_property
     def shared_columns(self) -> Array:

@@ -22,6 +22,7 @@ from fisheye_svp_ros.mixed_model import pseudo_inverse
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import Pose, axis_angle_between, identity
 from fisheye_svp_ros.scene.observations import Observations, views_of
+from fisheye_svp_ros.scene.table_checks import check_frames_differ
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state, localize_cameras
 from fisheye_svp_ros.solve.lens_calibration import Calibration
@@ -82,6 +83,7 @@ def calibrate_without_outliers(
     calibrate: fits a lens to some of the rows; starts: rough lenses, to find wrong landmarks with
     where it fails.  Returns the last lens, the rows that it is of, and those that are rejected.
     """
+    check_frames_differ(observations)
     result = _fit_if_possible(calibrate, observations)
     wrong = find_wrong_landmarks(
         observations,

@@ -1,0 +1,63 @@
+"""What no table can mean is refused in one line: sigma, and copies of one frame."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.robot import LENS
+from helpers.targets import plane, poses_around
+
+from fisheye_svp_ros import library
+from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import GeometryError, ObservationError
+from fisheye_svp_ros.io.csv_files import read, write_observations
+from fisheye_svp_ros.scene.table_checks import too_exact
+from fisheye_svp_ros.simulate.simulation import simulate
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import group_by_frame
+
+SIZE = (LENS.width, LENS.height)
+
+
+def table(frames=6):
+    rng = np.random.default_rng(1)
+    poses = poses_around(plane(), frames, rng, widest=0.8)
+    return simulate(ForwardModel(LENS), plane(), poses, 0.1, rng)
+
+
+def copied(frames):
+    """Return a table of copies of its first frame."""
+    first = table().take(table().frame == 0)
+    rows = first.take(np.tile(np.arange(len(first)), frames))
+    return replace(rows, frame=np.repeat(np.arange(frames), len(first)))
+
+
+def test_only_a_sigma_far_below_the_others_is_too_exact():
+    assert too_exact(np.array([0.1, 0.1, 0.1, 1e-9, 9e-5])).tolist() == 3 * [False] + 2 * [True]
+    assert not too_exact(np.array([0.1, 5.0, 2e-3, np.nan])).any()
+    assert not too_exact(np.full(3, 1e-5)).any() and not too_exact(np.full(3, np.nan)).any()
+
+
+@pytest.mark.parametrize('sigma', [1e-9, 1e-5])
+def test_a_sigma_that_no_detector_has_is_refused(sigma, tmp_path):
+    rows = table()
+    rows = replace(rows, sigma=np.where(rows.landmark == 3, sigma, rows.sigma))
+    write_observations(tmp_path / 'rows.csv', rows)
+    with pytest.raises(ObservationError, match=r'line \d+: sigma is .* of the median or more'):
+        read(tmp_path / 'rows.csv')
+    with pytest.raises(ObservationError, match='sigma of frame 0, landmark 3'):
+        library.localize(rows, LENS)
+
+
+def test_copies_of_one_frame_are_told():
+    with pytest.raises(ObservationError, match='4 frames repeat the image points of frame 0'):
+        library.calibrate(copied(5), 'equidistant', SIZE)
+
+
+def test_a_state_without_an_image_of_some_points_is_refused():
+    data = group_by_frame(table())
+    state = initial_state(data, LENS)
+    state.pose.position[0] += [0.0, 0.0, np.nan]
+    with pytest.raises(GeometryError, match='points lie out of sight of the fitted lens'):
+        NullModel.estimate(data, state, ())
