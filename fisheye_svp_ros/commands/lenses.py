@@ -239,6 +239,6 @@ def _glass(numbers: list[str]) -> dict[str, float]:
 
 def _length(text: str) -> float:
     """Return a length, m, of a text such as 5mm."""
-    if not text.endswith('mm'):
+    if text.removesuffix('mm') == text:
         raise ValueError(text)
     return 1e-3 * float(text.removesuffix('mm'))

@@ -16,11 +16,10 @@ from fisheye_svp_ros.diagnosis.causes import CONFOUNDED_P, Cause
 from fisheye_svp_ros.diagnosis.checks.two_cameras import Transfer, TwoCameras, deviations
 from fisheye_svp_ros.diagnosis.checks.two_datasets import TwoDatasets
 from fisheye_svp_ros.diagnosis.conclusion import (
-    DIAGNOSE_AIR,
     RETAKE,
     TURNED,
     UNLIKE,
-    USE_EXTENDED,
+    Action,
     Advice,
     frames_of,
 )
@@ -43,18 +42,18 @@ from fisheye_svp_ros.diagnosis.decision import (
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import MAX_RMS_RATIO
+from fisheye_svp_ros.diagnosis.findings import Finding, Reason, Rival, Status
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
 from fisheye_svp_ros.diagnosis.model_errors import ErrorParts, LensErrors, pose_maps, pose_summary
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, can_be_included
 from fisheye_svp_ros.diagnosis.stages import diagnose, diagnose_against
-from fisheye_svp_ros.diagnosis.stepwise import NAMED_P, TraceStep
+from fisheye_svp_ros.diagnosis.stepwise import NAMED_P
 from fisheye_svp_ros.diagnosis.uncertainty import total_errors
 from fisheye_svp_ros.diagnosis.variance_budget import stage_shares
 
 __all__ = [
     'CONFOUNDED_P',
-    'DIAGNOSE_AIR',
     'MAX_RMS_RATIO',
     'MIN_FRAMES',
     'NAMED_P',
@@ -62,7 +61,7 @@ __all__ = [
     'SIGNIFICANCE',
     'TURNED',
     'UNLIKE',
-    'USE_EXTENDED',
+    'Action',
     'Advice',
     'Cause',
     'Comparison',
@@ -71,6 +70,7 @@ __all__ = [
     'DiagnosisOptions',
     'EffectTests',
     'ErrorParts',
+    'Finding',
     'LensErrors',
     'LensFacts',
     'LensReason',
@@ -78,10 +78,12 @@ __all__ = [
     'PhotographsFacts',
     'PhotographsReason',
     'PredictedOffsets',
+    'Reason',
+    'Rival',
+    'Status',
     'TargetError',
     'TargetFacts',
     'TargetReason',
-    'TraceStep',
     'Transfer',
     'TwoCameras',
     'TwoDatasets',

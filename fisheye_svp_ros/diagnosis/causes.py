@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,14 +34,22 @@ _PORT_UNITS = {
 }
 
 
+class Imitation(NamedTuple):
+    """An effect that a cause may stand for, and the ray error, rad, rms, that would remain."""
+
+    effect: str
+    ray_error: float
+
+
 @dataclass(frozen=True)
 class Cause:
     """One named cause with its parameters, evidence and what it may be mistaken for.
 
-    form: `Effect.key`; share: of the misfit of the simulation; survives: whether it is still
-    needed with any one other cause left out; heldout_rms_px, gain: of held-out frames once it is
-    in the model; refuted_by_frames: first and last frame of contiguous thirds that are predicted
-    worse with it.
+    form: `Effect.key`; p_value: corrected for the effects and forms that were tested; share: of
+    the misfit of the simulation; survives: whether it is still needed with any one other cause
+    left out; heldout_rms_px, gain: of held-out frames once it is in the model; imitations: effects
+    that are not tested and that it may stand for; refuted_by_frames: first and last frame of
+    contiguous thirds that are predicted worse with it.
     """
 
     form: str
@@ -51,8 +59,8 @@ class Cause:
     survives: bool
     heldout_rms_px: float
     gain: float
-    indistinguishable_from: list[str]
-    to_separate: str
+    indistinguishable_from: list[str] = field(default_factory=list)
+    imitations: tuple[Imitation, ...] = ()
     refuted_by_frames: tuple[tuple[int, int], ...] = ()
 
     @property
@@ -76,16 +84,6 @@ class Cause:
         return list(dict.fromkeys(name.partition('.')[0] for name in self.parameters))
 
 
-@dataclass(frozen=True)
-class UnconfirmedCause:
-    """An effect that is significant, and yet no confirmed cause; why: the reason."""
-
-    effect: str
-    parameters: dict[str, dict[str, Any]]
-    p_value: float
-    why: str
-
-
 def selected_causes(
     tests: EffectTests,
     found: Sequence[PlacedEffect],
@@ -97,19 +95,19 @@ def selected_causes(
     causes = []
     for (effect, columns, values), (rms, gain) in zip(found, held_out, strict=True):
         name = effect.name
-        parameters = parameters_of(effect, values, errors[columns])
         alike = confounded_effects(tests, name, columns)
+        score = tests.test_removal(tests.null.included_columns, columns, effect)
         causes.append(
             Cause(
-                effect.key,
-                parameters,
-                tests.test_removal(tests.null.included_columns, columns, effect).p_value,
-                shares[name],
-                _survives(tests, effect, columns),
-                rms,
-                gain,
-                alike,
-                '; '.join([effect.to_separate, *_look_alike_texts(tests, alike, columns)]),
+                form=effect.key,
+                parameters=parameters_of(effect, values, errors[columns]),
+                p_value=tests.correct(effect, score.p_value),
+                share=shares[name],
+                survives=_survives(tests, effect, columns),
+                heldout_rms_px=rms,
+                gain=gain,
+                indistinguishable_from=alike,
+                imitations=_imitations(tests, alike, columns),
             )
         )
     return causes
@@ -135,26 +133,24 @@ def medium_cause(medium: Medium, stderr: dict[str, float], rms: float, gain: flo
         if name in (MEDIUM_INDEX, *medium.names)
     }
     return Cause(
-        f'{FlatPortEffect.name}(medium)',
-        parameters,
-        medium.p_value,
-        medium.share,
-        True,
-        rms,
-        gain,
-        [RadialProfileEffect.name] if medium.alike else [],
-        FlatPortEffect.to_separate,
+        form=f'{FlatPortEffect.name}(medium)',
+        parameters=parameters,
+        p_value=medium.p_value,
+        share=medium.share,
+        survives=True,
+        heldout_rms_px=rms,
+        gain=gain,
+        indistinguishable_from=[RadialProfileEffect.name] if medium.alike else [],
     )
 
 
-def _look_alike_texts(tests: EffectTests, alike: Sequence[str], columns: Index) -> list[str]:
-    """Return how to tell a cause from effects that are not tested, and what they would leave."""
-    return [
-        f'{effect.to_separate}; if it is a {effect.name}, a ray error of '
-        f'{1e3 * _error_of_imitation(tests, at, columns):.2g} mrad remains'
+def _imitations(tests: EffectTests, alike: Sequence[str], columns: Index) -> tuple[Imitation, ...]:
+    """Return the effects that are not tested and that a cause may stand for."""
+    return tuple(
+        Imitation(effect.name, _error_of_imitation(tests, at, columns))
         for effect, at in tests.null.look_alikes
         if effect.name in alike
-    ]
+    )
 
 
 def _error_of_imitation(tests: EffectTests, true: Index, columns: Index) -> float:
@@ -185,11 +181,11 @@ def parameters_of(effect: Effect, values: Array, errors: Array) -> dict[str, dic
 
 def _survives(tests: EffectTests, effect: Effect, columns: Index) -> bool:
     """Whether an effect is needed whichever one other cause is left out."""
-    factor = tests.effect_count
     for _, other, _ in tests.null.terms:
         included = np.setdiff1d(tests.null.included_columns, other)
         if not np.array_equal(other, columns) and (
-            tests.test_removal(included, columns, effect).p_value * factor > SIGNIFICANCE
+            tests.correct(effect, tests.test_removal(included, columns, effect).p_value)
+            > SIGNIFICANCE
         ):
             return False
     return True
@@ -228,7 +224,13 @@ def _plain_cause(
     """Return a cause that moves no prediction: it lies in the table or in the noise."""
     parameters = {part: {'value': value, 'stderr': stderr, 'unit': unit}}
     return Cause(
-        name, parameters, p_value, 0.0, True, float('nan'), 0.0, [], CATALOGUE[name].to_separate
+        form=name,
+        parameters=parameters,
+        p_value=p_value,
+        share=0.0,
+        survives=True,
+        heldout_rms_px=float('nan'),
+        gain=0.0,
     )
 
 

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from typing import Any
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Index
-from fisheye_svp_ros.diagnosis.causes import Cause, UnconfirmedCause
+from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
 from fisheye_svp_ros.diagnosis.cross_validation import gain_and_confidence
@@ -29,9 +30,9 @@ from fisheye_svp_ros.diagnosis.decision import (
 )
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
+from fisheye_svp_ros.diagnosis.findings import Finding
 from fisheye_svp_ros.diagnosis.lens_evidence import compare_lens_files, find_bounds, find_lens_rays
 from fisheye_svp_ros.diagnosis.random_effects import SAG
-from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
 from fisheye_svp_ros.diagnosis.variance_budget import Component
 from fisheye_svp_ros.effects.target_map import board_maps
 from fisheye_svp_ros.optics.lens import Lens
@@ -40,32 +41,66 @@ from fisheye_svp_ros.solve.outliers import FRAME, VIEW, Outliers
 from fisheye_svp_ros.solve.ray_errors import RayError
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
 
-DIAGNOSE_AIR = (
-    'diagnose the photographs in air first, then these with the extended lens of that '
-    'run: the lens already has errors in air'
-)
-USE_EXTENDED = 'solve with the extended lens file'
 RETAKE, UNLIKE, TURNED = 'retake', 'unlike', 'turned'
 _OUTSTANDING_RATIO = 2.0  # times the typical one
 _MAX_LISTED = 8
 _MIN_SAG = 0.05  # mm
 
 
+class Action(Enum):
+    """What there is to do."""
+
+    USE_EXTENDED = 1
+    DIAGNOSE_AIR = 2
+    CALIBRATE_AIR = 3
+    MEASURE_BOARD = 4
+    MEASURE_LANDMARKS = 5
+    SUPPORT_BOARD = 6
+    VARY_VIEWS = 7
+    RETAKE = 8
+    CHECK_VIEWS = 9  # most points of one view are outliers
+    CHECK_FRAMES = 10
+    CHECK_HELD_OUT_VIEWS = 11
+    CHECK_HELD_OUT_FRAMES = 12
+    CHECK_HELD_OUT_RIG = 13
+    HOLD_OUT_SAME_TARGET = 14
+    TAKE_MORE_LIKE_THESE = 15
+    NUMBER_LIKE_OTHERS = 16  # they were reordered
+    CHECK_NUMBERS = 17  # they were not
+    SEPARATE_CAUSE = 18
+
+
+_KINDS = {
+    Action.RETAKE: RETAKE,
+    Action.CHECK_VIEWS: RETAKE,
+    Action.CHECK_FRAMES: RETAKE,
+    Action.TAKE_MORE_LIKE_THESE: UNLIKE,
+    Action.NUMBER_LIKE_OTHERS: TURNED,
+    Action.CHECK_NUMBERS: TURNED,
+}
+
+
 @dataclass(frozen=True)
 class Advice:
     """One thing to do: what, to which frames, landmarks and boards; gain: of held-out variance.
 
-    photographs: the files of the frames, as far as they are known; kind: RETAKE, UNLIKE where
-    the other frames do not predict these, or TURNED where their board is numbered otherwise.
+    photographs: the files of the frames, as far as they are known; value: m of a sag, odds of a
+    turned board, s for which errors last; cause: which one, where it is about one.
     """
 
-    what: str
+    action: Action
     frames: list[int] = field(default_factory=list)
     photographs: list[str] = field(default_factory=list)
     landmarks: list[int] = field(default_factory=list)
     boards: list[int] = field(default_factory=list)
     gain: float = 0.0
-    kind: str = ''
+    value: float = 0.0
+    cause: Cause | None = None
+
+    @property
+    def kind(self) -> str:
+        """RETAKE, UNLIKE where others do not predict these, TURNED; '' of other advice."""
+        return _KINDS.get(self.action, '')
 
 
 def advise(
@@ -79,14 +114,14 @@ def advise(
     if any(part.name == SAG for part in parts):
         advice += _support_boards(evaluation)
     if evaluation.offsets.views is not None:
-        advice.append(_vary_views(evaluation.offsets.views))
+        advice.append(Advice(Action.VARY_VIEWS, value=evaluation.offsets.views.lasting))
     advice += _retake_frames(evaluation)
     advice += _check_photographs(
         selection.null.linear.data.observations, selection.revision.outliers
     )
     advice += _check_held_out(evaluation)
     advice += [
-        Advice(f'{cause.effect}: {cause.to_separate}')
+        Advice(Action.SEPARATE_CAUSE, cause=cause)
         for cause in causes
         if cause.stage in ('noise', 'frame') or cause.indistinguishable_from
     ]
@@ -98,24 +133,16 @@ def advise(
 
 def turn_advice(turned: Sequence[TurnedFrame]) -> list[Advice]:
     """Return what to do about photographs whose board is numbered from another end."""
-    words = (
-        (True, 'are', 'they were reordered like the others; number them so'),
-        (False, 'may be', 'they were not reordered; check them'),
-    )
     advice = []
-    for corrected, are, what in words:
+    for corrected, action in ((True, Action.NUMBER_LIKE_OTHERS), (False, Action.CHECK_NUMBERS)):
         mine = [one for one in turned if one.corrected == corrected]
         if mine:
-            least = min(one.odds for one in mine)
-            names = [one.photograph for one in mine if not one.photograph.startswith('frame ')]
             advice.append(
                 Advice(
-                    f'corners {are} numbered from another end of the board (odds '
-                    f'{least:.2g} to 1 or '
-                    f'more): {what}',
+                    action,
                     frames=[one.frame for one in mine],
-                    photographs=names,
-                    kind=TURNED,
+                    photographs=[one.photograph for one in mine if one.has_photograph],
+                    value=min(one.odds for one in mine),
                 )
             )
     return advice
@@ -125,7 +152,7 @@ def _use_causes(evaluation: Evaluation, causes: Sequence[Cause]) -> list[Advice]
     """Return what to do about causes of lens and target that held-out data confirm."""
     gains, advice = evaluation.gains, []
     if any(cause.stage == 'lens' for cause in causes) and gains['lens'].value > 0:
-        advice.append(Advice(USE_EXTENDED, gain=gains['lens'].value))
+        advice.append(Advice(Action.USE_EXTENDED, gain=gains['lens'].value))
     of_target = [cause for cause in causes if cause.stage == 'target']
     gain = gains['named'].value - max(gains['lens'].value, 0.0)
     if of_target and gain > 0:
@@ -137,7 +164,7 @@ def _use_causes(evaluation: Evaluation, causes: Sequence[Cause]) -> list[Advice]
         }
         advice.append(
             Advice(
-                'measure the board, or flatten or replace it',
+                Action.MEASURE_BOARD,
                 boards=sorted(boards),
                 gain=gain,
                 landmarks=[
@@ -156,12 +183,7 @@ def _support_boards(evaluation: Evaluation) -> list[Advice]:
     boards = evaluation.null.linear.scene.boards
     sizes = np.linalg.norm(evaluation.fitted.board_sags(), ord=2, axis=(1, 2))
     return [
-        Advice(
-            f'support the board or hold it upright: it bends by {size:.1f} mm between '
-            'lying face up '
-            'and upright',
-            boards=[board.id],
-        )
+        Advice(Action.SUPPORT_BOARD, boards=[board.id], value=1e-3 * float(size))
         for board, size in zip(boards, sizes, strict=True)
         if size > _MIN_SAG
     ]
@@ -176,39 +198,22 @@ def _check_held_out(evaluation: Evaluation) -> list[Advice]:
             [
                 _about_frames(
                     evaluation.null.linear.data.observations,
-                    'take more photographs like these: the others do not predict them. '
-                    'Either only they '
-                    'cover a part of the image, or they are wrong; the held-out rms excludes them',
+                    Action.TAKE_MORE_LIKE_THESE,
                     alone.tolist(),
-                    UNLIKE,
                 )
             ]
             if len(alone)
             else []
         )
     table = test.data.observations
-    advice = _check_photographs(table, test.outliers, 'held-out ')
+    advice = _check_photographs(table, test.outliers, held_out=True)
     if test.another_target:
-        advice.append(
-            Advice(
-                'hold out photographs of the same target: in these, landmarks of the same numbers '
-                'have other coordinates, so errors of the target are not predicted there'
-            )
-        )
+        advice.append(Advice(Action.HOLD_OUT_SAME_TARGET))
     if test.rig_differs:
         views = np.unique(np.stack([table.frame, table.camera]), axis=1)
         frames, count = np.unique(views[0], return_counts=True)
         shared = frames[count > 1].tolist()
-        advice.append(
-            _about_frames(
-                table,
-                'check these held-out photographs: their relative camera poses differ from the '
-                'others, so each view has its own pose. Check that the rig was not touched, '
-                'the cameras are not exchanged, simultaneous photographs have one number, and '
-                'points are numbered from the same end',
-                shared,
-            )
-        )
+        advice.append(_about_frames(table, Action.CHECK_HELD_OUT_RIG, shared))
     return advice
 
 
@@ -218,15 +223,9 @@ def _calibrate_in_air(medium: Medium, causes: Sequence[Cause]) -> list[Advice]:
     others = {cause.effect for cause in causes if cause.stage == 'lens'}
     told = medium.state.lens.uncertainty is not None  # by `diagnose`
     if not told and (medium.moved or len(others) > 1):
-        advice.append(Advice(DIAGNOSE_AIR))
+        advice.append(Advice(Action.DIAGNOSE_AIR))
     if medium.moved:
-        advice.append(
-            Advice(
-                'the lens was adjusted within the errors of its calibration in air: take '
-                'photographs '
-                'in air that fill the image, or measure the target better'
-            )
-        )
+        advice.append(Advice(Action.CALIBRATE_AIR))
     return advice
 
 
@@ -240,18 +239,7 @@ def _measure_landmarks(evaluation: Evaluation, gain: float) -> list[Advice]:
     chosen = [
         int(evaluation.offsets.landmark[i]) for i in order if far[i] > _OUTSTANDING_RATIO * typical
     ]
-    what = 'measure the landmarks of the target, first those that are displaced most'
-    return [Advice(what, landmarks=chosen, gain=gain)] if chosen else []
-
-
-def _vary_views(views: SimilarViews) -> Advice:
-    """Return what to do where landmarks err alike in similar views."""
-    soon = f' and taken within {views.lasting:.0f} s' if np.isfinite(views.lasting) else ''
-    return Advice(
-        'take photographs from more different poses: errors of landmarks repeat in similar '
-        f'ones{soon} and do not average out. Check that the paper is flat, nothing reflects, and '
-        'nothing is printed near the corners'
-    )
+    return [Advice(Action.MEASURE_LANDMARKS, landmarks=chosen, gain=gain)] if chosen else []
 
 
 def _retake_frames(evaluation: Evaluation) -> list[Advice]:
@@ -265,9 +253,8 @@ def _retake_frames(evaluation: Evaluation) -> list[Advice]:
         [
             _about_frames(
                 evaluation.null.linear.data.observations,
-                'take these photographs again: they scatter more than the others',
+                Action.RETAKE,
                 _frame_numbers(evaluation)[worst].tolist(),
-                RETAKE,
             )
         ]
         if len(bad)
@@ -281,8 +268,13 @@ def _frame_numbers(evaluation: Evaluation) -> Index:
     return data.views.frame[np.unique(data.frame_of, return_index=True)[1]]
 
 
-def _check_photographs(table: Observations, outliers: Outliers, where: str = '') -> list[Advice]:
+def _check_photographs(
+    table: Observations, outliers: Outliers, held_out: bool = False
+) -> list[Advice]:
     """Return the frames of which whole views are outliers, by reason."""
+    actions = {VIEW: Action.CHECK_VIEWS, FRAME: Action.CHECK_FRAMES}
+    if held_out:
+        actions = {VIEW: Action.CHECK_HELD_OUT_VIEWS, FRAME: Action.CHECK_HELD_OUT_FRAMES}
     off = {
         reason: sorted(
             {
@@ -291,18 +283,14 @@ def _check_photographs(table: Observations, outliers: Outliers, where: str = '')
                 if why == reason
             }
         )
-        for reason in (VIEW, FRAME)
+        for reason in actions
     }
     return [
-        _about_frames(
-            table, f'check these {where}photographs: {reason}', frames, '' if where else RETAKE
-        )
-        for reason, frames in off.items()
-        if frames
+        _about_frames(table, actions[reason], frames) for reason, frames in off.items() if frames
     ]
 
 
-def _about_frames(table: Observations, what: str, frames: list[int], kind: str = '') -> Advice:
+def _about_frames(table: Observations, action: Action, frames: list[int]) -> Advice:
     """Return what to do about frames of a table, with the photographs that they are."""
     known = {frame for frame, _, _ in table.photographs}
     names = [
@@ -311,7 +299,7 @@ def _about_frames(table: Observations, what: str, frames: list[int], kind: str =
         if frame in known
         for name in frame_names(table, frame)
     ]
-    return Advice(what, frames=frames, photographs=names, kind=kind)
+    return Advice(action, frames=frames, photographs=names)
 
 
 @dataclass(frozen=True)
@@ -325,7 +313,7 @@ class Conclusion:
     decision: dict[str, Decision]
     file: FileFigure
     ray_error: dict[str, dict[str, list[RayError]]]
-    candidates: list[UnconfirmedCause]
+    candidates: list[Finding]
 
     def ray_error_mrad(self) -> dict[str, Any]:
         """Return the expected ray errors, mrad, of the worst camera, and of each of several."""
@@ -355,7 +343,7 @@ def conclude(
     causes: Sequence[Cause],
     components: Sequence[Component],
     advice: Sequence[Advice],
-    candidates: list[UnconfirmedCause],
+    candidates: list[Finding],
     contradicted: bool,
 ) -> Conclusion:
     """Return what to do; contradicted: whether the cameras of a rig disagree about the target."""
@@ -400,9 +388,9 @@ def conclude(
 
 def advice_on_lens(advice: Sequence[Advice], conclusion: Conclusion) -> list[Advice]:
     """Return advice that agrees with the decision about the lens, what brings most first."""
-    rest = [one for one in advice if one.what != USE_EXTENDED]
+    rest = [one for one in advice if one.action is not Action.USE_EXTENDED]
     if conclusion.decision['lens'].say == 'use_extended':
-        rest.append(Advice(USE_EXTENDED, gain=conclusion.file.gain))
+        rest.append(Advice(Action.USE_EXTENDED, gain=conclusion.file.gain))
     return sorted(rest, key=lambda one: -one.gain)
 
 

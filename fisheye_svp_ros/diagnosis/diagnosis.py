@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.causes import Cause, UnconfirmedCause
+from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras
 from fisheye_svp_ros.diagnosis.checks.two_datasets import TwoDatasets
@@ -20,10 +20,10 @@ from fisheye_svp_ros.diagnosis.evaluation import (
     Figures,
     Intrinsic,
 )
+from fisheye_svp_ros.diagnosis.findings import Finding
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
 from fisheye_svp_ros.diagnosis.model_errors import ModelErrors
 from fisheye_svp_ros.diagnosis.problem import Problem
-from fisheye_svp_ros.diagnosis.stepwise import TraceStep
 from fisheye_svp_ros.diagnosis.variance_budget import REPEATED_COMPONENT, Component, Structure
 from fisheye_svp_ros.diagnosis.written_lens import AveragedModel
 from fisheye_svp_ros.effects.target_map import BoardMap, board_maps
@@ -44,7 +44,7 @@ class SearchRecord(NamedTuple):
     board is numbered from another end.
     """
 
-    trace: list[TraceStep]
+    trace: list[Finding]
     untestable: dict[str, str]
     gross: list[dict[str, Any]]
     cameras: list[TwoCameras]
@@ -106,7 +106,7 @@ class Diagnosis:
         return self.decision['lens'].say == 'recalibrate'
 
     @property
-    def candidates(self) -> list[UnconfirmedCause]:
+    def candidates(self) -> list[Finding]:
         """Effects that are significant, and not confirmed."""
         return self.conclusion.candidates
 
@@ -141,7 +141,7 @@ class Diagnosis:
         return self.evaluation.offsets
 
     @property
-    def trace(self) -> list[TraceStep]:
+    def trace(self) -> list[Finding]:
         """What was tried, and what came of it."""
         return self.record.trace
 

@@ -150,7 +150,7 @@ class EffectTests:
                 score = score._replace(p_value=float(special.chdtrc(1, max(gain, 0.0))) / 2)
             criterion = float(gain - count * np.log(null.full.rows))
             candidates.append(
-                Candidate(form, effect, score, self._correct(effect, score), criterion)
+                Candidate(form, effect, score, self.correct(effect, score.p_value), criterion)
             )
         return sorted(candidates, key=lambda candidate: -candidate.criterion)
 
@@ -171,15 +171,15 @@ class EffectTests:
             if not candidate.effect.per_frame:  # that one holds at any size of the variances
                 columns = self.null.form_columns(candidate.form)
                 score = self.adjust_p_value(candidate.score, included, columns, candidate.effect)
-                corrected = self._correct(candidate.effect, score)
+                corrected = self.correct(candidate.effect, score.p_value)
                 candidate = replace(candidate, score=score, corrected=corrected)
             if candidate.corrected < SIGNIFICANCE:
                 yield candidate
 
-    def _correct(self, effect: Effect, score: Score) -> float:
+    def correct(self, effect: Effect, p_value: float) -> float:
         """Return a p-value times the numbers of effects and of this one's forms (Bonferroni)."""
         count = self.null.fixed.forms.form_counts[effect.name]
-        return min(1.0, score.p_value * self.effect_count * count)
+        return min(1.0, p_value * self.effect_count * count)
 
     def adjust_p_value(
         self, score: Score, included: Index, columns: Index, effect: Effect | None = None

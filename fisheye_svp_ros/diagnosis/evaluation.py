@@ -376,7 +376,9 @@ class Evaluation:
         p_values = (
             component_significance(null)
             | {
-                effect.name: tests.test_removal(null.included_columns, columns, effect).p_value
+                effect.name: tests.correct(
+                    effect, tests.test_removal(null.included_columns, columns, effect).p_value
+                )
                 for effect, columns, _ in self.selection.causes
             }
             | dict(noise_causes)

@@ -18,6 +18,7 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes
 from fisheye_svp_ros.diagnosis.effect_forms import simplest_form
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
+from fisheye_svp_ros.diagnosis.findings import Finding
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
 from fisheye_svp_ros.diagnosis.null_model import (
     FINEST_FIELD,
@@ -27,7 +28,6 @@ from fisheye_svp_ros.diagnosis.null_model import (
 from fisheye_svp_ros.diagnosis.problem import Problem, Progress
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.stepwise import (
-    TraceStep,
     add_effects,
     eliminate_effects,
     find_single_landmarks,
@@ -79,7 +79,7 @@ class Selection:
     first: NullModel
     null: NullModel
     revision: Revision
-    trace: tuple[TraceStep, ...]
+    trace: tuple[Finding, ...]
     refuted: tuple[str, ...] = ()
 
     @property
@@ -102,7 +102,7 @@ class _Search:
     variances: Variances | None
     revision: Revision | None
     finest: bool
-    trace: tuple[TraceStep, ...]
+    trace: tuple[Finding, ...]
     refits_left: int
 
     def estimate_null_model(self, problem: Problem) -> NullModel:
@@ -158,9 +158,9 @@ def _change_effects(problem: Problem, search: _Search, null: NullModel, most: in
     """Remove effects and add others; where none changes, single landmarks that stand out."""
     tests, options = EffectTests(null), problem.options
     included, steps = eliminate_effects(tests, _known_effects(problem), options.quick)
-    gone = [step.name for step in steps]
+    gone = [step.effect for step in steps]
     # What was given up is not asked for again.
-    refused = {step.name for step in (*search.trace, *steps) if step.is_removal}
+    refused = {step.effect for step in (*search.trace, *steps) if step.is_removal}
     forms, tried = add_effects(tests, included, most, refused, options.quick)
     search = replace(search, trace=(*search.trace, *steps, *tried))
     if gone or forms:
@@ -210,7 +210,8 @@ def _revise_outliers(problem: Problem, search: _Search, fitted: FittedModel) -> 
     if 'noise_vs_angle' not in problem.options.left_out:
         growth = noise_growth(fitted)
         squares = squares / growth.variance
-        if growth.p_value * len(CATALOGUE) > SIGNIFICANCE:
+        growth = growth._replace(p_value=min(1.0, growth.p_value * len(CATALOGUE)))
+        if growth.p_value > SIGNIFICANCE:
             growth = None
     data, kept = reinstate_outliers(search.data, fitted, problem.outliers)
     data, outliers = reject_outliers(data, fitted, kept, squares)
@@ -255,7 +256,7 @@ def _finish(problem: Problem, search: _Search, null: NullModel) -> tuple[_Search
         )
         if not steps:
             return search, null
-        gone = [step.name for step in steps]
+        gone = [step.effect for step in steps]
         search = replace(
             search,
             state=_change_state(null, included, gone, ()),

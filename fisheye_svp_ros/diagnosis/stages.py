@@ -6,7 +6,7 @@ Before the last, causes that held-out frames refute, or another effect explains,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -15,7 +15,6 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.causes import (
     Cause,
-    UnconfirmedCause,
     confounded_effects,
     growth_cause,
     outlier_rows,
@@ -36,6 +35,7 @@ from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, cross_validate
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, SearchRecord
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
+from fisheye_svp_ros.diagnosis.findings import Finding, Reason, Rival, Status
 from fisheye_svp_ros.diagnosis.model_errors import with_uncertainty
 from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
 from fisheye_svp_ros.diagnosis.problem import (
@@ -61,10 +61,6 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.table_checks import ROUNDING, check_distinct, dither
 
 _FAR_SHIFT = 0.025  # m: no lens of a machine is known to move its viewpoint by more
-REFUTED_BY_FRAMES = 'held-out frames refute it'
-REFUTED_BY_FILE = 'the held-out file refutes it'
-NO_GAIN = 'its gain on held-out frames is not significant'
-NO_OTHER_FRAME = 'there is no other frame to confirm it'
 
 
 def diagnose(
@@ -170,7 +166,7 @@ class _EvaluationResult(NamedTuple):
     """
 
     evaluation: Evaluation
-    candidates: list[UnconfirmedCause]
+    candidates: list[Finding]
     cameras: list[TwoCameras]
     of_robot: bool
     turned: tuple[TurnedFrame, ...]
@@ -228,7 +224,7 @@ def _evaluate(inputs: Inputs, progress: Progress) -> _EvaluationResult:
 
 
 def _conclude(
-    evaluation: Evaluation, candidates: list[UnconfirmedCause], cameras: list[TwoCameras]
+    evaluation: Evaluation, candidates: list[Finding], cameras: list[TwoCameras]
 ) -> Diagnosis:
     """Return the diagnosis of an evaluated selection."""
     selection, averaged = evaluation.selection, evaluation.averaged_model
@@ -303,15 +299,35 @@ def _remaining(
 
 
 class _Doubt(NamedTuple):
-    """Why a cause is not confirmed; z: of what it gains on held-out frames."""
+    """A cause that is not confirmed; z: of what it gains on held-out frames."""
 
-    cause: PlacedEffect
     z: float
-    why: str
+    cause: PlacedEffect
+    reason: Reason
+    rival: Rival | None
 
 
-def _weakest_cause(evaluation: Evaluation) -> _Doubt | None:
-    """Return the cause that is confirmed least, if there is one that is not."""
+def _weakest_cause(evaluation: Evaluation) -> tuple[PlacedEffect, Finding] | None:
+    """Return the cause that is confirmed least and why it is not, if there is one."""
+    doubts = list(_doubts(evaluation))
+    if not doubts:
+        return None
+    _, cause, reason, rival = min(doubts, key=lambda one: one.z)
+    effect, columns, values = cause
+    tests = EffectTests(evaluation.null)
+    p_value = tests.test_removal(evaluation.null.included_columns, columns, effect).p_value
+    return cause, Finding(
+        form=effect.key,
+        reason=reason,
+        p_value=p_value,
+        p_corrected=tests.correct(effect, p_value),
+        parameters=parameters_of(effect, values, evaluation.errors[columns]),
+        rival=rival,
+    )
+
+
+def _doubts(evaluation: Evaluation) -> Iterator[_Doubt]:
+    """Yield the causes that are not confirmed."""
     selection, null = evaluation.selection, evaluation.null
     tests, full = EffectTests(null), cross_validate(null)
     kept = full.is_predictable
@@ -321,25 +337,24 @@ def _weakest_cause(evaluation: Evaluation) -> _Doubt | None:
         if not effect.per_frame
     ]
     other = None if evaluation.held_out is None else evaluation.predict()
-    doubts = []
     for cause in selection.causes:
         effect, columns, values = cause
         if effect.name in selection.problem.options.included or effect.per_frame:
             continue
-        z, why = (
-            _gain_in_sigmas(cross_validate(null, [effect.name]).take(kept), full.take(kept)),
-            '',
-        )
+        z = _gain_in_sigmas(cross_validate(null, [effect.name]).take(kept), full.take(kept))
+        reason, rival = None, None
         if len(kept) < 2:
-            why = NO_OTHER_FRAME
+            reason = Reason.NO_OTHER_FRAME
         elif z <= 1:
-            why = REFUTED_BY_FRAMES if z < -1 else NO_GAIN
+            reason = Reason.REFUTED_BY_FRAMES if z < -1 else Reason.NO_GAIN
         elif other is not None and _gain_in_sigmas(evaluation.predict([effect.name]), other) < -1:
-            why = REFUTED_BY_FILE
-        why = why or find_confounder(tests, effect, columns, twins) or _implausible(effect, values)
-        if why:
-            doubts.append(_Doubt(cause, z, why))
-    return min(doubts, key=lambda one: one.z, default=None)
+            reason = Reason.REFUTED_BY_FILE
+        if reason is None:
+            reason, rival = find_confounder(tests, effect, columns, twins)
+        if reason is None and _is_implausible(effect, values):
+            reason = Reason.IMPLAUSIBLE
+        if reason is not None:
+            yield _Doubt(z, cause, reason, rival)
 
 
 def _gain_in_sigmas(before: HeldOut, after: HeldOut) -> float:
@@ -354,8 +369,8 @@ def find_confounder(
     effect: Effect,
     columns: Index,
     twins: Sequence[tuple[str, Index, list[str]]],
-) -> str:
-    """Return which effect in the place of another cause makes this one needless."""
+) -> tuple[Reason | None, Rival | None]:
+    """Return which effect in the place of another cause makes this one needless, and how."""
     null = tests.null
     for other, theirs, names in twins:
         if other == effect.name or not names:
@@ -364,58 +379,41 @@ def find_confounder(
         # One with as many parameters as both causes explains nothing more simply than they do.
         for twin in tests.likeliest_forms(rest, names, len(theirs) + len(columns) - 1):
             beside = np.concatenate([rest, null.form_columns(twin.form)])
-            place = f'if {twin.effect.name} replaces {other}'
-            if tests.score_beside(beside, columns).p_value * tests.effect_count > SIGNIFICANCE:
-                return f'not significant {place}'
+            rival = Rival(twin.effect.name, other)
+            if tests.correct(effect, tests.score_beside(beside, columns).p_value) > SIGNIFICANCE:
+                return Reason.NEEDLESS_BESIDE_RIVAL, rival
             if not tests.held_out_gain(beside, columns, effect).sufficient:
-                return f'no significant gain on held-out frames {place}'
-    return ''
+                return Reason.NO_GAIN_BESIDE_RIVAL, rival
+    return None, None
 
 
-def _implausible(effect: Effect, values: Array) -> str:
-    if effect.name == 'viewpoint_shift' and abs(values[0]) > _FAR_SHIFT:
-        return f'a shift of {1e3 * abs(values[0]):.0f} mm is larger than in any real lens'
-    return ''
+def _is_implausible(effect: Effect, values: Array) -> bool:
+    """Say whether an effect is larger than in any real lens."""
+    return effect.name == 'viewpoint_shift' and bool(abs(values[0]) > _FAR_SHIFT)
 
 
-def _confirm(
-    selection: Selection, medium: Medium | None
-) -> tuple[Evaluation, list[UnconfirmedCause]]:
+def _confirm(selection: Selection, medium: Medium | None) -> tuple[Evaluation, list[Finding]]:
     """Take out causes that are not confirmed, the weakest first; fit the rest anew each time."""
-    candidates: dict[str, UnconfirmedCause] = {}
+    candidates: dict[str, Finding] = {}
     while True:
         evaluation = Evaluation.of_selection(selection, medium)
-        doubt = _weakest_cause(evaluation)
-        if doubt is None:
+        weakest = _weakest_cause(evaluation)
+        if weakest is None:
             return evaluation, _add_refused_causes(selection, candidates)
-        effect, columns, values = doubt.cause
-        test = EffectTests(selection.null).test_removal(
-            selection.null.included_columns, columns, effect
-        )
-        candidates[effect.name] = UnconfirmedCause(
-            effect.name,
-            parameters_of(effect, values, evaluation.errors[columns]),
-            test.p_value,
-            doubt.why,
-        )
+        (effect, _, values), finding = weakest
+        candidates[effect.name] = finding
         selection = without_cause(selection, effect.name)
-        if doubt.why in (REFUTED_BY_FRAMES, REFUTED_BY_FILE) or _implausible(effect, values):
+        if finding.status is Status.REFUTED or _is_implausible(effect, values):
             selection = replace(selection, refuted=(*selection.refuted, effect.name))
 
 
-def _add_refused_causes(
-    selection: Selection, found: Mapping[str, UnconfirmedCause]
-) -> list[UnconfirmedCause]:
+def _add_refused_causes(selection: Selection, found: Mapping[str, Finding]) -> list[Finding]:
     """Return also what was significant in the selection and did not predict better."""
-    causes = {effect.name for effect, _, _ in selection.causes}
+    known = {effect.name for effect, _, _ in selection.causes}
     every = dict(found)
-    why = NO_GAIN if selection.null.linear.data.frames > 1 else NO_OTHER_FRAME
+    alone = selection.null.linear.data.frames < 2
+    reason = Reason.NO_OTHER_FRAME if alone else Reason.NO_GAIN
     for step in selection.trace:
-        if (
-            not step.accepted
-            and step.why.endswith('does not predict better')
-            and step.name not in causes
-            and step.name not in every
-        ):
-            every[step.name] = UnconfirmedCause(step.name, {}, step.corrected, why)
+        if step.reason is Reason.NO_CONVINCING_GAIN and step.effect not in known:
+            every.setdefault(step.effect, replace(step, reason=reason))
     return list(every.values())

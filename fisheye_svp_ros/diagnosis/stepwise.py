@@ -6,7 +6,6 @@ This is where a cause is accepted (`add_effects`) and where it is given up (`eli
 from __future__ import annotations
 
 from collections.abc import Container, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import chain, takewhile
 
 import numpy as np
@@ -19,6 +18,7 @@ from fisheye_svp_ros.diagnosis.effect_tests import (
     EffectTests,
     HeldOutGain,
 )
+from fisheye_svp_ros.diagnosis.findings import Finding, Reason
 from fisheye_svp_ros.diagnosis.random_effects import MILLIMETRE, OF_LANDMARKS
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.target_effects import MIN_VIEWS, LandmarkSurveyEffect
@@ -34,7 +34,6 @@ from fisheye_svp_ros.mixed_model import (
 
 # What is named is surer than significant: a local error now and then has the form of an effect.
 NAMED_P = 0.002
-REMOVAL_PREFIX = 'removed:'
 _RARITY_ODDS = 4.0  # twice the log odds of an effect to one that looks alike and is rarer
 # So many landmarks are no single ones any more: of those that are exact, and of those that err
 # from landmark to landmark anyway.
@@ -44,40 +43,15 @@ _TAIL_FREEDOMS = (3.0, 5.0, 8.0, 12.0, 20.0, 40.0, 1e6)  # degrees of freedom, t
 _TAIL_GAIN = 2.0  # what longer tails add to the log likelihood if they are no chance
 
 
-@dataclass(frozen=True)
-class TraceStep:
-    """One line of the trace: what was tried, its evidence, and what came of it."""
-
-    effect: str
-    statistic: float
-    rank: int
-    p_value: float
-    corrected: float
-    held_out: float
-    held_out_stderr: float
-    accepted: bool
-    why: str
-
-    @property
-    def name(self) -> str:
-        """The name of the effect, without that of its form."""
-        return self.effect.partition('(')[0]
-
-    @property
-    def is_removal(self) -> bool:
-        """Whether an effect was given up that had been taken in."""
-        return self.why.startswith(REMOVAL_PREFIX)
-
-
 def add_effects(
     tests: EffectTests, included: Index, most: int, refused: Container[str], quick: bool
-) -> tuple[list[int], list[TraceStep]]:
+) -> tuple[list[int], list[Finding]]:
     """Add forms for as long as one is significant and predicts held-out frames better.
 
     included: the border's columns in the model; refused: effects that are not asked again; quick:
     do without held-out frames.  Returns the forms, in order, and the trace.
     """
-    forms, trace, failed = list[int](), list[TraceStep](), set()
+    forms, trace, failed = list[int](), list[Finding](), set()
     while len(forms) < most:
         remaining = (
             c
@@ -91,10 +65,8 @@ def add_effects(
         gain = HeldOutGain(np.inf, 0.0)
         if not (best.effect.per_frame or quick):
             gain = tests.held_out_gain(included, columns, best.effect)
-        why = 'significant and predicts better' if gain.convincing else 'does not predict better'
-        trace.append(
-            _trace_step(best.effect, best.score, best.corrected, gain, gain.convincing, why)
-        )
+        reason = Reason.PREDICTS_BETTER if gain.convincing else Reason.NO_CONVINCING_GAIN
+        trace.append(_finding(best.effect, best.score, best.corrected, gain, reason))
         if gain.convincing:
             included = np.concatenate([included, columns])
             forms.append(best.form)
@@ -131,40 +103,39 @@ def _commoner_candidate(best: Candidate, others: Iterator[Candidate]) -> Candida
     )
 
 
-def _trace_step(
-    effect: Effect, score: Score, corrected: float, gain: HeldOutGain, accepted: bool, why: str
-) -> TraceStep:
-    return TraceStep(
-        effect.key,
-        score.statistic,
-        score.rank,
-        score.p_value,
-        corrected,
-        gain.value,
-        gain.stderr,
-        accepted,
-        why,
+def _finding(
+    effect: Effect, score: Score, corrected: float, gain: HeldOutGain, reason: Reason
+) -> Finding:
+    return Finding(
+        form=effect.key,
+        reason=reason,
+        p_value=score.p_value,
+        p_corrected=corrected,
+        statistic=score.statistic,
+        rank=score.rank,
+        held_out=gain.value,
+        held_out_stderr=gain.stderr,
     )
 
 
 def eliminate_effects(
     tests: EffectTests, known: Sequence[str], quick: bool
-) -> tuple[Index, list[TraceStep]]:
+) -> tuple[Index, list[Finding]]:
     """Return the columns of what is still needed, given the others, and why the rest is not.
 
     The weakest goes first: what is no longer significant, then what held-out frames no longer
     support.  known: effects that stay whatever the tests say.
     """
     included = tests.null.included_columns
-    gone: list[TraceStep] = []
+    gone: list[Finding] = []
     while True:
-        weakest: tuple[float, Index, TraceStep] | None = None
+        weakest: tuple[float, Index, Finding] | None = None
         for effect, columns, _ in tests.null.terms:
             if effect.name in known or not np.isin(columns, included).all():
                 continue
             step = _test_removal(tests, included, effect, columns, quick)
-            if step is not None and (weakest is None or step.corrected > weakest[0]):
-                weakest = step.corrected, columns, step
+            if step is not None and (weakest is None or step.p_corrected > weakest[0]):
+                weakest = step.p_corrected, columns, step
         if weakest is None:
             return included, gone
         gone.append(weakest[2])
@@ -173,24 +144,24 @@ def eliminate_effects(
 
 def _test_removal(
     tests: EffectTests, included: Index, effect: Effect, columns: Index, quick: bool
-) -> TraceStep | None:
+) -> Finding | None:
     """Return why an effect is not needed beside everything else that is included, if so."""
     score = tests.test_removal(included, columns, effect)
-    corrected = min(1.0, score.p_value * tests.effect_count)
-    gain, why = HeldOutGain(np.nan, np.nan), f'{REMOVAL_PREFIX} the other causes explain it'
+    corrected = tests.correct(effect, score.p_value)
+    gain, reason = HeldOutGain(np.nan, np.nan), Reason.EXPLAINED_BY_OTHERS
     if corrected < SIGNIFICANCE:
         if quick or effect.per_frame:
             return None
         gain = tests.held_out_gain(np.setdiff1d(included, columns), columns, effect)
         if gain.sufficient:
             return None
-        why = f'{REMOVAL_PREFIX} it does not predict better any more'
-    return _trace_step(effect, score, corrected, gain, False, why)
+        reason = Reason.NO_LASTING_GAIN
+    return _finding(effect, score, corrected, gain, reason)
 
 
 def find_single_landmarks(
     tests: EffectTests,
-) -> tuple[LandmarkSurveyEffect, Array, TraceStep] | None:
+) -> tuple[LandmarkSurveyEffect, Array, Finding] | None:
     """Return landmarks that stand out against the variance of all, their offsets and the test.
 
     None where there is none, or where so many do that they are no single ones.
@@ -215,16 +186,13 @@ def find_single_landmarks(
     found = found[np.argsort(p[found], kind='stable')]
     ids = null.random.landmark[found]
     effect = LandmarkSurveyEffect(tuple(int(i) for i in ids))
-    step = TraceStep(
-        effect.key,
-        float(statistic[found].sum()),
-        int(rank[found].sum()),
-        float(p[found[0]]),
-        float(p[found[0]] * number),
-        np.nan,
-        np.nan,
-        True,
-        'further off than the bulk of landmarks',
+    step = Finding(
+        form=effect.key,
+        reason=Reason.BEYOND_BULK,
+        p_value=float(p[found[0]]),
+        p_corrected=float(p[found[0]] * number),
+        statistic=float(statistic[found].sum()),
+        rank=int(rank[found].sum()),
     )
     return effect, offset[found].ravel(), step
 

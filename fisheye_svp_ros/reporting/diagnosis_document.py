@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from fisheye_svp_ros.diagnosis import Decision, Diagnosis
+from fisheye_svp_ros.diagnosis import Advice, Cause, Decision, Diagnosis, Finding
+from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason
+from fisheye_svp_ros.reporting.wording.findings import finding_reason
 from fisheye_svp_ros.scene.observations import photograph_names
 
 
@@ -24,7 +26,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         'observations': d.observations,
         'base': base,
         'components': [part._asdict() for part in d.components],
-        'causes': [{'effect': cause.effect, **asdict(cause)} for cause in d.causes],
+        'causes': [_cause(one) for one in d.causes],
         'named': named,
         'lens': {
             **lens,
@@ -34,20 +36,20 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         },
         'extended': extended,
         'file': d.file._asdict(),
-        'candidates': [asdict(one) for one in d.candidates],
+        'candidates': [_candidate(one) for one in d.candidates],
         'decision': {name: _decision(one) for name, one in d.decision.items()},
         'photographs': [
             {'frame': frame, 'camera': camera, 'name': name}
             for (frame, camera), name in photograph_names(d.problem.observations).items()
         ],
         'gross': d.gross,
-        'advice': [asdict(advice) for advice in d.advice],
+        'advice': [_advice(one) for one in d.advice],
         'remaining': {'structure': [s._asdict() for s in d.remaining]},
         'untestable': [{'effect': e, 'why': why} for e, why in d.untestable.items()],
         'gain': d.figures.gain.interval,
         'intrinsics': {name: asdict(value) for name, value in d.intrinsics.items()},
         'uncertainty': d.uncertainty,
-        'trace': [asdict(step) for step in d.trace],
+        'trace': [_step(one) for one in d.trace],
         **_external(d),
         'turned': [asdict(one) for one in d.record.turned],
         **({'hand_eye': d.hand_eye.to_dict()} if d.hand_eye else {}),
@@ -62,6 +64,57 @@ def _decision(one: Decision) -> dict[str, Any]:
         'figure': one.figure._asdict(),
         'confidence': one.confidence,
         **bound,
+    }
+
+
+def _cause(one: Cause) -> dict[str, Any]:
+    return {
+        'effect': one.effect,
+        'form': one.form,
+        'parameters': one.parameters,
+        'p_value': one.p_value,
+        'share': one.share,
+        'survives': one.survives,
+        'heldout_rms_px': one.heldout_rms_px,
+        'gain': one.gain,
+        'indistinguishable_from': one.indistinguishable_from,
+        'to_separate': separation(one),
+        'refuted_by_frames': one.refuted_by_frames,
+    }
+
+
+def _advice(one: Advice) -> dict[str, Any]:
+    return {
+        'what': advised_action(one),
+        'frames': one.frames,
+        'photographs': one.photographs,
+        'landmarks': one.landmarks,
+        'boards': one.boards,
+        'gain': one.gain,
+        'kind': one.kind,
+    }
+
+
+def _candidate(one: Finding) -> dict[str, Any]:
+    return {
+        'effect': one.effect,
+        'parameters': one.parameters,
+        'p_value': one.p_corrected,
+        'why': finding_reason(one),
+    }
+
+
+def _step(one: Finding) -> dict[str, Any]:
+    return {
+        'effect': one.form,
+        'statistic': one.statistic,
+        'rank': one.rank,
+        'p_value': one.p_value,
+        'corrected': one.p_corrected,
+        'held_out': one.held_out,
+        'held_out_stderr': one.held_out_stderr,
+        'accepted': one.accepted,
+        'why': finding_reason(one),
     }
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from fisheye_svp_ros.diagnosis import NAMED_P, Comparison, Diagnosis, TraceStep, stage_shares
+from fisheye_svp_ros.diagnosis import NAMED_P, Comparison, Diagnosis, Finding, stage_shares
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_map import BoardMap
@@ -25,6 +25,8 @@ from fisheye_svp_ros.reporting.next_steps import (
     command_to_go_on,
     follow_up_files,
 )
+from fisheye_svp_ros.reporting.wording.advice import separation
+from fisheye_svp_ros.reporting.wording.findings import finding_reason
 
 _CAPTIONS = {
     'field': 'Residual vectors over the image; the scale is above each panel; dotted: equal '
@@ -165,7 +167,7 @@ def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
             {
                 **fields,
                 'what': cause_text.describe_effect(cause.effect),
-                'to_separate': cause.to_separate if cause.indistinguishable_from else '',
+                'to_separate': separation(cause) if cause.indistinguishable_from else '',
                 'refuted': text.frame_ranges(diagnosis, cause.refuted_by_frames),
                 'parameters': [
                     (
@@ -183,27 +185,28 @@ def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _evidence(diagnosis: Diagnosis) -> dict[str, Any]:
-    withdrawn = {one.effect: one.why for one in diagnosis.candidates}
+    withdrawn = {one.effect: finding_reason(one) for one in diagnosis.candidates}
     return {
         'steps': [_step(step, withdrawn) for step in diagnosis.trace],
         'tested': len(CATALOGUE) - len(diagnosis.untestable),
     }
 
 
-def _step(step: TraceStep, withdrawn: Mapping[str, str]) -> dict[str, Any]:
+def _step(step: Finding, withdrawn: Mapping[str, str]) -> dict[str, Any]:
     """Return a row of the evidence; withdrawn: why accepted effects were not confirmed."""
-    why = withdrawn.get(step.name) if step.accepted and not step.is_removal else None
+    why = withdrawn.get(step.effect) if step.accepted else None
+    reason = finding_reason(step)
     tried = step.statistic > 0
     held_out = ''
     if math.isfinite(step.held_out):
         held_out = f'{step.held_out:.1f} ± {step.held_out_stderr:.1f}'
     return {
-        'effect': step.effect,
+        'effect': step.form,
         'accepted': step.accepted and not why,
-        'why': f'{step.why}; not confirmed: {why}' if why else step.why,
+        'why': f'{reason}; not confirmed: {why}' if why else reason,
         'rank': step.rank if tried else '',
         'explains': f'{step.statistic:.1f}' if tried else '',
-        'p': cause_text.bare_probability(step.corrected) if tried else '',
+        'p': cause_text.bare_probability(step.p_corrected) if tried else '',
         'held_out': held_out,
     }
 

@@ -6,13 +6,13 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 
 from fisheye_svp_ros.diagnosis import (
-    DIAGNOSE_AIR,
     TURNED,
-    USE_EXTENDED,
+    Action,
     Advice,
     Cause,
     Comparison,
     Diagnosis,
+    Reason,
 )
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.cause_text import (
@@ -21,6 +21,7 @@ from fisheye_svp_ros.reporting.cause_text import (
     probability,
     size,
 )
+from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason
 from fisheye_svp_ros.scene.observations import frame_name
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
@@ -223,10 +224,9 @@ def _is_target_off(d: Diagnosis) -> bool:
 def _almost(d: Diagnosis) -> str:
     """Return which effect would be named, had it predicted frames that were left out."""
     for step in d.trace:
-        if not step.accepted and step.why.endswith('does not predict better'):
-            name = step.effect.partition('(')[0]
+        if step.reason is Reason.NO_CONVINCING_GAIN:
             return (
-                f'; {name} is significant ({probability(step.corrected)}), but does not '
+                f'; {step.effect} is significant ({probability(step.p_corrected)}), but does not '
                 'improve the prediction of left-out frames significantly: take more '
                 'photographs'
             )
@@ -336,10 +336,9 @@ def _next_step(d: Diagnosis) -> str:
         if pair.verdict == 'contradict'
     ]
     steps += [advice_text(one) for one in d.advice if one.frames]
-    steps += [advice_text(one) for one in d.advice if one.gain > 0 and one.what != USE_EXTENDED][
-        :_MAX_CAUSES
-    ]
-    steps += [advice_text(one) for one in d.advice if one.what == DIAGNOSE_AIR]
+    gaining = [one for one in d.advice if one.gain > 0 and one.action is not Action.USE_EXTENDED]
+    steps += [advice_text(one) for one in gaining[:_MAX_CAUSES]]
+    steps += [advice_text(one) for one in d.advice if one.action is Action.DIAGNOSE_AIR]
     held = [c.effect for c in d.causes if c.stage == 'frame' and c.effect in d.lens.corrections]
     if held and d.decision['lens'].say == 'use_extended':
         steps.append(f'it includes {join_names(held)}')
@@ -376,12 +375,12 @@ def advice_text(advice: Advice) -> str:
         )
         if numbers
     ]
-    what = advice.what.replace('the extended lens file', LENS_FILE)
+    what = advised_action(advice).replace('the extended lens file', LENS_FILE)
     return f'{what} ({", ".join(about)})' if about else what
 
 
 def _remedy(cause: Cause) -> str:
-    return cause.to_separate.replace(';', ',')
+    return separation(cause).replace(';', ',')
 
 
 def known_rows(

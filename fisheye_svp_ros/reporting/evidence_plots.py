@@ -33,7 +33,7 @@ def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
     with picture(path, 9.2, 1.6 + 0.3 * count, tight=True) as figure:
         left, right = figure.subplots(1, 2)
         left.barh(
-            [step.effect[:40] for step in steps],
+            [step.form[:40] for step in steps],
             [step.statistic for step in steps],
             color=[AFTER if step.accepted else _REJECTED_COLOR for step in steps],
         )

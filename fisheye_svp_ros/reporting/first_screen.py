@@ -41,6 +41,7 @@ from fisheye_svp_ros.reporting.diagnosis_text import (
     only_gross,
 )
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason
+from fisheye_svp_ros.reporting.wording.findings import finding_reason
 from fisheye_svp_ros.scene.observations import photograph_names
 
 _MAX_NAMES = 4  # photographs, and candidates, by name
@@ -270,7 +271,7 @@ def _candidates(d: Diagnosis) -> str:
         f'{1e3 * one.stderr:.2g} mm)'
         for one in shifts
     ]
-    words += [f'{one.effect} ({one.why})' for one in others[:_MAX_NAMES]]
+    words += [f'{one.effect} ({finding_reason(one)})' for one in others[:_MAX_NAMES]]
     more = len(others) - _MAX_NAMES
     return '; '.join(words) + (f'; and {more} more' if more > 0 else '')
 

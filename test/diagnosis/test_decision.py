@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.conclusion import _largest_error, _measure_landmarks
+from fisheye_svp_ros.diagnosis.conclusion import Action, _largest_error, _measure_landmarks
 from fisheye_svp_ros.diagnosis.decision import (
     EffectBound,
     FileFigure,
@@ -168,7 +168,7 @@ def test_the_gain_of_all_offsets_is_not_that_of_one_landmark() -> None:
     offsets = SimpleNamespace(offset=offset, landmark=np.arange(20))
     (one,) = _measure_landmarks(SimpleNamespace(offsets=offsets), 0.95)  # type: ignore[arg-type]
     assert one.landmarks == [7]
-    assert one.what == 'measure the landmarks of the target, first those that are displaced most'
+    assert one.action is Action.MEASURE_LANDMARKS
 
 
 def test_the_worst_of_several_lenses_may_be_so_by_chance() -> None:
@@ -203,8 +203,6 @@ def test_the_largest_error_of_the_target(
         True,
         0.1,
         0.3,
-        [],
-        '',
     )
     smaller = replace(
         cause, form='board_pose' if effect != 'board_pose' else 'landmark_survey', share=0.1

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
-from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
+from fisheye_svp_ros.diagnosis import Action, DiagnosisOptions, diagnose
 from fisheye_svp_ros.diagnosis.problem import Inputs, Problem
 from fisheye_svp_ros.diagnosis.selection import select_causes
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
@@ -560,7 +560,7 @@ def test_a_frame_of_a_rig_from_another_moment_is_named():
     found = diagnose(replace(table, uv=uv).take(kept), lenses)
     assert not found.causes
     assert {row['frame'] for row in found.gross} == {4}
-    assert [advice.frames for advice in found.advice if 'contradict' in advice.what] == [[4]]
+    assert [one.frames for one in found.advice if one.action is Action.CHECK_VIEWS] == [[4]]
 
 
 def test_a_rig_needs_a_lens_for_each_camera():

@@ -10,6 +10,7 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import DomePortEffect
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import DomeGlass
+from fisheye_svp_ros.reporting.wording.advice import separation
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
@@ -29,7 +30,7 @@ def test_a_dome_is_in_the_class_of_what_it_looks_like(seen):
     (cause,) = diagnose(*seen).causes
     assert cause.effect in ('decentering', 'sensor_tilt')
     assert 'dome_port' in cause.indistinguishable_from
-    assert '--port dome:' in cause.to_separate and 'a ray error of 0.0' in cause.to_separate
+    assert '--port dome:' in separation(cause) and 'a ray error of 0.0' in separation(cause)
 
 
 def test_a_stated_dome_is_named_and_its_place_measured(seen):

@@ -7,7 +7,7 @@ import pytest
 from helpers.uncertain import STDERR, uncertain
 from helpers.water import AIR, photographs
 
-from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
+from fisheye_svp_ros.diagnosis import Action, DiagnosisOptions, diagnose
 from fisheye_svp_ros.diagnosis.checks.medium import InAir
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import FlatGlass
@@ -95,7 +95,7 @@ def test_what_photographs_in_air_left_open_of_the_lens_is_found_under_water():
     heights = [one.fx * one.image_height.value_and_slope(theta)[0] for one in (found.lens, AIR)]
     assert heights[0] == pytest.approx(heights[1], rel=0.01)
     assert found.figures.extended.heldout_rms_px < 0.2
-    assert any('errors of its calibration' in advice.what for advice in found.advice)
+    assert Action.CALIBRATE_AIR in {advice.action for advice in found.advice}
     assert 'diagnose the photographs in air first' in verdict_sentences(found)[2]
 
 

@@ -4,7 +4,7 @@ import pytest
 from helpers.sagging import FREE, photographs
 from helpers.water import AIR
 
-from fisheye_svp_ros.diagnosis import NullModel, diagnose
+from fisheye_svp_ros.diagnosis import Action, NullModel, diagnose
 from fisheye_svp_ros.diagnosis.fitted_model import refit
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
@@ -32,8 +32,8 @@ def test_a_board_that_sags_is_to_be_supported():
     assert [c.effect for c in found.causes if c.effect != 'target_shape'] == []
     (sag,) = (one for one in found.components if one.name == 'frame_sag')
     assert sag.p_value < 1e-9
-    (advice,) = (one for one in found.advice if 'support the board' in one.what)
-    assert 0.8 < float(advice.what.split(' mm')[0].split()[-1]) < 1.2 and advice.boards == [0]
+    (advice,) = (one for one in found.advice if one.action is Action.SUPPORT_BOARD)
+    assert 0.8e-3 < advice.value < 1.2e-3 and advice.boards == [0]
 
 
 def test_a_board_whose_bend_stays_does_not_sag():

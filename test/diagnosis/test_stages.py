@@ -7,13 +7,11 @@ import pytest
 from helpers.scenes import lens, observe, scene
 from helpers.water import AIR
 
-from fisheye_svp_ros.diagnosis import EffectTests, NullModel, diagnose
+from fisheye_svp_ros.diagnosis import EffectTests, NullModel, Reason, Rival, diagnose
+from fisheye_svp_ros.diagnosis.causes import selected_causes
 from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain
-from fisheye_svp_ros.diagnosis.stages import (
-    NO_OTHER_FRAME,
-    REFUTED_BY_FRAMES,
-    find_confounder,
-)
+from fisheye_svp_ros.diagnosis.stages import find_confounder
+from fisheye_svp_ros.diagnosis.stepwise import eliminate_effects
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.effects.recording_effects import FocalDriftEffect, SessionStepEffect
@@ -91,6 +89,9 @@ def test_a_tilt_beside_a_jump_stays_confirmed():
     assert abs(jump['value'] - 6.0) < 4 * jump['stderr']
 
 
+RIVAL = Rival('session_step', 'focal_drift')
+
+
 @pytest.fixture(scope='module')
 def false_tilt():
     """Return the tests of a jump of the intrinsics that is fitted as a drift beside a tilt."""
@@ -109,7 +110,7 @@ def confounder(tests):
 
 
 def test_an_effect_with_more_parameters_takes_the_place_of_another_cause(false_tilt):
-    assert confounder(false_tilt) == 'not significant if session_step replaces focal_drift'
+    assert confounder(false_tilt) == (Reason.NEEDLESS_BESIDE_RIVAL, RIVAL)
 
 
 def test_a_cause_must_predict_better_beside_what_takes_the_place_of_another(
@@ -120,11 +121,9 @@ def test_a_cause_must_predict_better_beside_what_takes_the_place_of_another(
     monkeypatch.setattr(f'{module}.SIGNIFICANCE', 1e9)
     gain = HeldOutGain(1.0, 0.5)
     monkeypatch.setattr(EffectTests, 'held_out_gain', lambda *_: gain)
-    assert not confounder(false_tilt)
+    assert confounder(false_tilt) == (None, None)
     gain = HeldOutGain(1.0, 2.0)
-    assert confounder(false_tilt) == (
-        'no significant gain on held-out frames if session_step replaces focal_drift'
-    )
+    assert confounder(false_tilt) == (Reason.NO_GAIN_BESIDE_RIVAL, RIVAL)
 
 
 def test_one_frame_confirms_nothing_and_is_not_adequate():
@@ -135,9 +134,27 @@ def test_one_frame_confirms_nothing_and_is_not_adequate():
     found = diagnose(table, lens())
     assert found.causes == [] and found.verdict == 'unexplained'
     assert found.decision['lens'].say == 'undecided'
-    assert {one.why for one in found.candidates} <= {NO_OTHER_FRAME, REFUTED_BY_FRAMES}
+    assert {one.reason for one in found.candidates} <= {
+        Reason.NO_OTHER_FRAME,
+        Reason.REFUTED_BY_FRAMES,
+    }
     assert headline(found).startswith('Errors show in one frame')
     screen = first_screen(found, 'table')
     assert 'points in 1 frame;' in screen.facts
     listed = screen.candidates
     assert listed.count('viewpoint_shift (') <= 1
+
+
+def test_p_values_are_corrected_once(false_tilt):
+    """A cause had the p-value of one test, a candidate that of all: 23 times as large and more."""
+    null = false_tilt.null
+    *_, (effect, columns, _) = null.terms
+    alone = false_tilt.test_removal(null.included_columns, columns, effect).p_value
+    forms = null.fixed.forms.form_counts[effect.name]
+    corrected = min(1.0, alone * false_tilt.effect_count * forms)
+    shares = {one.name: 0.1 for one, _, _ in null.terms}
+    errors = np.ones(null.column_count)
+    *_, cause = selected_causes(false_tilt, null.terms, errors, shares, [(0.1, 0.0)] * 2)
+    assert cause.p_value == corrected > alone
+    _, steps = eliminate_effects(false_tilt, ('focal_drift',), quick=True)
+    assert all(one.p_corrected == corrected for one in steps)

@@ -12,6 +12,7 @@ from benchmark.studies import two_cameras
 from benchmark.studies.two_cameras import Hidden
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.diagnosis import (
+    Action,
     Comparison,
     DiagnosisOptions,
     Transfer,
@@ -335,7 +336,9 @@ def test_a_rig_that_was_not_seen_predicts_nothing_in_held_out_frames(longer):
     test = replace(test, cameras=('right', 'left'), camera=1 - test.camera)
     found = diagnose(apart, longer.lenses, held_out=test, options=DiagnosisOptions(quick=True))
     assert found.figures.named.heldout_rms_px < 0.16
-    assert not any('held-out' in advice.what for advice in found.advice)
+    assert not {Action.CHECK_HELD_OUT_RIG, Action.CHECK_HELD_OUT_FRAMES} & {
+        advice.action for advice in found.advice
+    }
     with pytest.raises(ObservationError, match='cam0, right'):
         diagnose(train, longer.lenses, held_out=replace(test, cameras=('cam0', 'right')))
 
@@ -345,7 +348,7 @@ def test_a_frame_that_alone_shows_a_part_of_the_image_spoils_no_figure():
     gone = (seen.table.camera == 1) & (seen.table.frame % 3 == 0)
     found = diagnose(seen.table.take(~gone), seen.lenses, options=DiagnosisOptions(quick=True))
     # Frame 19 is at the edge of the right camera's image; without it 2.8 px remain there.
-    alone = [one for one in found.advice if 'the others do not predict them' in one.what]
+    alone = [one for one in found.advice if one.action is Action.TAKE_MORE_LIKE_THESE]
     assert [one.frames for one in alone] == [[19]]
     assert found.figures.named.heldout_rms_px < 0.14 < found.figures.base.heldout_rms_px < 0.17
     (said,) = found.cameras

@@ -8,6 +8,7 @@ from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.diagnosis import (
+    Action,
     Comparison,
     DiagnosisOptions,
     Transfer,
@@ -74,7 +75,7 @@ def test_nothing_of_the_target_is_predicted_of_another_one():
     # The first board's offsets would make the prediction of the other one worse.
     assert max(found.figures.extended.heldout_rms_px, found.figures.named.heldout_rms_px) < 0.18
     assert found.figures.base.heldout_rms_px > 0.2
-    assert 'the same target' in ' '.join(advice.what for advice in found.advice)
+    assert Action.HOLD_OUT_SAME_TARGET in {advice.action for advice in found.advice}
 
 
 def test_what_the_other_set_refutes_is_withdrawn():

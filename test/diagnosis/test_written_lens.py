@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.water import AIR, photographs
 
-from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, diagnose
+from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, Reason, diagnose
 from fisheye_svp_ros.diagnosis.lens_evidence import find_lens_rays
 from fisheye_svp_ros.diagnosis.model_errors import LensErrors
 from fisheye_svp_ros.diagnosis.written_lens import (
@@ -125,6 +125,6 @@ def test_ray_errors_are_stated_at_the_range_that_is_asked_for() -> None:
 def test_a_shift_that_no_lens_can_have_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('fisheye_svp_ros.diagnosis.stages._FAR_SHIFT', 1e-3)
     found = diagnosed(0.006, 0.02, options=DiagnosisOptions(quick=True))
-    why = {one.effect: one.why for one in found.candidates}
-    assert 'larger than in any real lens' in why['viewpoint_shift']
+    reasons = {one.effect: one.reason for one in found.candidates}
+    assert reasons['viewpoint_shift'] is Reason.IMPLAUSIBLE
     assert found.lens.viewpoint_shift is None and not found.averaged_model.shifts

@@ -154,7 +154,7 @@ def test_doubt_between_a_cause_and_its_look_alikes_is_settled(linear, board, sho
 
 
 def cause(alike):
-    return Cause('viewpoint_shift(order=1)', {}, 0.0, 1.0, True, 0.1, 0.5, alike, '')
+    return Cause('viewpoint_shift(order=1)', {}, 0.0, 1.0, True, 0.1, 0.5, alike)
 
 
 def test_the_question_is_the_doubt_then_the_cause_then_the_lens(linear, board):

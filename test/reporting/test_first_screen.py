@@ -13,16 +13,16 @@ from helpers.diagnoses import with_changes
 from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import (
-    RETAKE,
+    Action,
     Advice,
     Cause,
     Comparison,
     Diagnosis,
     DiagnosisOptions,
-    TraceStep,
+    Finding,
+    Reason,
     diagnose,
 )
-from fisheye_svp_ros.diagnosis.causes import UnconfirmedCause
 from fisheye_svp_ros.diagnosis.decision import EffectBound, Figure
 from fisheye_svp_ros.diagnosis.variance_budget import Structure
 from fisheye_svp_ros.reporting.cause_text import percent, size
@@ -123,8 +123,6 @@ def _tilt(value: float, error: float) -> Cause:
         True,
         0.1,
         0.3,
-        [],
-        '',
     )
 
 
@@ -301,7 +299,7 @@ def test_no_plan_is_promised_that_the_target_does_not_allow(found: Diagnosis) ->
 
 def test_photographs_are_named_only_beside_what_to_do_with_them(found: Diagnosis) -> None:
     """Once "Enough: frame 3. 16 frames, ..." did not say what was to be done with frame 3."""
-    bad = replace(found, advice=[Advice('take again', frames=[3], kind=RETAKE)])
+    bad = replace(found, advice=[Advice(Action.RETAKE, frames=[3])])
     for say, names in (('enough', []), ('more', []), ('retake', ['frame 3'])):
         action = first_screen(_deciding(bad, 'photographs', say=say), 'table').actions[2]
         assert [photo.name for photo in action.photographs] == names
@@ -370,8 +368,8 @@ def test_evidence_tells_what_was_not_confirmed_in_the_end(
     found: Diagnosis, tmp_path: Path
 ) -> None:
     """The table ended with "predicts better"; the first screen, "held-out frames refute it"."""
-    refuted = UnconfirmedCause('sensor_tilt', {}, 1e-9, 'held-out frames refute it')
-    step = TraceStep('sensor_tilt', 99.0, 2, 1e-9, 1e-9, 93.0, 27.0, True, 'predicts better')
+    refuted = Finding('sensor_tilt', Reason.REFUTED_BY_FRAMES, 1e-9, 1e-9)
+    step = Finding('sensor_tilt', Reason.PREDICTS_BETTER, 1e-9, 1e-9, 99.0, 2, 93.0, 27.0)
     table = with_changes(
         found, causes=[], trace=[step], conclusion=replace(found.conclusion, candidates=[refuted])
     )
@@ -382,7 +380,7 @@ def test_evidence_tells_what_was_not_confirmed_in_the_end(
         ReportInputs('obs.csv', ('l.yaml',), None, None, tmp_path, False),
     )
     page = (tmp_path / 'report.html').read_text()
-    assert '<td>predicts better; not confirmed: held-out frames refute it</td>' in page
+    assert 'predicts better; not confirmed: held-out frames refute it</td>' in page
 
 
 def test_an_extended_lens_that_held_out_frames_refute_is_not_offered(found: Diagnosis) -> None:

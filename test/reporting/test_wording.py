@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from fisheye_svp_ros.diagnosis import (
+    Action,
+    Advice,
+    Cause,
     Decision,
+    Finding,
     LensFacts,
     LensReason,
     PhotographsFacts,
     PhotographsReason,
+    Reason,
+    Rival,
     TargetError,
     TargetFacts,
     TargetReason,
 )
+from fisheye_svp_ros.diagnosis.causes import Imitation
 from fisheye_svp_ros.diagnosis.decision import EffectBound, Figure, FileFigure, LensOffset
+from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason, target_error
+from fisheye_svp_ros.reporting.wording.findings import finding_reason
 
 LENS = LensFacts(
     lens_causes=['sensor_tilt'],
@@ -165,3 +176,45 @@ def test_views_are_planned_only_where_they_can_be() -> None:
 )
 def test_the_largest_error_of_the_target_is_said(error: TargetError, text: str) -> None:
     assert target_error(error) == text
+
+
+ANGLE = {'x': {'value': 0.03, 'stderr': 0.001, 'unit': 'm'}}
+
+
+@pytest.mark.parametrize('reason', Reason)
+def test_every_finding_has_a_short_reason(reason: Reason) -> None:
+    rival = Rival('session_step', 'focal_drift')
+    finding = Finding('viewpoint_shift(1)', reason, 1e-9, 1e-8, parameters=ANGLE, rival=rival)
+    text = finding_reason(finding)
+    assert text and '{' not in text and len(text.split()) <= _MAX_WORDS
+
+
+def test_a_finding_names_its_size_and_its_rival() -> None:
+    far = Finding('viewpoint_shift', Reason.IMPLAUSIBLE, 0.0, 0.0, parameters=ANGLE)
+    assert finding_reason(far) == 'a shift of 30 mm is larger than in any real lens'
+    rival = Rival('session_step', 'focal_drift')
+    needless = Finding('sensor_tilt', Reason.NEEDLESS_BESIDE_RIVAL, 0.0, 0.0, rival=rival)
+    assert finding_reason(needless) == 'not significant if session_step replaces focal_drift'
+
+
+CAUSE = Cause('sensor_tilt', {}, 1e-9, 0.2, True, 0.1, 0.3)
+
+
+@pytest.mark.parametrize('action', Action)
+def test_every_advice_says_what_to_do(action: Action) -> None:
+    text = advised_action(Advice(action, value=1e-3, cause=CAUSE))
+    assert text and '{' not in text and not text.endswith('.')
+
+
+def test_advice_holds_its_figure() -> None:
+    assert 'bends by 1.0 mm' in advised_action(Advice(Action.SUPPORT_BOARD, value=1e-3))
+    assert 'ones and do not' in advised_action(Advice(Action.VARY_VIEWS, value=float('inf')))
+    assert 'taken within 9 s' in advised_action(Advice(Action.VARY_VIEWS, value=9.0))
+    assert '(odds 1e+06 to 1 or more)' in advised_action(Advice(Action.CHECK_NUMBERS, value=1e6))
+
+
+def test_what_separates_a_cause_counts_what_it_imitates() -> None:
+    dome = replace(CAUSE, imitations=(Imitation('dome_port', 1.2e-3),))
+    text = separation(dome)
+    assert text.startswith(CAUSE.effect_class.to_separate)
+    assert text.endswith('; if it is a dome_port, a ray error of 1.2 mrad remains')

@@ -50,6 +50,11 @@ class TurnedFrame:
     odds: float
     corrected: bool
 
+    @property
+    def has_photograph(self) -> bool:
+        """Whether it is called by a photograph, not by its number."""
+        return not self.photograph.startswith(f'frame {self.frame}')
+
 
 class _Frames(NamedTuple):
     """What F frames of up to N points say of the L landmarks of one board, in its axes.

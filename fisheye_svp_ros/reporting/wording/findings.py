@@ -1,0 +1,29 @@
+"""Why an effect was accepted, is not confirmed, or is not needed."""
+
+from __future__ import annotations
+
+from fisheye_svp_ros.diagnosis import Finding, Reason
+
+_REASONS = {
+    Reason.PREDICTS_BETTER: 'significant and predicts better',
+    Reason.BEYOND_BULK: 'further off than the bulk of landmarks',
+    Reason.NO_CONVINCING_GAIN: 'does not predict better',
+    Reason.EXPLAINED_BY_OTHERS: 'removed: the other causes explain it',
+    Reason.NO_LASTING_GAIN: 'removed: it does not predict better any more',
+    Reason.REFUTED_BY_FRAMES: 'held-out frames refute it',
+    Reason.REFUTED_BY_FILE: 'the held-out file refutes it',
+    Reason.NO_GAIN: 'its gain on held-out frames is not significant',
+    Reason.NO_OTHER_FRAME: 'there is no other frame to confirm it',
+    Reason.NEEDLESS_BESIDE_RIVAL: 'not significant if {effect} replaces {replaced}',
+    Reason.NO_GAIN_BESIDE_RIVAL: 'no significant gain on held-out frames if {effect} replaces '
+    '{replaced}',
+}
+
+
+def finding_reason(finding: Finding) -> str:
+    """Return why, as a clause that begins in lower case and ends without a stop."""
+    if finding.reason is Reason.IMPLAUSIBLE:
+        size = next(abs(entry['value']) for entry in finding.parameters.values())
+        return f'a shift of {1e3 * size:.0f} mm is larger than in any real lens'
+    rival = finding.rival._asdict() if finding.rival else {}
+    return _REASONS[finding.reason].format(**rival)
