@@ -12,6 +12,7 @@ nodes = (
     'detector',
     'rectifier',
     'localizer',
+    'rig_localizer',
     'stereo_calibrator',
     'stereo_depth',
     'model_critic',

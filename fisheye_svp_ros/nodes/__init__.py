@@ -6,6 +6,7 @@ NODES = (
     'detector',
     'rectifier',
     'localizer',
+    'rig_localizer',
     'stereo_calibrator',
     'stereo_depth',
     'model_critic',

@@ -12,6 +12,7 @@ from visualization_msgs.msg import MarkerArray
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes.base_pose import BasePose
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
 from fisheye_svp_ros.nodes.lenses import lens_of
 from fisheye_svp_ros.nodes.messages import camera_shape
@@ -55,6 +56,7 @@ class Localizer(SolverNode):
         self._residuals = self.announce(PointCloud2, '~/residuals')
         self._markers = self.announce(MarkerArray, '~/markers', LATCHED)
         self._transforms = Transforms(self, self.settings.publish_tf)
+        self._base = BasePose(self, self.settings)
         self._before: tuple[Pose | None, float] = None, 0.0
         self._misfits = 0  # sets up to the one before that fit badly, without outliers found
         self._errors: LensErrors | None = None  # of the latest lens
@@ -85,6 +87,7 @@ class Localizer(SolverNode):
         self._pose.publish(
             messages.pose_with_covariance_message(pose, covariance[0], stamp, world)
         )
+        self._base.publish(pose, covariance[0], stamp, world, camera)
         if self._residuals.get_subscription_count():
             cloud = residual_points(model, views, solution)
             self._residuals.publish(messages.cloud_message(cloud, stamp, camera))

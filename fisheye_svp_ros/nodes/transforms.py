@@ -29,7 +29,7 @@ class Transforms:
         self._sent: deque[Any] = deque(maxlen=_MAX_SENT)
         self._children: set[str] = set()
         if wanted:
-            self._kind = _message_class()
+            self._kind = message_class('publish_tf')
             self._publisher = (
                 node.announce(self._kind, '/tf_static', LATCHED)
                 if static
@@ -66,13 +66,17 @@ class Transforms:
                 )
 
 
-def _message_class() -> Any:
-    """Return TFMessage, which is in a package of its own and not in every installation."""
+def message_class(parameter: str) -> Any:
+    """Return TFMessage, which is in a package of its own and not in every installation.
+
+    parameter: that needs it.
+    """
     try:
         from tf2_msgs.msg import TFMessage
     except ImportError as cause:
         raise ParameterError(
-            'publish_tf: tf2_msgs is not installed; source a ROS 2 that has it (apt install '
-            'ros-jazzy-tf2-msgs; it has no wheel), or set publish_tf:=false'
+            f'{parameter}: tf2_msgs is not installed; source a ROS 2 that has it (apt install '
+            'ros-jazzy-tf2-msgs; it has no wheel), or '
+            + ('set publish_tf:=false' if parameter == 'publish_tf' else 'leave it out')
         ) from cause
     return TFMessage

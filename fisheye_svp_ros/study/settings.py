@@ -137,8 +137,8 @@ class RigSettings(SolverSettings):
 
 
 @dataclass(frozen=True)
-class LocalizerSettings(SolverSettings):
-    """Parameters of the localizer."""
+class RobotSettings(SolverSettings):
+    """Parameters of every node that poses a robot."""
 
     publish_tf: bool = parameter(
         False,
@@ -146,6 +146,26 @@ class LocalizerSettings(SolverSettings):
         'camera; only if no other node publishes the latter',
         fixed=True,
     )
+    base_frame: str = parameter(
+        '',
+        'Frame id of the base of a robot: publish its pose on ~/base_pose, the camera in it being '
+        'looked up on /tf_static. Empty: do not',
+        fixed=True,
+        frame=True,
+    )
+    odom_frame: str = parameter(
+        '',
+        'Frame id of the odometry: publish on /tf where it stands in the frame of the landmarks, '
+        'as amcl does; needs base_frame and odometry on /tf. Empty: do not',
+        fixed=True,
+        frame=True,
+    )
+
+
+@dataclass(frozen=True)
+class LocalizerSettings(RobotSettings):
+    """Parameters of the localizer."""
+
     camera_frame: str = parameter(
         '',
         'Frame id of the estimated camera; empty: that of the image points',
@@ -175,6 +195,19 @@ class StereoCalibratorSettings(RigSettings):
         'Calibrate from this number of the latest sets of a scenario, or from fewer if there '
         'are no more',
         span=(1, 1000),
+    )
+
+
+@dataclass(frozen=True)
+class RigLocalizerSettings(RobotSettings, RigSettings):
+    """Parameters of the rig localizer."""
+
+    rig: str = parameter(
+        '',
+        'Rig: `rig.yaml` of `calibrate` or its folder, or a camchain; its cameras are heard on '
+        'NAME/image_points, and the lenses are those of `lens` in this order',
+        file=True,
+        fixed=True,
     )
 
 

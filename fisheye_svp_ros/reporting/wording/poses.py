@@ -10,3 +10,10 @@ def second_pose_note(frames: str, count: int) -> str:
         f'{count} {poses} ambiguous ({frames}): the target may be tilted the other way, odds in '
         'localize.json; go nearer, or add landmarks'
     )
+
+
+def rig_reason(outliers: int, contradicted: bool) -> str:
+    """Say why the pose of a rig should not be relied on; '' for a reliable one."""
+    points = f'{outliers} outliers rejected' if outliers else ''
+    rig = 'the relative poses of the cameras differ; calibrate the rig again'
+    return '; '.join(filter(None, (points, rig if contradicted else '')))
