@@ -39,6 +39,8 @@ def load_with_notes(path: str | Path) -> Lens:
     """Return the lens of a file, or raise LensError; say what is odd about it."""
     lens, foreign = load_lens(path), read_lens_file(path)
     note_odd(lens, path, foreign.deviation_px(lens) if foreign else 0.0)
+    for note in foreign.notes if foreign else ():
+        say(f'{path}: {note}')
     return lens
 
 

@@ -1,4 +1,6 @@
-"""rosbag2 recordings: their files, compressed or not, and the messages in them, read and written.
+"""Recordings: their files, compressed or not, and the messages in them, read and written.
+
+Those of rosbag2, and to read also bags of ROS 1.
 
 They are written so that a crash loses what came since the last flush only.
 """
@@ -40,8 +42,10 @@ from fisheye_svp_ros.io.mcap import (
     listed_topics,
     whole_messages,
 )
-from fisheye_svp_ros.io.recording_files import metadata_topics, recording_files
+from fisheye_svp_ros.io.recording_files import ROS1_SUFFIX, metadata_topics, recording_files
+from fisheye_svp_ros.io.ros1_bags import bag_messages, bag_topics, ros1_types
 
+_READERS = {'.db3': database_messages, ROS1_SUFFIX: bag_messages}  # others are MCAP
 _ZSTD = b'\x28\xb5\x2f\xfd'  # CDR begins with 0
 _EXPANDS = 1000  # times the size of a file, at most
 _BLOCK_BYTES = 1 << 20  # bytes
@@ -237,13 +241,16 @@ class Bag:
         Of a recording that was cut short or damaged everything whole is yielded, and in the end
         `damage` says so.  Raises BagError where nothing can be read.
         """
-        store = _types()
+        store = ros1_types() if self._is_ros1 else _types()
         notes: list[str] = []
         for topic, typename, when, data in self._raw(notes.append, passed):
             if typename not in store.fielddefs or not wanted(topic, typename):
                 continue
             try:
-                message = store.deserialize_cdr(unpacked_message(data), typename)
+                if self._is_ros1:
+                    message = store.deserialize_ros1(data, typename)
+                else:
+                    message = store.deserialize_cdr(unpacked_message(data), typename)
             except Exception as cause:
                 notes.append(f'a message on {topic} cannot be read ({cause})')
                 continue
@@ -263,6 +270,10 @@ class Bag:
             return set().union(*listed)
         return {(message.topic, message.typename) for message in self._raw(_ignore, _ignore)}
 
+    @property
+    def _is_ros1(self) -> bool:
+        return self.path.suffix.lower() == ROS1_SUFFIX
+
     def _files(self) -> list[Path]:
         return recording_files(self.path)
 
@@ -278,7 +289,7 @@ class Bag:
 
         for file in self._files():
             with decompress_file(file, say) as plain:
-                read = database_messages if plain.suffix == '.db3' else whole_messages
+                read = _READERS.get(plain.suffix.lower(), whole_messages)
                 for message in read(plain, say, passed if plain == file else _ignore):
                     count += 1
                     yield message
@@ -295,6 +306,8 @@ def _list_topics(file: Path) -> set[tuple[str, str]]:
     """Return the topics and types that a file, or the metadata beside it, lists; empty if not."""
     if file.suffix == '.zstd':
         return metadata_topics(file.parent)  # it is not unpacked for this alone
+    if file.suffix.lower() == ROS1_SUFFIX:
+        return bag_topics(file)
     return database_topics(file) if file.suffix == '.db3' else listed_topics(file)
 
 

@@ -233,7 +233,8 @@ _Loader.add_implicit_resolver(
     list('-+.0123456789'),
 )
 # OpenCV's matrices are mappings; those of other types are none that a lens has.
-_Loader.add_constructor('tag:yaml.org,2002:opencv-matrix', _Loader.construct_yaml_map)
+for _kind in ('opencv-matrix', 'opencv-nd-matrix'):
+    _Loader.add_constructor(f'tag:yaml.org,2002:{_kind}', _Loader.construct_yaml_map)
 
 
 class _Dumper(_BaseDumper):  # type: ignore[misc]

@@ -122,7 +122,7 @@ READERS: Registry[Reader] = Registry(
                 lambda path: path.is_dir() and any(path.glob('*.orpc')),
                 f'{_PACKAGE}.orpc',
             ),
-            Reader('a rosbag2 recording', is_recording, f'{_PACKAGE}.recording'),
+            Reader('a recording (rosbag2, ROS 1)', is_recording, f'{_PACKAGE}.recording'),
         )
     },
     Reader,

@@ -9,12 +9,18 @@ from pathlib import Path
 from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.files import read_yaml
 
+ROS1_SUFFIX = '.bag'
 _SUFFIXES = ('.mcap', '.db3', '.mcap.zstd', '.db3.zstd')
 
 
 def is_recording(path: Path) -> bool:
-    """Say whether a path is called as a file of a recording is, or a folder with one in it."""
-    return bool(_files_in(path)) if path.is_dir() else path.name.lower().endswith(_SUFFIXES)
+    """Say whether a path is called as a file of a recording is, or a folder with one in it.
+
+    Bags of ROS 1 are files; in a folder they are nobody's parts.
+    """
+    if path.is_dir():
+        return bool(_files_in(path))
+    return path.name.lower().endswith((*_SUFFIXES, ROS1_SUFFIX))
 
 
 def recording_files(path: Path) -> list[Path]:

@@ -72,7 +72,8 @@ class Foreign(NamedTuple):
     """What a file of another tool holds.
 
     form: of the file; lenses by camera; rigs: each camera in the next one; worst_px: how far each
-    lens is from what the file says; cameras: of a rig without lenses, if it names them.
+    lens is from what the file says; cameras: of a rig without lenses, if it names them;
+    notes: what was assumed.
     """
 
     form: str
@@ -80,6 +81,7 @@ class Foreign(NamedTuple):
     rigs: tuple[Pose, ...]
     worst_px: dict[str, float]
     cameras: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def from_lenses(

@@ -8,6 +8,7 @@ cv2.fisheye.stereoCalibrate returns them.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -18,22 +19,30 @@ from fisheye_svp_ros.io.files import parse_json
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import STEREO
 
-_MATRIX = ('camera_matrix', 'cameraMatrix', 'Camera_Matrix', 'K', 'K1', 'M1', 'cameraMatrix1')
+# Names as programs write them, without case and separators, before what tells two cameras apart
+_MATRIX = ('cameramatrix', 'k', 'm', 'intrinsicmatrix', 'intrinsics', 'mtx')
 _COEFFICIENTS = (
-    'distortion_coefficients',
-    'Distortion_Coefficients',
-    'distCoeffs',
-    'D',
-    'D1',
-    'distCoeffs1',
+    'distortioncoefficients',
+    'distortioncoeffs',
+    'distcoeffs',
+    'distcoeff',
+    'distortion',
+    'dist',
+    'd',
 )
-_RIGHT_KEYS = ('K2', 'M2', 'cameraMatrix2'), ('D2', 'distCoeffs2')
-_WIDTH, _HEIGHT = ('image_width', 'width', 'image_Width'), ('image_height', 'height')
+_SIDES = (('1', '2'), ('0', '1'), ('l', 'r'), ('left', 'right'))
+_ROTATION, _TRANSLATION = ('r', 'rotation', 'rotationmatrix'), ('t', 'translation')
+_WIDTH, _HEIGHT = ('imagewidth', 'imgwidth', 'width'), ('imageheight', 'imgheight', 'height')
+_SIZE = ('imagesize', 'imgsize', 'size', 'framesize', 'resolution')
 _XI, _OF_FISHEYE = 'xi', 4
 _IS_FISHEYE = 'fisheye_model'  # 0 or 1, of OpenCV's own calibration program
 _COUNTS = [shape for n in (4, 5, 8, 12, 14) for shape in ((1, n), (n, 1))]
-_SIZE = ('image_size', 'imageSize', 'size')
+_FISHEYE_NOTE = (
+    '4 coefficients are read as those of cv2.fisheye; add `fisheye_model: 0` for those of '
+    'cv2.calibrateCamera'
+)
 
 
 def recognises(text: str) -> bool:
@@ -42,45 +51,93 @@ def recognises(text: str) -> bool:
     return (
         start.startswith('%YAML')
         or '<opencv_storage>' in text
-        or (start.startswith('{') and '"opencv-matrix"' in text)
+        or '!!opencv-' in text
+        or (start.startswith('{') and '"opencv-' in text)
     )
 
 
 def read(text: str, where: str) -> Foreign:
     """Read the lens; raises LensError, naming what is missing."""
     # A file that is nested deeply ends the process in OpenCV's own parser.
-    if text.lstrip().startswith('%YAML'):
-        document = fields.yaml(text, where)
-    elif text.lstrip().startswith('{'):
+    start = text.lstrip()
+    if start.startswith('{'):
         document = parse_json(text, where, LensError)
-    else:
+    elif start.startswith('<'):
         document = _from_xml(text, where)
-
-    def value(names: tuple[str, ...]) -> Any:
-        for name in names:
-            if name in document:
-                return document[name]
-        raise LensError(f'{where}: it has none of {", ".join(names)}')
-
-    if any(name in document for name in _SIZE):
-        size = fields.numbers({'size': value(_SIZE)}, 'size', 2, where)
     else:
-        size = fields.numbers({'size': [value(_WIDTH), value(_HEIGHT)]}, 'size', 2, where)
+        document = fields.yaml(text, where)
+    named = {re.sub('[^a-z0-9]', '', name.lower()): value for name, value in document.items()}
 
-    def lens(name: str, matrix: tuple[str, ...], named: tuple[str, ...]) -> tuple[Lens, float]:
-        k = _matrix(value(matrix), ((3, 3),), where)
-        distortion = _distortion(_matrix(value(named), _COUNTS, where), document, where)
-        return models.nearest_lens(name, size, (k[0], k[4], k[2], k[5], k[1]), distortion, where)
+    def lens(name: str, side: str) -> tuple[Lens, float]:
+        k = _matrix(_value(named, _sided(_MATRIX, side), where), ((3, 3),), where)
+        coefficients = _matrix(_value(named, _sided(_COEFFICIENTS, side), where), _COUNTS, where)
+        distortion = _distortion(coefficients, document, where)
+        return models.nearest_lens(
+            name, _image_size(named, where), (k[0], k[4], k[2], k[5], k[1]), distortion, where
+        )
 
-    pair = {'camera': lens('camera', _MATRIX, _COEFFICIENTS)}
-    if any(name in document for name in _RIGHT_KEYS[0]):
-        pair = {'left': lens('left', _MATRIX, _COEFFICIENTS), 'right': lens('right', *_RIGHT_KEYS)}
+    sides = [
+        pair
+        for pair in _SIDES
+        if all(any(name in named for name in _sided(_MATRIX, side)) for side in pair)
+    ]
+    if sides:
+        found = dict(zip(STEREO, map(lens, STEREO, sides[0]), strict=True))
+    else:
+        found = {'camera': lens('camera', _only_side(named))}
     rigs: tuple[Pose, ...] = ()
-    if 'R' in document or 'T' in document:
-        turn = np.reshape(_matrix(value(('R',)), ((3, 3),), where), (3, 3))
-        place = _matrix(value(('T',)), ((3, 1), (1, 3)), where)
+    if any(name in named for name in (*_ROTATION, *_TRANSLATION)):
+        turn = np.reshape(_matrix(_value(named, _ROTATION, where), ((3, 3),), where), (3, 3))
+        place = _matrix(_value(named, _TRANSLATION, where), ((3, 1), (1, 3)), where)
         rigs = (fields.pose(place, turn, f'{where}: R, T'),)
-    return Foreign.from_lenses('OpenCV', pair, rigs)
+    given = Foreign.from_lenses('OpenCV', found, rigs)
+    assumed = _XI not in document and _IS_FISHEYE not in document
+    return given._replace(notes=(_FISHEYE_NOTE,) * (assumed and _has_four(named)))
+
+
+def _sided(names: Sequence[str], side: str) -> list[str]:
+    """Return the names of one camera's entry: `side` stands after or, as a word, before them."""
+    before = [side + name for name in names] if side.isalpha() else []
+    return [name + side for name in names] + before
+
+
+def _only_side(named: Mapping[str, Any]) -> str:
+    """Return what stands after the names of the only camera of a file: mostly nothing."""
+    sides = ('', *(side for pair in _SIDES for side in pair))
+    return next(
+        (side for side in sides if any(name in named for name in _sided(_MATRIX, side))), ''
+    )
+
+
+def _has_four(named: Mapping[str, Any]) -> bool:
+    """Say whether the coefficients of any camera are four."""
+    sides = ('', *(side for pair in _SIDES for side in pair))
+    given = (named.get(name) for side in sides for name in _sided(_COEFFICIENTS, side))
+    lists = (value.get('data') if isinstance(value, dict) else value for value in given)
+    return any(np.size(value) == _OF_FISHEYE for value in lists if isinstance(value, list))
+
+
+def _value(named: Mapping[str, Any], names: Sequence[str], where: str) -> Any:
+    """Return the value under the first of some names; raise LensError for none."""
+    for name in names:
+        if name in named:
+            return named[name]
+    raise LensError(f'{where}: it has none of {", ".join(names)}')
+
+
+def _image_size(named: Mapping[str, Any], where: str) -> list[float]:
+    """Return width and height, px; raise LensError where they are not told."""
+    for name in _SIZE:
+        if name in named:
+            return fields.numbers({'size': _flat(named[name])}, 'size', 2, where)
+    pair = [
+        next((named[name] for name in names if name in named), None) for names in (_WIDTH, _HEIGHT)
+    ]
+    if None in pair:
+        raise LensError(
+            f'{where}: the image size is missing; add image_width and image_height, px'
+        )
+    return fields.numbers({'size': pair}, 'size', 2, where)
 
 
 def _distortion(d: Sequence[float], document: Mapping[str, Any], where: str) -> models.Distortion:
@@ -104,20 +161,42 @@ def _distortion(d: Sequence[float], document: Mapping[str, Any], where: str) -> 
 
 
 def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[float]:
-    """Return the numbers of a matrix of one of some shapes, row by row."""
-    if not isinstance(value, dict) or (value.get('rows'), value.get('cols')) not in shapes:
+    """Return the numbers of a matrix of one of some shapes, row by row.
+
+    OpenCV 5 writes arrays of one dimension by their `sizes`; lists are those of other programs.
+    """
+    data = _flat(value)
+    shape: tuple[Any, ...] | None = None
+    if isinstance(value, dict):
+        shape = value.get('rows'), value.get('cols')
+        if isinstance(sizes := value.get('sizes'), list):
+            shape = tuple(map(int, [*sizes, 1][:2])) if 0 < len(sizes) < 3 else None
+    elif isinstance(data, list):
+        shape = next((one for one in shapes if one[0] * one[1] == len(data)), None)
+    if shape is None or shape not in shapes:
         raise LensError(
             f'{where}: a matrix of 3 x 3 and the four coefficients of cv2.fisheye are '
             'needed (of a rig R, 3 x 3, and T, 3 x 1)'
         )
-    return fields.numbers(value, 'data', value['rows'] * value['cols'], where)
+    return fields.numbers({'data': data}, 'data', int(shape[0] * shape[1]), where)
+
+
+def _flat(value: Any) -> Any:
+    """Return the numbers of a list of lists, or of a matrix, in one list."""
+    if isinstance(value, dict):
+        value = value.get('data')
+    if isinstance(value, list) and all(isinstance(row, list) for row in value):
+        return [number for row in value for number in row]
+    return value
 
 
 def _from_xml(text: str, where: str) -> dict[str, Any]:
     """Return the numbers, lists and matrices of a FileStorage in XML by name."""
     return {
-        one.tag: {part.tag: _parse_numbers(part.text, part.tag == 'data') for part in one}
-        if one.get('type_id') == 'opencv-matrix'
+        one.tag: {
+            part.tag: _parse_numbers(part.text, part.tag in ('data', 'sizes')) for part in one
+        }
+        if str(one.get('type_id')).startswith('opencv-')
         else _parse_numbers(one.text, False)
         for one in fields.xml(text, where, 'OpenCV file')
     }
@@ -141,6 +220,7 @@ def write(lens: Lens) -> str:
     storage.write('image_width', near.width)
     storage.write('image_height', near.height)
     storage.write('camera_matrix', models.camera_matrix(near))
+    storage.write(_IS_FISHEYE, 1)
     storage.write('distortion_coefficients', np.array([models.coefficients(near)]))
     text: str = storage.releaseAndGetString()
     return text
