@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs='+',
         metavar='PHOTOS',
         help='image files, folders or videos (left and right in their names for a rig), '
-        'rosbag2 recordings with Image or CompressedImage',
+        'recordings (rosbag2, ROS 1 bags) with Image or CompressedImage',
     )
     add_board_arguments(parser, required=True)
     parser.add_argument(
@@ -180,14 +180,16 @@ def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False)
     add_split_argument(parser)
 
 
-def add_split_argument(parser: argparse.ArgumentParser) -> None:
+def add_split_argument(
+    parser: argparse.ArgumentParser, default: str = '2 where both halves show the board'
+) -> None:
     """Declare --split, of photographs in which several cameras lie side by side."""
     parser.add_argument(
         '--split',
         type=positive_count,
         metavar='N',
         help='cameras side by side in each image: it is cut into N parts of equal width, left '
-        'and right or cam0, cam1, ...; default: 2 where both halves of wide images show the board',
+        f'and right or cam0, cam1, ...; default: {default}',
     )
 
 

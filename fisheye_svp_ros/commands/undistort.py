@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.commands.detect import image_size
+from fisheye_svp_ros.commands.detect import add_split_argument, image_size
 from fisheye_svp_ros.commands.lenses import Lenses, lenses_of, load_lenses
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.detect.photographs import (
-    IMAGES,
     count_photographs,
     doubtful_folders,
     find_photographs,
@@ -44,6 +43,7 @@ from fisheye_svp_ros.reporting.undistort_report import (
 # What camera_info calls the rectified cameras that it can describe, and its coefficients
 _CAMERA_INFO = {'pinhole': ('plumb_bob', 5), 'fisheye': ('equidistant', 4)}
 _RESULT = 'undistort.json'
+_MAX_LISTED = 12  # photographs that are skipped
 _PICTURES = ('mask.png', 'shift.png')  # of each camera, beside its photographs
 
 
@@ -82,6 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'pictures of the remaining errors and undistort.json to; for a rig, '
         'one subfolder per camera',
     )
+    add_split_argument(parser, '1')
     parser.add_argument(
         '--as',
         choices=PROJECTIONS,
@@ -122,13 +123,9 @@ def run(args: argparse.Namespace) -> None:
     with (
         keep_existing(fresh),
         write_together(),
-        progress('undistorting', count_photographs(paths)) as done,
+        progress('undistorting', count_photographs(paths, 1, args.split or 1)) as done,
     ):
-        counts = _write_photographs(sides, pair, paths, args.output, done)
-        if paths and not any(counts.values()):
-            raise ObservationError(
-                f'{", ".join(paths)}: no photograph can be read; images are {" ".join(IMAGES)}'
-            )
+        counts = _write_photographs(sides, pair, paths, args.output, args.split or 1, done)
         left = {name: shift_left(side) for name, side in sides.items() if not side.lens.is_svp}
         rows = rows_left(pair) if pair and left else None
         document: dict[str, Any] = {
@@ -172,7 +169,8 @@ def _rectifications(
     lenses = load_lenses(args.lens or args.inputs[:1])
     for line in doubtful_folders(paths):
         say(line)
-    photographed = tuple(dict.fromkeys(one.camera for one in find_photographs(paths)))
+    found = find_photographs(paths, split=args.split or 1)
+    photographed = tuple(dict.fromkeys(one.camera for one in found))
     by_camera = _by_camera(photographed, lenses)
     rig = _rig(args, by_camera)
     field = None if args.fov is None else float(np.radians(args.fov))
@@ -230,20 +228,23 @@ def _write_photographs(
     pair: RectifiedPair | None,
     paths: Sequence[str],
     folder: Path,
+    split: int,
     done: Any,
 ) -> dict[str, int]:
     """Write the rectified photographs, and a picture of the first pair; return how many."""
     counts = dict.fromkeys(sides, 0)
     written = {folder / name / file for name in sides for file in _PICTURES}
     first: dict[str, tuple[str, Any]] = {}
-    for photograph in find_photographs(paths):
+    skipped: list[str] = []
+    for photograph in find_photographs(paths, split=split):
         try:
             image = sides[photograph.camera].remap(photograph.pixels(color=True))
-        except ObservationError as error:
-            say(str(error))
+        except (ObservationError, ParameterError) as error:
+            skipped.append(str(error).removeprefix(f'{photograph.name}: '))
+            if len(skipped) <= _MAX_LISTED:
+                say(f'{photograph.name}: {skipped[-1]}; it is skipped')
+            done()
             continue
-        except ParameterError as error:
-            raise ParameterError(f'{photograph.name}: {error}') from error
         key = Path(photograph.key).name
         path = folder / photograph.camera / f'{key}.png'
         if path in written:
@@ -261,6 +262,10 @@ def _write_photographs(
         counts[photograph.camera] += 1
         first.setdefault(photograph.camera, (key, image))
         done()
+    if len(skipped) > _MAX_LISTED:
+        say(f'and {len(skipped) - _MAX_LISTED} more such photographs')
+    if skipped and not any(counts.values()):
+        raise ObservationError(f'{", ".join(paths)}: no photograph can be used: {skipped[0]}')
     if pair and len(first) == 2:
         left, right = (first[name] for name in sides)
         if left[0] == right[0]:

@@ -162,7 +162,7 @@ def detect(
         )
     if pattern.kind == 'aprilgrid':
         search(*_by_common_layout(begun, results))
-    searched = _add_notes(_one_size([results[number] for number in sorted(results)]))
+    searched = _add_notes(_of_cameras(_one_size([results[number] for number in sorted(results)])))
     if not any(one.points for one in searched):
         reasons = Counter(one.reason.partition(';')[0] for one in searched).most_common(2)
         said = ', '.join(f'{reason} ({count})' for reason, count in reasons)
@@ -294,6 +294,20 @@ def _one_size(searched: list[SearchedPhotograph]) -> list[SearchedPhotograph]:
     ]
 
 
+def _of_cameras(searched: list[SearchedPhotograph]) -> list[SearchedPhotograph]:
+    """Leave out boards in photographs of no camera where others are of one."""
+    cameras = sorted({one.camera for one in searched if one.camera and one.points})
+    reason = (
+        f'of no camera, others are of {", ".join(cameras)}; put it into a folder of its camera'
+    )
+    return [
+        replace(one, points=None, reason=reason)
+        if cameras and one.points and not one.camera
+        else one
+        for one in searched
+    ]
+
+
 def _add_notes(searched: list[SearchedPhotograph]) -> tuple[SearchedPhotograph, ...]:
     """Leave out copies; name photographs that are blurred, burnt out or from the same place."""
     blur = float(np.median([one.points.blur for one in searched if one.points] or [0.0]))
@@ -342,12 +356,6 @@ def _table(
     number = {key: i for i, key in enumerate(keys)}
     cameras = tuple(sorted({one.camera for one in searched if one.points}))
     found = [one for one in searched if one.points is not None]
-    if '' in cameras and len(cameras) > 1:
-        lone = next(one.name for one in found if not one.camera)
-        raise ObservationError(
-            f'{lone}: of no camera, others are of {", ".join(cameras[1:])}; '
-            'put it into a folder named after its camera'
-        )
     certainty = np.ones(len(searched))
     if len(pattern.symmetries) > 1:
         found, sure = _agree_on_order(found, pattern, cameras, number, source)

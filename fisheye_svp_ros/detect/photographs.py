@@ -21,7 +21,7 @@ from fisheye_svp_ros.detect.image_messages import image_pixels
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.files import read_bytes
-from fisheye_svp_ros.io.recording_files import is_recording
+from fisheye_svp_ros.io.recording_files import ROS1_SUFFIX, is_recording
 from fisheye_svp_ros.scene.observations import STEREO
 
 Pixels = NDArray[Any]  # (H, W), uint8 or uint16, grey
@@ -41,15 +41,15 @@ _ORIENTATION = re.compile(
 class Photograph:
     """One photograph: its name for people, which instant and camera, t in s (NaN: unknown).
 
-    data: a path or bytes of an image file, or pixels; part: which of how many cameras that lie
-    side by side in it.
+    data: a path or bytes of an image file, pixels, or why there are none; part: which of how many
+    cameras that lie side by side in it.
     """
 
     name: str
     key: str
     camera: str
     t: float
-    data: Path | bytes | Pixels
+    data: Path | bytes | Pixels | ObservationError
     part: tuple[int, int] = (0, 1)
 
     def pixels(self, color: bool = False) -> Pixels:
@@ -60,6 +60,8 @@ class Photograph:
         data = self.data
         if isinstance(data, Path):
             data = read_bytes(data, ObservationError)
+        if isinstance(data, ObservationError):
+            raise data
         whole = data if isinstance(data, np.ndarray) else decode_image(data, self.name, color)
         part, count = self.part
         width = whole.shape[1] // count
@@ -87,9 +89,9 @@ def find_photographs(paths: Sequence[str], every: int = 1, split: int = 1) -> It
     topics in such namespaces are the cameras of a rig; equal names, and equal stamps, are the same
     instant.  A name that a camera had in an earlier path is another instant: the number of its
     path stands before it.  every: take one of so many; split: cameras side by side in each.
-    Raises ObservationError for a path without any.
+    Raises ObservationError where no path has any.
     """
-    earlier: set[tuple[str, str]] = set()
+    earlier, empty = set[tuple[str, str]](), list[Path]()
     given = [*map(Path, paths)]
     named = _path_cameras(given)
     for place, path in enumerate(given):
@@ -102,10 +104,9 @@ def find_photographs(paths: Sequence[str], every: int = 1, split: int = 1) -> It
                     photograph = replace(photograph, key=f'{place}/{photograph.key}')
                 yield from photograph.split(split)
         earlier |= own
-        if number < 0:
-            raise ObservationError(
-                f'{path}: it and its folders hold no photograph; images are {" ".join(IMAGES)}'
-            )
+        empty += [path] * (number < 0)
+    if empty and len(empty) == len(given):
+        raise ObservationError(_no_photograph(empty[0]))
 
 
 def count_photographs(paths: Sequence[str], every: int = 1, split: int = 1) -> int | None:
@@ -133,8 +134,17 @@ def doubtful_folders(paths: Sequence[str]) -> Iterator[str]:
     loose = [path for path in given if not path.is_dir()]
     yield from _doubtful_names('the files', loose)
     for folder in folders:
+        if len(given) > 1 and not any(map(_media, photograph_folders(folder))):
+            yield _no_photograph(folder)
         yield from _skipped(folder, given)
         yield from _doubtful_names(str(folder), _media(folder))
+
+
+def _no_photograph(path: Path) -> str:
+    bags = [p.name for p in path.glob(f'*{ROS1_SUFFIX}')] if path.is_dir() else []
+    if bags:
+        return f'{path}: bags of ROS 1 are given as files, such as {path / bags[0]}'
+    return f'{path}: it and its folders hold no photograph; images are {" ".join(IMAGES)}'
 
 
 def _equal_names(folders: Sequence[Path]) -> Iterator[str]:
@@ -398,7 +408,11 @@ def _recording(path: Path) -> Iterator[Photograph]:
         t = stamp.sec + 1e-9 * stamp.nanosec
         name = f'{path} {record.topic} {t:.9f}'
         camera = _camera(record.topic, topics)
-        data = message_pixels(record.message, record.typename, name)
+        data: Pixels | ObservationError
+        try:
+            data = message_pixels(record.message, record.typename, name)
+        except ObservationError as error:
+            data = error
         yield Photograph(name, f'{stamp.sec:012d}.{stamp.nanosec:09d}', camera, t, data)
 
 

@@ -262,16 +262,47 @@ def test_what_cannot_be_done_is_said_in_a_line(
     small = tmp_path / 'small'
     small.mkdir()
     cv2.imwrite(str(small / 'x.png'), np.zeros((40, 42), np.uint8))
-    said = refused(capsys, 'undistort', lens, small, *end)
+    assert cli.main(['undistort', str(lens), str(small), '-o', str(out)]) == 2
+    said = capsys.readouterr().err
     assert "x.png: the image is 42x40 px, lens 'small' is for 424x400 px" in said
-    twice = [photos / 'left' / '00.png', photos / 'right' / '00.png']
+    assert 'small: no photograph can be used: the image is 42x40 px' in said
+    twice = [photos / 'left' / '00.png', tmp_path / 'other' / '00.png']
+    (tmp_path / 'other').mkdir()
+    shutil.copy(photos / 'right' / '00.png', twice[1])
     (tmp_path / 'a.csv').write_text('frame')
     assert cli.main(['undistort', str(lens), str(tmp_path / 'a.csv'), '-o', str(out)]) == 2
-    assert 'no photograph can be read; images are .png' in capsys.readouterr().err
+    assert 'no photograph can be used: the image cannot be read' in capsys.readouterr().err
     assert 'another photograph is also called 00' in refused(
         capsys, 'undistort', lens, *twice, *end
     )
     assert not out.exists() or not [*out.rglob('*.*')]
+
+
+def test_a_photograph_of_another_size_is_skipped(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(folder / 'photos' / 'left', tmp_path / 'photos')
+    cv2.imwrite(str(tmp_path / 'photos' / 'x.png'), np.zeros((40, 42), np.uint8))
+    (tmp_path / 'photos' / 'y.png').write_text('no image')
+    lens, out = folder / 'lenses' / 'left.yaml', tmp_path / 'out'
+    assert cli.main(['undistort', str(lens), str(tmp_path / 'photos'), '-o', str(out)]) == 0
+    said = capsys.readouterr().err
+    assert "x.png: the image is 42x40 px, lens 'small' is for 424x400 px" in said
+    assert 'y.png: the image cannot be read' in said
+    assert (out / '00.png').exists() and not (out / 'x.png').exists()
+
+
+def test_images_side_by_side_are_undistorted_apart(folder: Path, tmp_path: Path) -> None:
+    pair = [cv2.imread(str(folder / 'photos' / name / '00.png'), 0) for name in ('left', 'right')]
+    cv2.imwrite(str(tmp_path / '00.png'), np.hstack(pair))
+    lenses = f'{folder / "lenses"}/'
+    for paths, out in ((folder / 'photos', 'apart'), (tmp_path / '00.png', 'joined')):
+        split = ['--split', '2'] if out == 'joined' else []
+        command = ['undistort', lenses, str(paths), *split, '-o', str(tmp_path / out)]
+        assert cli.main(command) == 0
+    for name in ('left', 'right'):
+        apart, joined = (tmp_path / out / name / '00.png' for out in ('apart', 'joined'))
+        assert apart.read_bytes() == joined.read_bytes()
 
 
 def test_a_broken_photograph_is_named_and_the_rest_goes_on(
