@@ -22,7 +22,7 @@ from fisheye_svp_ros.io.csv_files import FramePoses
 from fisheye_svp_ros.io.parameters import SWEEP, rows, with_values
 from fisheye_svp_ros.io.readers import check_size_given, check_sizes, read_observations, read_poses
 from fisheye_svp_ros.io.rig_files import load_pair
-from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.io.share import typed_lens_path
 from fisheye_svp_ros.library_checks import (
     check_list,
     check_numbers,
@@ -79,7 +79,7 @@ def load_lens(lens: AnyLens) -> Lens:
 
     Raises LensError, naming file and field, for anything impossible.
     """
-    return lens if isinstance(lens, Lens) else lens_files.load_lens(lens_path(str(lens)))
+    return lens if isinstance(lens, Lens) else lens_files.load_lens(typed_lens_path(str(lens)))
 
 
 def save_lens(lens: Lens, path: str | Path) -> None:

@@ -84,13 +84,13 @@ def run(args: argparse.Namespace) -> None:
     import numpy as np
 
     from fisheye_svp_ros.io.files import write_json
-    from fisheye_svp_ros.io.share import lens_path
+    from fisheye_svp_ros.io.share import typed_lens_path
     from fisheye_svp_ros.reporting.budget_report import BudgetRequest, answer, document, draw, rows
     from fisheye_svp_ros.reporting.terminal import print_table, progress
     from fisheye_svp_ros.scene.rigs import rig
     from fisheye_svp_ros.study.budget import Setup, at_point, default_spread, make_budget
 
-    lens = load_with_notes(lens_path(args.lens))
+    lens = load_with_notes(typed_lens_path(args.lens))
     spread = default_spread(lens) if args.spread is None else np.radians(args.spread).item()
     limits = {
         name: (value := getattr(args, option[2:].replace('-', '_'))) and factor * value

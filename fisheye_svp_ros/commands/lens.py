@@ -15,10 +15,16 @@ from fisheye_svp_ros.effects.extension import LANDMARKS
 from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_text
-from fisheye_svp_ros.io.lens_files import cameras_in, read_lens_file, save_lens
-from fisheye_svp_ros.io.lens_formats import WRITABLE, read_foreign, write_foreign
-from fisheye_svp_ros.io.rig_files import rigs_of_lenses, save_rig
-from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file, save_lens
+from fisheye_svp_ros.io.lens_formats import (
+    RIG_WRITABLE,
+    WRITABLE,
+    read_foreign,
+    write_foreign,
+    write_foreign_rig,
+)
+from fisheye_svp_ros.io.rig_files import load_cameras, rigs_of_lenses, save_rig
+from fisheye_svp_ros.io.share import typed_lens_path
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import IMAGE_FIELD, PORT, Lens
 from fisheye_svp_ros.pose import Pose
@@ -61,7 +67,7 @@ def run(args: argparse.Namespace) -> None:
         raise ParameterError(f'--format {args.format} needs -o FILE')
     if args.range_m is not None and not args.format:
         raise ParameterError(f'--range {args.range_m:g} needs --format, for example ros')
-    path = lens_path(args.lens)
+    path = typed_lens_path(args.lens)
     foreign = read_lens_file(path)
     if foreign is not None and not foreign.lenses and not args.format:
         _print_rig(foreign.rigs)
@@ -69,10 +75,15 @@ def run(args: argparse.Namespace) -> None:
             save_rig(foreign.rigs, args.output, foreign.cameras or STEREO)
         return
     lens = load_with_notes(path)
-    if several := cameras_in(path):
+    several, steps = cameras_in(path), rigs_of_lenses(path)
+    chain = load_cameras(path)[0] if steps else ()
+    whole = args.format in RIG_WRITABLE and len(chain) > 1 and sorted(chain) == sorted(several)
+    if several:
+        only = f' and only {several[0]} is written' if args.output and not whole else ''
         say(
-            f'{path}: it holds {", ".join(several)}; the first is shown; use '
+            f'{path}: it holds {", ".join(several)}; the first is shown{only}; use '
             f'{args.lens}#{several[1]} for another'
+            + (f', or --format {" or ".join(RIG_WRITABLE)} for the rig' if only and steps else '')
         )
     print(
         f'{lens.name}: {lens.width}x{lens.height} px, up to {np.degrees(lens.max_incidence):.2f}'
@@ -95,17 +106,37 @@ def run(args: argparse.Namespace) -> None:
                     f'  {camera}: kannala_brandt fitted to {foreign.form}, at most {worst:.2g} '
                     'px off'
                 )
-    _print_rig(rigs_of_lenses(path))
+    _print_rig(steps)
     if args.output and args.format:
-        _convert(lens, args)
+        cameras = [load_lens(f'{path}#{name}') for name in chain] if whole else []
+        _convert(cameras or [lens], steps if cameras else (), args)
     elif args.output:
         save_lens(lens, args.output)
     if args.output:
         print(f'{args.output}: {args.format or "lens file of this package"}')
 
 
-def _convert(lens: Lens, args: argparse.Namespace) -> None:
-    """Write another tool's form of the lens, or of the nearest SVP lens; say what that loses."""
+def _convert(lenses: Sequence[Lens], steps: Sequence[Pose], args: argparse.Namespace) -> None:
+    """Write another tool's form of lenses, or of the nearest SVP lenses; say what that loses.
+
+    steps: each camera in the next one, of a rig.
+    """
+    fitted = [_at_range(lens, args) for lens in lenses]
+    given = [lens for lens, _ in fitted]
+    if len(given) > 1:
+        text = write_foreign_rig(given, steps, args.format)
+    else:
+        text = write_foreign(given[0], args.format)
+    write_text(args.output, text)
+    written = read_foreign(args.output, text)
+    for i, (lens, (near, ranges)) in enumerate(zip(lenses, fitted, strict=True)):
+        if written is not None:
+            _print_loss(lens, [*written.lenses.values()][i], ranges, args.range_m is None)
+        note_reader_limit(near, args.format)
+
+
+def _at_range(lens: Lens, args: argparse.Namespace) -> tuple[Lens, tuple[float, ...]]:
+    """Return the lens, or the SVP lens nearest at the range that is asked for, and ranges, m."""
     given, ranges = lens, _RANGES
     if args.range_m is not None and lens.is_svp:
         say(f'--range {args.range_m:g} changes nothing: lens {lens.name!r} has a single viewpoint')
@@ -116,12 +147,7 @@ def _convert(lens: Lens, args: argparse.Namespace) -> None:
             f'  one viewpoint, fitted at {range_text(args.range_m)}: {worst:.2g} px off there '
             'at most'
         )
-    text = write_foreign(given, args.format)
-    write_text(args.output, text)
-    written = read_foreign(args.output, text)
-    if written is not None:
-        _print_loss(lens, next(iter(written.lenses.values())), ranges, args.range_m is None)
-    note_reader_limit(given, args.format)
+    return given, ranges
 
 
 def _print_rig(steps: Sequence[Pose]) -> None:

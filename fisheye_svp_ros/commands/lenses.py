@@ -12,7 +12,7 @@ from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.effects.ray_effects import DomePortEffect
 from fisheye_svp_ros.errors import LensError, ParameterError
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file
-from fisheye_svp_ros.io.share import is_there, lens_path, without_camera
+from fisheye_svp_ros.io.share import is_there, typed_lens_path, without_camera
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.optics.ports import MEDIA, DomeGlass, FlatGlass, Port
 
@@ -92,7 +92,7 @@ def load_lenses(given: Sequence[str]) -> Lenses:
                 f'{"of camera " + camera if camera else "without a camera"} is '
                 'already given'
             )
-        file = lens_path(path)
+        file = typed_lens_path(path)
         lenses[camera] = load_with_notes(file)
         if not camera:
             lenses.file, lenses.names = path, cameras_in(file)

@@ -17,7 +17,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.readers import write_poses
-from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.io.share import typed_lens_path
 from fisheye_svp_ros.optics.camera import incidence
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.planning import MAX_VIEWS
@@ -172,7 +172,7 @@ def _lens(args: argparse.Namespace) -> Lens:
     if (args.lens is None) == (args.fov is None) or bool(args.fov) != bool(args.image_size):
         raise ParameterError('give --lens LENS, or --fov and --image-size')
     if args.lens is not None:
-        return load_with_notes(lens_path(args.lens))
+        return load_with_notes(typed_lens_path(args.lens))
     if not 0 < args.fov < 360:
         raise ParameterError(f'--fov {args.fov:g}: it must be between 0 and 360 degrees')
     try:

@@ -19,7 +19,7 @@ from fisheye_svp_ros.io.image_files import write_png
 from fisheye_svp_ros.io.lens_files import cameras_in
 from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses
 from fisheye_svp_ros.io.rig_files import cameras_in_first, rigs_of_lenses
-from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.io.share import typed_lens_path
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.reporting.terminal import progress
@@ -166,7 +166,7 @@ def _of_random_poses(args: argparse.Namespace) -> tuple[int, Ranges]:
 
 def _cameras(given: str) -> Cameras:
     """Return lens and place of each camera, the first being that of the poses."""
-    path = lens_path(given)
+    path = typed_lens_path(given)
     names = cameras_in(path)
     rigs = rigs_of_lenses(path) if names else ()
     if not names:

@@ -23,7 +23,7 @@ from fisheye_svp_ros.io.files import keep_existing, write_json, write_text, writ
 from fisheye_svp_ros.io.image_files import save_maps, write_png
 from fisheye_svp_ros.io.lens_formats.ros import camera_info_text
 from fisheye_svp_ros.io.rig_files import load_pair, pair_of_lenses
-from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.io.share import typed_lens_path
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.cameras import PROJECTIONS, STEREO_PROJECTIONS, camera_for
@@ -206,7 +206,7 @@ def _rig(args: argparse.Namespace, lenses: dict[str, Lens]) -> Pose | None:
         return load_pair(args.rig, list(lenses))
     if args.lens or len(lenses) != 2:
         return None
-    return pair_of_lenses(lens_path(args.inputs[0]), list(lenses))
+    return pair_of_lenses(typed_lens_path(args.inputs[0]), list(lenses))
 
 
 def _note_unrectified(cameras: Sequence[str]) -> None:

@@ -29,6 +29,19 @@ def lens_path(name: str) -> Path:
     return _given_or_named(name, 'lenses', LensError)
 
 
+def typed_lens_path(name: str) -> Path:
+    """Return what `lens_path` does of a name that a user typed: a folder needs no slash then.
+
+    A lens of this package comes before a folder of its name.
+    """
+    try:
+        return lens_path(name)
+    except LensError:
+        if is_there(Path(without_camera(name)[0]), Path.is_dir):
+            return Path(name)
+        raise
+
+
 def sweep_path(name: str) -> Path:
     """Return a sweep file as given, or that in config/sweeps; raise ParameterError for neither."""
     return _given_or_named(name, 'sweeps', ParameterError)

@@ -426,8 +426,9 @@ def test_cameras_of_a_chain_are_in_the_order_of_their_numbers(
     assert capsys.readouterr().err == ''
     assert cli.main(['lens', str(path), '-o', str(out)]) == 0
     assert capsys.readouterr().err == (
-        f'fisheye-svp: note: {path}: it holds {", ".join(foreign.lenses)}; the first is shown; '
-        f'use {path}#cam1 for another\n'
+        f'fisheye-svp: note: {path}: it holds {", ".join(foreign.lenses)}; the first is shown '
+        f'and only cam0 is written; use {path}#cam1 for another, or --format kalibr or basalt for '
+        'the rig\n'
     )
 
 

@@ -45,6 +45,7 @@ READERS_TO_90_DEG = {
     'opencv': 'cv2.fisheye',
     'colmap': 'COLMAP',
 }
+RIG_WRITABLE = ('kalibr', 'basalt')  # cameras with the transforms between them
 _GRID = 100  # image points along each axis
 READABLE = (
     'ROS camera_info, Kalibr, OpenCV, Basalt, mrcal, EuRoC, COLMAP, ORB-SLAM3, CamOdoCal, '
@@ -133,4 +134,10 @@ def write_foreign(lens: Lens, form: str) -> str:
     if form not in WRITABLE:
         raise LensError(f'format {form!r} is unknown; known are {", ".join(WRITABLE)}')
     text: str = import_module(f'{__name__}.{form}').write(lens)
+    return text
+
+
+def write_foreign_rig(lenses: Sequence[Lens], rigs: Sequence[Pose], form: str) -> str:
+    """Return lenses and each camera in the next one, in one of RIG_WRITABLE; else as above."""
+    text: str = import_module(f'{__name__}.{form}').write_chain(lenses, rigs)
     return text

@@ -12,7 +12,7 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.files import parse_json
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.pose import Pose, identity, quaternion_from_rotation
 
 recognises = re.compile(r'\s*\{.*"camera_type"', re.DOTALL).match
 # Coefficients of each model, and what they make
@@ -73,21 +73,35 @@ def _rigs(entries: Sequence[Mapping[str, Any]], where: str) -> tuple[Pose, ...]:
 
 def write(lens: Lens) -> str:
     """Return the lens in this form, as the one camera of its rig."""
-    near = models.nearest_kannala_brandt(lens)
-    values = {'fx': near.fx, 'fy': near.fy, 'cx': near.cx, 'cy': near.cy}
-    values |= {f'k{i}': k for i, k in enumerate(models.coefficients(near), start=1)}
-    return (
-        json.dumps(
-            {
-                'value0': {
-                    'T_imu_cam': [
-                        dict(zip(_NAMES, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), strict=True))
-                    ],
-                    'intrinsics': [{'camera_type': 'kb4', 'intrinsics': values}],
-                    'resolution': [[near.width, near.height]],
-                }
-            },
-            indent=4,
-        )
-        + '\n'
-    )
+    return write_chain([lens], ())
+
+
+def write_chain(lenses: Sequence[Lens], rigs: Sequence[Pose]) -> str:
+    """Return lenses and each camera in the next one in this form, the first as the IMU.
+
+    Viewpoint shifts stay behind.
+    """
+    near = [models.nearest_kannala_brandt(lens) for lens in lenses]
+    places = [identity()]
+    for rig in rigs:
+        places.append(places[-1].compose(rig.inverse()))
+    document = {
+        'T_imu_cam': [
+            dict(
+                zip(
+                    _NAMES,
+                    [*place.position.tolist(), *quaternion_from_rotation(place.rotation).tolist()],
+                    strict=True,
+                )
+            )
+            for place in places
+        ],
+        'intrinsics': [{'camera_type': 'kb4', 'intrinsics': _intrinsics(one)} for one in near],
+        'resolution': [[one.width, one.height] for one in near],
+    }
+    return json.dumps({'value0': document}, indent=4) + '\n'
+
+
+def _intrinsics(lens: Lens) -> dict[str, float]:
+    values = {'fx': lens.fx, 'fy': lens.fy, 'cx': lens.cx, 'cy': lens.cy}
+    return values | {f'k{i}': k for i, k in enumerate(models.coefficients(lens), start=1)}
