@@ -178,9 +178,11 @@ def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
     # The problem of a robot has no poses any more.
     observations = evaluated.evaluation.selection.problem.inputs.observations
     inputs, views = replace(inputs, observations=observations), evaluated.turned
+    # Beside a large effect that is held back, offsets of landmarks are no sign of another order.
+    held_back = any(one.reason is Reason.IMPLAUSIBLE for one in evaluated.candidates)
     turned = (
         []
-        if inputs.poses is not None
+        if inputs.poses is not None or held_back
         else find_turned_frames(evaluated.evaluation.null, evaluated.evaluation.fitted)
     )
     if any(one.corrected for one, _ in turned):
