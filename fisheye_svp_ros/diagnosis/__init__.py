@@ -42,7 +42,7 @@ from fisheye_svp_ros.diagnosis.decision import (
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import MAX_RMS_RATIO
-from fisheye_svp_ros.diagnosis.findings import Finding, Reason, Rival, Status
+from fisheye_svp_ros.diagnosis.findings import Finding, Reason, Rival, Status, status_of
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
 from fisheye_svp_ros.diagnosis.model_errors import ErrorParts, LensErrors, pose_maps, pose_summary
 from fisheye_svp_ros.diagnosis.null_model import NullModel
@@ -97,5 +97,6 @@ __all__ = [
     'pose_summary',
     'predict_other_data',
     'stage_shares',
+    'status_of',
     'total_errors',
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import isnan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index, flat_rows
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
+from fisheye_svp_ros.diagnosis.findings import Status, probability_of, status_of
 from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
 from fisheye_svp_ros.diagnosis.variance_budget import NoiseGrowth
 from fisheye_svp_ros.effects.base import Effect
@@ -47,7 +49,8 @@ class Cause:
 
     form: `Effect.key`; p_value: corrected for the effects and forms that were tested; share: of
     the misfit of the simulation; survives: whether it is still needed with any one other cause
-    left out; heldout_rms_px, gain: of held-out frames once it is in the model; imitations: effects
+    left out; heldout_rms_px: of held-out frames once it is in the model, after those before it;
+    gain: of what held-out frames lose without it; imitations: effects
     that are not tested and that it may stand for; refuted_by_frames: first and last frame of
     contiguous thirds that are predicted worse with it.
     """
@@ -67,6 +70,16 @@ class Cause:
     def effect(self) -> str:
         """The name of the effect."""
         return self.form.partition('(')[0]
+
+    @property
+    def probability(self) -> float:
+        """How probable the cause is."""
+        return probability_of(self.p_value)
+
+    @property
+    def status(self) -> Status:
+        """Confirmed where it predicts better, or moves no prediction, and is probable enough."""
+        return status_of(self.probability, isnan(self.heldout_rms_px) or self.gain > 0)
 
     @property
     def effect_class(self) -> type[Effect]:

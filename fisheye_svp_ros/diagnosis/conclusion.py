@@ -30,7 +30,7 @@ from fisheye_svp_ros.diagnosis.decision import (
 )
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
-from fisheye_svp_ros.diagnosis.findings import Finding
+from fisheye_svp_ros.diagnosis.findings import Finding, Status
 from fisheye_svp_ros.diagnosis.lens_evidence import compare_lens_files, find_bounds, find_lens_rays
 from fisheye_svp_ros.diagnosis.random_effects import SAG
 from fisheye_svp_ros.diagnosis.variance_budget import Component
@@ -361,6 +361,7 @@ def conclude(
             noise_px=evaluation.noise_px,
             falling=evaluation.falling,
             frames=evaluation.frames,
+            refuted=[one.effect for one in candidates if one.status is Status.REFUTED],
         )
     )
     scatter = np.hypot.reduce(

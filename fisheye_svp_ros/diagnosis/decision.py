@@ -152,7 +152,7 @@ class LensFacts(NamedTuple):
     has_likely_shift: whether the extended lens has a viewpoint shift that is likely and not named;
     named_gain: value, low of what all causes gain held out; offset: None where intrinsics were
     not fitted; falling: whether no error rises with the causes on the fitted frames; frames: how
-    many.
+    many; refuted: effects that held-out data, or their size, refute.
     """
 
     lens_causes: Sequence[str]
@@ -165,6 +165,7 @@ class LensFacts(NamedTuple):
     noise_px: float
     falling: bool
     frames: int
+    refuted: Sequence[str] = ()
 
     @property
     def wrong_intrinsics(self) -> list[str]:
@@ -174,7 +175,11 @@ class LensFacts(NamedTuple):
     @property
     def likely_effects(self) -> list[EffectBound]:
         """Effects that are not named and yet likely there, the costliest first."""
-        likely = (b for b in self.bounds if b.z > _HINT and b.edge_px > self.noise_px)
+        likely = (
+            one
+            for one in self.bounds
+            if one.z > _HINT and one.edge_px > self.noise_px and one.effect not in self.refuted
+        )
         return sorted(likely, key=lambda bound: -bound.edge_px)
 
 

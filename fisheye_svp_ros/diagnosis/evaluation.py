@@ -348,7 +348,8 @@ class Evaluation:
         total = sum(squares.values())
         shares = {name: named * s / total if total else 0.0 for name, s in squares.items()}
         held_out = [
-            (after.rms, self._gain(before, after).value) for before, after in pairwise(predictions)
+            (after.rms, self._gain(self.predict([name]), predictions[-1]).value)
+            for name, after in zip(self.names, predictions[1:], strict=True)
         ]
         causes = selected_causes(
             EffectTests(self.null), self.selection.causes, self.errors, shares, held_out

@@ -1,11 +1,19 @@
-"""What came of an effect that was tried, and why: a round of the selection, or the last word."""
+"""What came of an effect that was tried, and why: a round of the selection, or the last word.
+
+One probability and one status: of confirmed causes, of what is not confirmed, everywhere alike.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from math import e, exp, log
 from typing import Any, NamedTuple
+
+CONFIRMED_PROBABILITY = 0.95
+LIKELY_PROBABILITY = 0.5
+_MAX_SQUARE = 200.0  # of z: beyond it, the probability is 0
 
 
 class Status(Enum):
@@ -34,9 +42,9 @@ class Reason(Enum):
     IMPLAUSIBLE = 12  # larger than in any real lens
 
     @property
-    def status(self) -> Status:
-        """Return what follows from it."""
-        return _STATUS.get(self, Status.NOT_NEEDED)
+    def refutes(self) -> bool:
+        """Whether held-out data, or its size, are evidence against an effect."""
+        return self in (Reason.REFUTED_BY_FRAMES, Reason.REFUTED_BY_FILE, Reason.IMPLAUSIBLE)
 
     @property
     def is_removal(self) -> bool:
@@ -44,16 +52,27 @@ class Reason(Enum):
         return self in (Reason.EXPLAINED_BY_OTHERS, Reason.NO_LASTING_GAIN)
 
 
-_STATUS = {
-    Reason.PREDICTS_BETTER: Status.CONFIRMED,
-    Reason.BEYOND_BULK: Status.CONFIRMED,
-    Reason.NO_CONVINCING_GAIN: Status.LIKELY,
-    Reason.NO_GAIN: Status.LIKELY,
-    Reason.NO_OTHER_FRAME: Status.LIKELY,
-    Reason.REFUTED_BY_FRAMES: Status.REFUTED,
-    Reason.REFUTED_BY_FILE: Status.REFUTED,
-    Reason.IMPLAUSIBLE: Status.REFUTED,
-}
+def probability_of(p_corrected: float) -> float:
+    """Return the largest probability of an effect that a corrected p-value allows.
+
+    The odds before the data are even: that many effects were tried is in the correction.
+    Source: Sellke, Bayarri and Berger, Calibration of p values for testing precise null
+    hypotheses, The American Statistician 55 (2001).
+    """
+    if p_corrected <= 0:
+        return 1.0
+    p = min(p_corrected, 1 / e)
+    return 1 / (1 - e * p * log(p))
+
+
+def status_of(probability: float, predicts_better: bool) -> Status:
+    """Return what is to be thought of an effect that nothing refutes.
+
+    predicts_better: whether frames that were left out are predicted better with it.
+    """
+    if predicts_better and probability >= CONFIRMED_PROBABILITY:
+        return Status.CONFIRMED
+    return Status.LIKELY if probability > LIKELY_PROBABILITY else Status.NOT_NEEDED
 
 
 class Rival(NamedTuple):
@@ -69,7 +88,9 @@ class Finding:
 
     form: `Effect.key`; p_corrected: p_value times the numbers of effects and of this one's forms;
     held_out, held_out_stderr: what it adds to the log predictive density of frames left out, NaN
-    where that was not asked; parameters: value, stderr, unit by name, as far as it was fitted.
+    where that was not asked; z: by how many of its errors over the frames the held-out sum of
+    squares falls with it; parameters: value, stderr, unit by name, as far as it was fitted;
+    averaged: its probability in the average of models that is written, None where it is not in it.
     """
 
     form: str
@@ -82,6 +103,8 @@ class Finding:
     held_out_stderr: float = float('nan')
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     rival: Rival | None = None
+    z: float = 0.0
+    averaged: float | None = None
 
     @property
     def effect(self) -> str:
@@ -91,12 +114,23 @@ class Finding:
     @property
     def status(self) -> Status:
         """What is to be thought of the effect."""
-        return self.reason.status
+        if self.reason.refutes:
+            return Status.REFUTED
+        return status_of(self.probability, self.accepted)
+
+    @property
+    def probability(self) -> float:
+        """How probable the effect is; where held-out data refute it, by their evidence alone."""
+        if self.reason is Reason.IMPLAUSIBLE:
+            return 0.0
+        if self.reason.refutes:
+            return 1 / (1 + exp(min(self.z**2, _MAX_SQUARE) / 2))
+        return probability_of(self.p_corrected) if self.averaged is None else self.averaged
 
     @property
     def accepted(self) -> bool:
         """Whether it was taken into the model."""
-        return self.status is Status.CONFIRMED
+        return self.reason in (Reason.PREDICTS_BETTER, Reason.BEYOND_BULK)
 
     @property
     def is_removal(self) -> bool:

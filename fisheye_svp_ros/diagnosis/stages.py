@@ -243,6 +243,12 @@ def _conclude(
         evaluation.uncertainty['image_px']['misfit'],
         evaluation.extended_lenses,
     )
+    if averaged.shifts:
+        likeliest = max(shift.weight for shift in averaged.shifts)
+        candidates = [
+            replace(one, averaged=likeliest) if one.effect == 'viewpoint_shift' else one
+            for one in candidates
+        ]
     advice = advise(evaluation, causes, significant)
     conclusion = conclude(
         evaluation,
@@ -314,7 +320,7 @@ def _weakest_cause(evaluation: Evaluation) -> tuple[PlacedEffect, Finding] | Non
     doubts = list(_doubts(evaluation))
     if not doubts:
         return None
-    _, cause, reason, rival = min(doubts, key=lambda one: one.z)
+    z, cause, reason, rival = min(doubts, key=lambda one: one.z)
     effect, columns, values = cause
     tests = EffectTests(evaluation.null)
     p_value = tests.test_removal(evaluation.null.included_columns, columns, effect).p_value
@@ -325,6 +331,7 @@ def _weakest_cause(evaluation: Evaluation) -> tuple[PlacedEffect, Finding] | Non
         p_corrected=tests.correct(effect, p_value),
         parameters=parameters_of(effect, values, evaluation.errors[columns]),
         rival=rival,
+        z=z,
     )
 
 
@@ -349,8 +356,10 @@ def _doubts(evaluation: Evaluation) -> Iterator[_Doubt]:
             reason = Reason.NO_OTHER_FRAME
         elif z <= 1:
             reason = Reason.REFUTED_BY_FRAMES if z < -1 else Reason.NO_GAIN
-        elif other is not None and _gain_in_sigmas(evaluation.predict([effect.name]), other) < -1:
-            reason = Reason.REFUTED_BY_FILE
+        elif other is not None:
+            z_file = _gain_in_sigmas(evaluation.predict([effect.name]), other)
+            if z_file < 0:
+                reason, z = (Reason.REFUTED_BY_FILE if z_file < -1 else Reason.NO_GAIN), z_file
         if reason is None:
             reason, rival = find_confounder(tests, effect, columns, twins)
         if reason is None and _is_implausible(effect, values):

@@ -91,10 +91,15 @@ def size(diagnosis: Diagnosis, cause: Cause) -> str:
     return f'size within its error: {text}' if within else text
 
 
-def most_significant(parameters: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the parameter that is most standard errors from zero, and its value; '' of none."""
+def most_significant(parameters: Mapping[str, Mapping[str, Any]], least: float) -> str:
+    """Return the parameter that is most standard errors from zero, and its value.
+
+    '' where that is less than so many, or there is none; what has no error always counts.
+    """
     name = max(parameters, key=lambda one: _significance(parameters[one]), default='')
-    return f'{name} = {quantity(parameters[name])}' if name else ''
+    if not name or (parameters[name]['stderr'] > 0 and _significance(parameters[name]) < least):
+        return ''
+    return f'{name} = {quantity(parameters[name])}'
 
 
 def _is_determined(entry: Mapping[str, Any]) -> bool:

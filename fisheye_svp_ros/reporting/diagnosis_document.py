@@ -73,6 +73,8 @@ def _cause(one: Cause) -> dict[str, Any]:
         'form': one.form,
         'parameters': one.parameters,
         'p_value': one.p_value,
+        'probability': one.probability,
+        'status': one.status.value,
         'share': one.share,
         'survives': one.survives,
         'heldout_rms_px': one.heldout_rms_px,
@@ -100,6 +102,8 @@ def _candidate(one: Finding) -> dict[str, Any]:
         'effect': one.effect,
         'parameters': one.parameters,
         'p_value': one.p_corrected,
+        'probability': one.probability,
+        'status': one.status.value,
         'why': finding_reason(one),
     }
 

@@ -26,7 +26,7 @@ from fisheye_svp_ros.reporting.next_steps import (
     follow_up_files,
 )
 from fisheye_svp_ros.reporting.wording.advice import separation
-from fisheye_svp_ros.reporting.wording.findings import finding_reason
+from fisheye_svp_ros.reporting.wording.findings import belief, finding_reason
 
 _CAPTIONS = {
     'field': 'Residual vectors over the image; the scale is above each panel; dotted: equal '
@@ -167,6 +167,7 @@ def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
             {
                 **fields,
                 'what': cause_text.describe_effect(cause.effect),
+                'belief': belief(cause.status, cause.probability),
                 'to_separate': separation(cause) if cause.indistinguishable_from else '',
                 'refuted': text.frame_ranges(diagnosis, cause.refuted_by_frames),
                 'parameters': [

@@ -21,7 +21,9 @@ from fisheye_svp_ros.diagnosis import (
     Comparison,
     Decision,
     Diagnosis,
+    Status,
     frames_of,
+    status_of,
 )
 from fisheye_svp_ros.reporting.blocks import image_uri
 from fisheye_svp_ros.reporting.cause_text import (
@@ -41,11 +43,11 @@ from fisheye_svp_ros.reporting.diagnosis_text import (
     only_gross,
 )
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason
-from fisheye_svp_ros.reporting.wording.findings import finding_reason
+from fisheye_svp_ros.reporting.wording.findings import belief, chance, finding_reason
 from fisheye_svp_ros.scene.observations import photograph_names
 
 _MAX_NAMES = 4  # photographs, and candidates, by name
-_CERTAIN = 0.99  # more cannot be said of a bootstrap
+_MIN_SIGMAS = 2.0  # a size nearer to 0 stands in no headline
 _MIN_CONFIDENCE = 0.5  # what is less is no reason for what a decision says
 _THUMBNAIL = 96  # px, the longer side
 _VERDICTS = {
@@ -238,15 +240,10 @@ def _confidence(decision: Decision) -> str:
         or decision.confidence < _MIN_CONFIDENCE
     ):
         return ''
-    sure = f'{_sure_text(decision.confidence)} sure'
+    sure = f'{chance(decision.confidence)} sure'
     if decision.say == 'use_extended':
         return f'removes {percent(decision.figure.value)} of the squared error, {sure}'
     return sure
-
-
-def _sure_text(probability: float) -> str:
-    limit = 100 * _CERTAIN
-    return f'more than {limit:.0f} %' if probability > _CERTAIN else f'{100 * probability:.0f} %'
 
 
 def _causes(d: Diagnosis) -> str:
@@ -258,7 +255,11 @@ def _causes(d: Diagnosis) -> str:
     for one in d.causes:
         worse = frame_ranges(d, one.refuted_by_frames)
         names = ' or '.join([one.effect, *one.indistinguishable_from])
-        found.append(f'{names} ({size(d, one)}{f"; makes {worse} worse" if worse else ""})')
+        doubt = (
+            '' if one.status is Status.CONFIRMED else f'{belief(one.status, one.probability)}: '
+        )
+        harm = f'; makes {worse} worse' if worse else ''
+        found.append(f'{names} ({doubt}{size(d, one)}{harm})')
     return '; '.join(found)
 
 
@@ -266,12 +267,15 @@ def _candidates(d: Diagnosis) -> str:
     shifts = d.averaged_model.shifts
     others = [one for one in d.candidates if not shifts or one.effect != 'viewpoint_shift']
     words = [
-        f'{f"{one.camera} " if one.camera else ""}viewpoint_shift (posterior probability '
-        f'{_sure_text(one.weight)}: the extended lens includes e0 = {1e3 * one.e0:.2g} ± '
-        f'{1e3 * one.stderr:.2g} mm)'
+        f'{f"{one.camera} " if one.camera else ""}viewpoint_shift '
+        f'({belief(status_of(one.weight, False), one.weight)}: the extended lens includes '
+        f'e0 = {1e3 * one.e0:.2g} ± {1e3 * one.stderr:.2g} mm)'
         for one in shifts
     ]
-    words += [f'{one.effect} ({finding_reason(one)})' for one in others[:_MAX_NAMES]]
+    words += [
+        f'{one.effect} ({belief(one.status, one.probability)}: {finding_reason(one)})'
+        for one in others[:_MAX_NAMES]
+    ]
     more = len(others) - _MAX_NAMES
     return '; '.join(words) + (f'; and {more} more' if more > 0 else '')
 
@@ -383,8 +387,12 @@ def _displaced_landmarks(d: Diagnosis) -> str:
 
 def _sentence(d: Diagnosis, cause: Cause) -> str:
     """Return a cause as a sentence, its size in it, and whether nothing but the user claims it."""
-    assumed = is_assumed(d, cause) and cause.p_value > NAMED_P
-    return _statement(d, cause) + (' (assumed, not significant)' if assumed else '')
+    if is_assumed(d, cause):
+        doubt = ' (assumed, not significant)' if cause.p_value > NAMED_P else ''
+    else:
+        confirmed = cause.status is Status.CONFIRMED
+        doubt = '' if confirmed else f' ({belief(cause.status, cause.probability)})'
+    return _statement(d, cause) + doubt
 
 
 def _statement(d: Diagnosis, cause: Cause) -> str:
@@ -397,7 +405,11 @@ def _statement(d: Diagnosis, cause: Cause) -> str:
     if cause.effect == 'landmark_scale' and 'relative' not in cause.parameters:
         words = 'The target is stretched'
     # Of several parameters, the most significant one.
-    how = size(d, cause) if cause.effect_class.target_map else most_significant(cause.parameters)
+    how = (
+        size(d, cause)
+        if cause.effect_class.target_map
+        else most_significant(cause.parameters, _MIN_SIGMAS)
+    )
     return f'{words} ({how})' if how else words
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from fisheye_svp_ros.diagnosis import Finding, Reason
+from fisheye_svp_ros.diagnosis import Finding, Reason, Status
+
+_CERTAIN = 0.99  # more cannot be said of models and bootstraps
 
 _REASONS = {
     Reason.PREDICTS_BETTER: 'significant and predicts better',
@@ -18,6 +20,20 @@ _REASONS = {
     Reason.NO_GAIN_BESIDE_RIVAL: 'no significant gain on held-out frames if {effect} replaces '
     '{replaced}',
 }
+
+
+def chance(probability: float) -> str:
+    """Return a probability in percent."""
+    if probability > _CERTAIN:
+        return f'more than {100 * _CERTAIN:.0f} %'
+    if probability < 1 - _CERTAIN:
+        return f'less than {100 * (1 - _CERTAIN):.0f} %'
+    return f'{100 * probability:.0f} %'
+
+
+def belief(status: Status, probability: float) -> str:
+    """Return status and probability, as the terminal, the report and the node show them."""
+    return f'{status.value}, {chance(probability)}'
 
 
 def finding_reason(finding: Finding) -> str:
