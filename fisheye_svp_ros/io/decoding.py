@@ -45,34 +45,60 @@ def structured_array(layout: np.dtype[np.void], landmark: Index, *columns: Array
     return points
 
 
+class UsablePoints(NamedTuple):
+    """Points (N,) of a cloud; `rejected` others hold a value that cannot be used: the reason."""
+
+    points: Points
+    rejected: int
+    reason: str
+
+
 def unpack(cloud: Any, layout: np.dtype[np.void], what: str) -> Points:
     """Return the points (N,) of a PointCloud2 as `layout`, whatever their order and widths.
 
     what: topic or file, for the error.  Raises ObservationError where a field is missing, of the
     wrong kind, not finite, or where a landmark stands twice.
     """
+    return _unpack(cloud, layout, what, strict=True).points
+
+
+def unpack_usable(cloud: Any, layout: np.dtype[np.void], what: str) -> UsablePoints:
+    """Return the usable points of a PointCloud2, as `unpack` does.
+
+    Raises ObservationError where none of several points is usable.
+    """
     raw = _raw_points(cloud, what)
-    points = np.empty(raw.shape, dtype=layout)
+    usable, reason = np.ones(raw.shape, dtype=bool), ''
     for name in layout.names or ():
-        if name not in (raw.dtype.names or ()):
-            needed = ', '.join(layout.names or ())
-            raise ObservationError(f'{what}: field {name!r} is missing; needed are {needed}')
-        kinds, kind = _NUMBER_KINDS[layout[name].kind]
-        if raw.dtype[name].kind not in kinds:
-            given = raw.dtype[name]
-            raise ObservationError(f'{what}: field {name!r} is {given}; {kind} is needed')
-        usable = _representable(raw[name], layout[name])
-        if not usable.all():
-            bad = int(np.argmin(usable))
-            raise ObservationError(
+        _check_field(raw.dtype, layout, name, what)
+        good = _representable(raw[name], layout[name])
+        if not good.all() and not reason:
+            bad = int(np.argmin(good))
+            reason = (
                 f'{what}: field {name!r} of point {bad} is {raw[name][bad]}; leave out '
                 f'points without a value, or beyond {MAX_VALUE:g}'
             )
+        usable &= good
+    if reason and not usable.any():
+        raise ObservationError(reason)
+    raw = raw[usable] if reason else raw
+    points = np.empty(raw.shape, dtype=layout)
+    for name in layout.names or ():
         points[name] = raw[name]
     if len(set(points['landmark'].tolist())) < len(points):
         ids, counts = np.unique(points['landmark'], return_counts=True)
         raise ObservationError(f'{what}: landmark {ids[counts > 1][0]} is listed twice')
-    return points
+    return UsablePoints(points, len(usable) - len(points), reason)
+
+
+def _check_field(given: np.dtype[Any], layout: np.dtype[np.void], name: str, what: str) -> None:
+    """Raise ObservationError where a field is missing, or of the wrong kind."""
+    if name not in (given.names or ()):
+        needed = ', '.join(layout.names or ())
+        raise ObservationError(f'{what}: field {name!r} is missing; needed are {needed}')
+    kinds, kind = _NUMBER_KINDS[layout[name].kind]
+    if given[name].kind not in kinds:
+        raise ObservationError(f'{what}: field {name!r} is {given[name]}; {kind} is needed')
 
 
 def _representable(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[np.bool_]:
@@ -124,17 +150,28 @@ def _layout(
 
 
 class LandmarkSet(NamedTuple):
-    """Landmarks and the frame_id of the world they stand in."""
+    """Landmarks and the frame_id of the world they stand in; others cannot be used: the reason."""
 
     landmarks: Landmarks
     frame: str
+    rejected: int = 0
+    reason: str = ''
 
 
 class ImagePoints(NamedTuple):
-    """landmark (N,); uv (N, 2), px; frame: the camera's frame_id."""
+    """landmark (N,); uv (N, 2), px; frame: the camera's frame_id; rejected: as in LandmarkSet."""
 
     landmark: Index
     uv: Array
+    frame: str
+    rejected: int = 0
+    reason: str = ''
+
+
+class FramedPose(NamedTuple):
+    """A pose, and the frame_id it is given in."""
+
+    pose: Pose
     frame: str
 
 
@@ -168,20 +205,30 @@ def nanoseconds(sec: int, nanosec: int, topic: str = 'header') -> int:
     return sec * _NS + nanosec
 
 
-def read_landmarks(message: Any, topic: str = 'landmarks') -> LandmarkSet:
-    """Return the landmarks of a PointCloud2; at least one."""
-    points = unpack(message, LANDMARKS, topic)
+def read_landmarks(message: Any, topic: str = 'landmarks', strict: bool = True) -> LandmarkSet:
+    """Return the landmarks of a PointCloud2; at least one; strict: as for image points."""
+    points, rejected, reason = _unpack(message, LANDMARKS, topic, strict)
     if not len(points):
         raise ObservationError(f'{topic}: no landmark in it; at least one is needed')
     landmarks = Landmarks(points['landmark'].astype(np.int64), columns(points, 'xyz'))
-    return LandmarkSet(landmarks, str(message.header.frame_id))
+    return LandmarkSet(landmarks, str(message.header.frame_id), rejected, reason)
 
 
-def read_image_points(message: Any, topic: str = 'image_points') -> ImagePoints:
-    """Return the image points of a PointCloud2."""
-    points = unpack(message, IMAGE_POINTS, topic)
+def read_image_points(
+    message: Any, topic: str = 'image_points', strict: bool = True
+) -> ImagePoints:
+    """Return the image points of a PointCloud2; strict: refuse it for one that is no number."""
+    points, rejected, reason = _unpack(message, IMAGE_POINTS, topic, strict)
     landmark = points['landmark'].astype(np.int64)
-    return ImagePoints(landmark, columns(points, 'uv'), str(message.header.frame_id))
+    frame, uv = str(message.header.frame_id), columns(points, 'uv')
+    return ImagePoints(landmark, uv, frame, rejected, reason)
+
+
+def _unpack(message: Any, layout: np.dtype[np.void], topic: str, strict: bool) -> UsablePoints:
+    found = unpack_usable(message, layout, topic)
+    if strict and found.rejected:
+        raise ObservationError(found.reason)
+    return found
 
 
 def read_residuals(message: Any, topic: str = 'residuals') -> Points:
@@ -197,6 +244,11 @@ def columns(points: Points, names: Sequence[str]) -> Array:
 def read_pose(message: Any, topic: str = 'true_pose') -> Pose:
     """Return the pose of a PoseStamped."""
     return _pose(message.pose.position, message.pose.orientation, topic)
+
+
+def read_framed_pose(message: Any, topic: str = 'true_pose') -> FramedPose:
+    """Return the pose of a PoseStamped, and its frame_id."""
+    return FramedPose(read_pose(message, topic), str(message.header.frame_id))
 
 
 def read_transform(message: Any, topic: str = 'rig') -> Pose:

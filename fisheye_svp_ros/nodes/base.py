@@ -16,6 +16,7 @@ from rclpy.node import Node
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io.parameters import rows, with_values
 from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes.complaints import Complaints
 from fisheye_svp_ros.nodes.declaration import (
     check_access,
     declare,
@@ -81,7 +82,7 @@ class BaseNode(Node):  # type: ignore[misc]
         self.settings = declare(self, self.SETTINGS, self.given)
         self._inputs: dict[str, Input] = {}
         self._silences: set[tuple[str, str]] = set()
-        self._complaint = ''
+        self._complaints = Complaints(self.get_logger().warning)
         self._unforeseen: set[tuple[object, ...]] = set()
         self._failures = 0
         self._candidate: tuple[Settings, Any] | None = None
@@ -236,18 +237,16 @@ class BaseNode(Node):  # type: ignore[misc]
         return [(topic,) for topic in self._inputs]
 
     def drop(self, topic: str, error: Exception) -> None:
-        """Count and log an input that cannot be used."""
+        """Count and log a message that cannot be used."""
         self._inputs[topic].count.dropped += 1
         self._complain(error)
 
     def warn(self, text: str) -> None:
         """Log a warning, and say it in the next report on /diagnostics."""
-        self._complaint = text
-        self.get_logger().warning(text, throttle_duration_sec=10.0)
+        self._complaints.add(text, 10.0)
 
-    def _complain(self, error: Exception) -> None:
-        self._complaint = str(error)
-        self.get_logger().warning(f'dropped: {error}', throttle_duration_sec=1.0)
+    def _complain(self, error: Exception, prefix: str = 'dropped: ') -> None:
+        self._complaints.add(str(error), 1.0, prefix)
 
     def _consider(self, parameters: list[Any]) -> Any:
         self._candidate = None
@@ -298,9 +297,8 @@ class BaseNode(Node):  # type: ignore[misc]
         more, trouble = self.report()
         now = self.get_clock().now().nanoseconds
         clock = '' if now else 'use_sim_time is true, but /clock has no time yet'
-        troubles = [trouble, clock, self._complaint, self._explain_silence()]
-        self._complaint = ''  # what it was is in the counts
-        text = '; '.join(filter(None, troubles))
+        troubles = [trouble, clock, *self._complaints.collect(), self._explain_silence()]
+        text = '; '.join(dict.fromkeys(filter(None, troubles)))
         level = DiagnosticStatus.WARN if text else DiagnosticStatus.OK
         text = text or 'all inputs usable'
         if self._failures:

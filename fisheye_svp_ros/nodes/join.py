@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.decoding import LandmarkSet
 from fisheye_svp_ros.nodes.subscriptions import Unread
+from fisheye_svp_ros.reporting.wording import inputs as wording
 
 # Sets waiting for their rest, and items waiting for their set; the oldest is given up beyond this.
 LIMIT = 2000
@@ -237,7 +238,7 @@ class StampJoin:
         return next((one for one in (*own, *others) if one.stamps.get(topic) == stamp), None)
 
 
-class StandingLandmarks:
+class LatchedLandmarks:
     """The landmarks of sets without any of their stamp: the latest, unless they come set by set.
 
     They do once a set had landmarks of its own stamp and landmarks of other stamps come as
@@ -245,6 +246,7 @@ class StandingLandmarks:
     """
 
     def __init__(self) -> None:
+        self.trouble = ''  # with the latest message, until another comes
         self._latest: LandmarkSet | None = None
         self._stamp: int | None = None
         self._matched = self._vary = False
@@ -256,8 +258,19 @@ class StandingLandmarks:
         elif stamp != self._stamp:
             self._vary = self._stamp is not None
             self._stamp = stamp
+        self.trouble = ''
         if not self._is_series:
-            self._latest = unread.read()
+            self._read(unread)
+
+    def _read(self, unread: Unread) -> None:
+        try:
+            self._latest = latest = unread.read()
+        except ObservationError as error:
+            self.trouble = wording.landmarks_refused(str(error)) if self._latest else ''
+            raise
+        if latest.rejected:
+            count = len(latest.landmarks.ids) + latest.rejected
+            self.trouble = wording.landmarks_left_out(latest.rejected, count)
 
     def find_for_set(self, own: LandmarkSet | None, distance: int | None) -> LandmarkSet:
         """Return the landmarks of a set; raise ObservationError where there are none.

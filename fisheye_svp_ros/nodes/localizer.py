@@ -17,8 +17,9 @@ from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
 from fisheye_svp_ros.nodes.lenses import lens_of
 from fisheye_svp_ros.nodes.messages import camera_shape
 from fisheye_svp_ros.nodes.quality import LATCHED
-from fisheye_svp_ros.nodes.solver import Items, SolverNode
+from fisheye_svp_ros.nodes.solver import SolverNode
 from fisheye_svp_ros.nodes.transforms import Transforms
+from fisheye_svp_ros.nodes.validation import Items, KnownPoints
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
@@ -70,8 +71,8 @@ class Localizer(SolverNode):
 
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Localize the camera of one set; raise GeometryError where its points fix no pose."""
-        seen: decoding.ImagePoints = items['image_points']
-        views, model = self.views(stamp, landmarks, seen), self.model(stamp, items)
+        seen: KnownPoints = items['image_points']
+        views, model = self.views(stamp, seen), self.model(stamp, items)
         errors = self._lens_errors(stamp, items) if self.settings.model_error else None
         if errors is not None:
             sigma = errors.inflate_sigma(self.settings.sigma_px)

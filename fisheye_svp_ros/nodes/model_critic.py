@@ -31,7 +31,8 @@ from fisheye_svp_ros.nodes.set_collection import (
     scenario_of,
     table_of,
 )
-from fisheye_svp_ros.nodes.solver import Items, SolverNode
+from fisheye_svp_ros.nodes.solver import SolverNode
+from fisheye_svp_ros.nodes.validation import Items
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.diagnosis_text import refusal_reason
 from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
@@ -153,7 +154,7 @@ class ModelCritic(SolverNode):
 
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Take in one more frame; start over where the scenario is another one."""
-        seen = make_set(stamp, landmarks, items, self.cameras)
+        seen = make_set(stamp, items, self.cameras)
         self.lens(stamp, items)  # raises where nobody names one
         scenario = scenario_of(items)
         if scenario != self._scenario:

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.io import decoding
-from fisheye_svp_ros.nodes.solver import Items, known_points
+from fisheye_svp_ros.nodes.validation import Items, KnownPoints
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
 _MAX_MOTION_PX = 1.0  # px: what image points of a still camera move by at most
@@ -27,19 +26,14 @@ class CollectedSet(NamedTuple):
     camera: Index
 
 
-def make_set(
-    stamp: int, landmarks: decoding.LandmarkSet, items: Items, cameras: Sequence[str]
-) -> CollectedSet:
-    """Return one set of cameras given by namespace, each with its slash.
-
-    Raises ObservationError for an unknown landmark.
-    """
-    sets = [items[f'{camera}image_points'] for camera in cameras]
+def make_set(stamp: int, items: Items, cameras: Sequence[str]) -> CollectedSet:
+    """Return one set of cameras given by namespace, each with its slash."""
+    sets: list[KnownPoints] = [items[f'{camera}image_points'] for camera in cameras]
     return CollectedSet(
         stamp,
         np.concatenate([seen.landmark for seen in sets]),
         np.concatenate([seen.uv for seen in sets]),
-        np.concatenate([known_points(landmarks, seen) for seen in sets]),
+        np.concatenate([seen.points for seen in sets]),
         np.repeat(np.arange(len(sets)), [len(seen.landmark) for seen in sets]),
     )
 

@@ -19,30 +19,28 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.decoding import (
-    ImagePoints,
     LandmarkSet,
     read_camera_info,
+    read_framed_pose,
     read_image_points,
     read_key_values,
     read_landmarks,
-    read_pose,
 )
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import ManagedNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.declaration import check_access
-from fisheye_svp_ros.nodes.join import LIMIT, NeighborPair, Pending, StampJoin, StandingLandmarks
+from fisheye_svp_ros.nodes.join import LIMIT, LatchedLandmarks, Pending, StampJoin
 from fisheye_svp_ros.nodes.lenses import lens_of, lenses_of, shift_scale
 from fisheye_svp_ros.nodes.quality import INFO_INPUT
 from fisheye_svp_ros.nodes.subscriptions import Unread
+from fisheye_svp_ros.nodes.validation import Items, KnownPoints, SetValidation
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import STEREO, Views
 from fisheye_svp_ros.study.settings import SolverSettings
 from fisheye_svp_ros.study.solutions import Pair
-
-Items = Mapping[str, Any]
 
 _UNREAD = 5 * LIMIT  # messages to look at while there is nothing to solve
 _LONGEST_INTAKE = 0.05  # s of taking in before a set is solved, come what may
@@ -110,20 +108,24 @@ class SolverNode(ManagedNode):
         self._backlog: deque[Pending] = deque()
         self._unread: deque[tuple[int, str]] = deque(maxlen=_UNREAD)
         self._pace = Pace()
-        self._standing = StandingLandmarks()
+        self._latched_landmarks = LatchedLandmarks()
+        self._validation = SetValidation(self._image_points, tuple(self._poses), self.drop)
+        self._left_out: list[str] = []  # of the set that is solved
         self._said = ''
         self._lenses: dict[str, Lens] = {}  # those of the parameter lens
         self._infos = CameraInfos(self.get_logger().info)
         self._models: dict[str, tuple[Lens, ForwardModel]] = {}  # the latest, by camera
         self._guarded_work = self.guard_callback(self._work)
         self._rest = self.create_guard_condition(self._guarded_work)
-        self.collect(PointCloud2, 'landmarks', read_landmarks, self._hear_landmarks, latched=True)
+        self.collect(
+            PointCloud2, 'landmarks', self._read_landmarks, self._hear_landmarks, latched=True
+        )
         self._collect(DiagnosticArray, 'scenario', read_key_values)
         for topic in self._poses:
-            self._collect(PoseStamped, topic, read_pose)
+            self._collect(PoseStamped, topic, read_framed_pose)
         # Last, because a camera that sees this subscription counts on the others.
         for topic in self._image_points:
-            self._collect(PointCloud2, topic, read_image_points)
+            self._collect(PointCloud2, topic, self._read_image_points)
         self.start_timer(0.1, self._work)
 
     def start(self) -> None:
@@ -209,12 +211,11 @@ class SolverNode(ManagedNode):
         scale = shift_scale(scenario.get('shift_scale', '1.0'))
         return lens_of(name, scale, self.settings)
 
-    def views(self, stamp: int, landmarks: LandmarkSet, seen: ImagePoints) -> Views:
-        """Return image points as one view; raise ObservationError for an unknown landmark."""
-        points = known_points(landmarks, seen)
-        shape = 1, len(points)
+    def views(self, stamp: int, seen: KnownPoints) -> Views:
+        """Return image points as one view."""
+        shape = 1, len(seen.points)
         return Views(
-            points=points[None],
+            points=seen.points[None],
             uv=seen.uv[None],
             weight=np.full(shape, 1 / self.settings.sigma_px),
             landmark=seen.landmark[None],
@@ -222,12 +223,18 @@ class SolverNode(ManagedNode):
             t=np.full(shape, stamp / 1e9),
             frame=np.array([stamp]),
             camera=np.zeros(1, dtype=np.int64),
-            row=np.arange(len(points))[None],
+            row=np.arange(len(seen.points))[None],
         )
 
     def publish_result(self, stamp: int, metrics: Mapping[str, Array], problem: str = '') -> None:
-        """Publish the metrics (1,) of one set, together and one by one."""
-        name = self.get_fully_qualified_name()
+        """Publish the metrics (1,) of one set, together and one by one.
+
+        problem: why they should not be relied on; what was left out of the set is added.
+        """
+        name, problem = (
+            self.get_fully_qualified_name(),
+            '; '.join(filter(None, (problem, *self._left_out))),
+        )
         values = {key: float(value[0]) for key, value in metrics.items()}
         for key, value in values.items():
             self._metrics[key].publish(messages.number_message(value))
@@ -236,7 +243,9 @@ class SolverNode(ManagedNode):
 
     def report(self) -> tuple[Mapping[str, object], str]:
         """Return what became of every set, and whether this node keeps up."""
-        return self._pace.report(len(self._backlog) + len(self._join))
+        counts, trouble = self._pace.report(len(self._backlog) + len(self._join))
+        troubles = filter(None, (trouble, self._latched_landmarks.trouble))
+        return {**counts, **self._validation.rejected}, '; '.join(troubles)
 
     def _listen_to_camera_info(self) -> None:
         def hear(topic: str, stamp: int, unread: Unread) -> None:
@@ -255,6 +264,12 @@ class SolverNode(ManagedNode):
                     latched=True,
                 )
 
+    def _read_landmarks(self, message: Any, topic: str) -> LandmarkSet:
+        return read_landmarks(message, topic, self.settings.strict)
+
+    def _read_image_points(self, message: Any, topic: str) -> Any:
+        return read_image_points(message, topic, self.settings.strict)
+
     def _collect(self, kind: Any, topic: str, read: Any) -> None:
         self.collect(kind, topic, read, functools.partial(self._add, topic))
 
@@ -265,7 +280,7 @@ class SolverNode(ManagedNode):
     def _hear_landmarks(self, stamp: int, unread: Unread) -> None:
         if stamp:
             self._add('landmarks', stamp, unread)
-        self._standing.hear(stamp, unread)
+        self._latched_landmarks.hear(stamp, unread)
         if not stamp:
             self._join.expect_no_more('landmarks')
 
@@ -340,34 +355,29 @@ class SolverNode(ManagedNode):
                 self._fail(stamp, str(error))
 
     def _attempt(self, one: Pending) -> None:
-        topic = self._image_points[0]
         try:
-            items = self._contents(one.items)
-            landmarks = self._standing.find_for_set(
-                items.get('landmarks'), self._join.distance('landmarks', one.stamp)
-            )
+            items, landmarks = self._validate(one)
             self.solve(one.stamp, landmarks, items)
             self._pace.counts['solved'] += 1
         except FisheyeSvpError as error:
-            self.drop(topic, error)
+            self._complain(error, 'not solved: ')
             self._fail(one.stamp, str(error))
         except Exception as error:
             self.unforeseen(error)
             self._fail(one.stamp, f'internal error: {error!r:.200}')
+        finally:
+            self._left_out = []
 
-    def _contents(self, unread: Items) -> dict[str, Any]:
-        """Return what a set holds; without what cannot be read and need not be there."""
-        items = {}
-        for topic, item in unread.items():
-            try:
-                items[topic] = (
-                    _interpolated_pose(item) if isinstance(item, NeighborPair) else item.read()
-                )
-            except FisheyeSvpError as error:
-                if topic in (*self._image_points, 'landmarks'):
-                    raise
-                self.drop(topic, error)
-        return items
+    def _validate(self, one: Pending) -> tuple[Items, LandmarkSet]:
+        """Return what is to be solved; raise FisheyeSvpError where that is nothing."""
+        read = self._validation.read(one.items)
+        landmarks = self._latched_landmarks.find_for_set(
+            read.get('landmarks'), self._join.distance('landmarks', one.stamp)
+        )
+        items, self._left_out = self._validation.check(read, landmarks, self.settings.strict)
+        for text in self._left_out:
+            self.warn(text)
+        return items, landmarks
 
     def _fail(self, stamp: int, problem: str) -> None:
         self._pace.counts['not solved'] += 1
@@ -388,20 +398,6 @@ class SolverNode(ManagedNode):
             f'the nearest stamp on {missing} is {1e-6 * off:.1f} ms off; with '
             'approximate_sync:=true, up to approximate_sync_tolerance_seconds is allowed'
         )
-
-
-def _interpolated_pose(poses: NeighborPair) -> Pose:
-    first, second = poses.first.read(), poses.second.read()
-    return Pose(*first.retract(poses.fraction * second.difference(first)))
-
-
-def known_points(landmarks: LandmarkSet, seen: ImagePoints) -> Array:
-    """Return the landmarks (N, 3), m, of image points; raise ObservationError for an unknown."""
-    points, known = landmarks.landmarks.lookup(seen.landmark)
-    if not known.all():
-        unknown = seen.landmark[~known][0]
-        raise ObservationError(f'image_points: landmark {unknown} is not one of the landmarks')
-    return points
 
 
 def true_rig(items: Items) -> Pose | None:

@@ -10,8 +10,9 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.set_collection import CollectedSet, make_set, scenario_of, table_of
-from fisheye_svp_ros.nodes.solver import Items, SolverNode, true_rig
+from fisheye_svp_ros.nodes.solver import SolverNode, true_rig
 from fisheye_svp_ros.nodes.transforms import Transforms
+from fisheye_svp_ros.nodes.validation import Items
 from fisheye_svp_ros.scene.observations import STEREO, stereo_views
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
 from fisheye_svp_ros.study.settings import StereoCalibratorSettings
@@ -47,7 +48,7 @@ class StereoCalibrator(SolverNode):
             if scenario == self._scenario
             else []
         )
-        one = make_set(stamp, landmarks, items, self.CAMERAS)
+        one = make_set(stamp, items, self.CAMERAS)
         window = [*known, one][-self.settings.views :]
         left, right = stereo_views(table_of(window, self.CAMERAS), self.settings.sigma_px)
         found = solve_rigs(self.models(stamp, items), left, right, true=true_rig(items)).require()

@@ -18,12 +18,8 @@ from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.messages import camera_shape, epipolar_shapes, landmarks_shape
 from fisheye_svp_ros.nodes.quality import LATCHED
-from fisheye_svp_ros.nodes.solver import (
-    Items,
-    SolverNode,
-    known_points,
-    true_rig,
-)
+from fisheye_svp_ros.nodes.solver import SolverNode, true_rig
+from fisheye_svp_ros.nodes.validation import Items
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import STEREO
 from fisheye_svp_ros.solve.reliability import doubt_of_pairs
@@ -76,7 +72,7 @@ class StereoDepth(SolverNode):
         )
         uv = left.uv[in_left], right.uv[in_right]
         true: Pose | None = items.get('right/true_pose')
-        known = known_points(landmarks, right)[in_right]
+        known = right.points[in_right]
         found = measure_points(
             models,
             rig.take(None),

@@ -92,6 +92,11 @@ class SolverSettings(Settings):
         's',
         (0.0, 60.0),
     )
+    strict: bool = parameter(
+        False,
+        'Refuse a set for one point without a finite value or of an unknown landmark, which is '
+        'left out otherwise',
+    )
     backlog: int = parameter(
         100,
         'Largest number of sets that wait to be solved; beyond it the oldest are dropped and '

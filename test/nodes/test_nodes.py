@@ -342,9 +342,11 @@ class Sets:
 
     def dropped(self) -> int:
         """Return how many image points the latest diagnostics count as dropped."""
-        if not self.diagnostics:
-            return 0
-        return int(values(self.diagnostics[-1])['image_points: dropped'])
+        return self.count('image_points: dropped')
+
+    def count(self, name: str) -> int:
+        """Return what the latest diagnostics count."""
+        return int(values(self.diagnostics[-1])[name]) if self.diagnostics else 0
 
 
 @pytest.fixture
@@ -518,6 +520,12 @@ def unknown_landmark(sets: Sets, stamp: int) -> None:
     sets.points.publish(messages.image_points_message(ids, uv, stamp, 'camera'))
 
 
+def other_landmarks(sets: Sets, stamp: int) -> None:
+    uv = np.array([[700.0, 700.0], [800.0, 700.0], [700.0, 800.0], [800.0, 810.0]])
+    ids = np.array([96, 97, 98, 99])
+    sets.points.publish(messages.image_points_message(ids, uv, stamp, 'camera'))
+
+
 def too_few(sets: Sets, stamp: int) -> None:
     uv = np.array([[700.0, 700.0], [800.0, 700.0], [700.0, 800.0]])
     sets.points.publish(messages.image_points_message(np.arange(3), uv, stamp, 'camera'))
@@ -536,7 +544,8 @@ def all_in_one_place(sets: Sets, stamp: int) -> None:
 @pytest.mark.parametrize(
     ('spoil', 'reason'),
     [
-        (unknown_landmark, 'landmark 99 is not one of the landmarks'),
+        (unknown_landmark, 'has 3 usable points'),
+        (other_landmarks, 'landmark 96 is not one of the landmarks'),
         (too_few, 'has 3 usable points'),
         (far_outside, 'has 0 usable points inside the field of view'),
         (all_in_one_place, ''),
@@ -552,7 +561,8 @@ def test_a_set_that_cannot_be_solved_has_a_result_that_says_why(
     status = sets.results[0].status[0]
     if reason:
         assert reason in status.message and not status.values
-        sets.graph.until(lambda: sets.dropped() == 1)
+        sets.graph.until(lambda: sets.count('sets: not solved') == 1)
+        assert sets.dropped() == 0
     sets.tell_truth(2)
     sets.tell_points(2, 2.0)
     assert float(sets.result(2)['position_error_m']) < 1e-9
@@ -584,6 +594,7 @@ def test_malformed_messages_are_counted_and_the_node_lives_on(sets: Sets) -> Non
     assert {status.name for status in told} == {'/localizer: inputs'}
     warnings = [status.message for status in told if status.level == status.WARN]
     assert any('missing' in text or 'finite' in text for text in warnings)
+    sets.tell_landmarks(0, 2.0)  # which ends the one that was refused
     sets.graph.until(lambda: sets.diagnostics[-1].status[0].message == 'all inputs usable')
     assert sets.diagnostics[-1].status[0].level == told[-1].OK and sets.dropped() == 4
 

@@ -1,0 +1,124 @@
+"""The one step between what came for a set and what is solved: read, compared, filtered."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
+from fisheye_svp_ros.io.decoding import FramedPose, ImagePoints, LandmarkSet
+from fisheye_svp_ros.nodes.join import NeighborPair
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.reporting.wording import inputs as wording
+
+Items = Mapping[str, Any]
+
+_FRAME_HOLDS = 5.0  # s without a message of its frame, after which a topic may have another
+
+
+class KnownPoints(NamedTuple):
+    """Image points of known landmarks; points (N, 3), m; frame: the camera's frame_id."""
+
+    landmark: Index
+    uv: Array
+    points: Array
+    frame: str
+
+
+class SetValidation:
+    """Makes of what came for a set what can be solved, and counts what is left out of it.
+
+    image_points: topics without which there is no set; true_poses: topics of these;
+    drop: counts a message of a topic that cannot be read, and tells of it.
+    """
+
+    def __init__(
+        self,
+        image_points: Sequence[str],
+        true_poses: Sequence[str],
+        drop: Callable[[str, Exception], None],
+    ) -> None:
+        self.rejected: Counter[str] = Counter()  # by topic and reason, since the start
+        self._image_points, self._true_poses, self._drop = image_points, true_poses, drop
+        self._frames: dict[str, tuple[str, float]] = {}  # by topic, and when it was last met, s
+
+    def read(self, unread: Items) -> dict[str, Any]:
+        """Return what a set holds, by topic, without what cannot be read and need not be there.
+
+        Raises FisheyeSvpError for image points or landmarks that cannot be read.
+        """
+        items = {}
+        for topic, item in unread.items():
+            try:
+                items[topic] = (
+                    _interpolate(item) if isinstance(item, NeighborPair) else item.read()
+                )
+            except FisheyeSvpError as error:
+                self._drop(topic, error)
+                if topic in (*self._image_points, 'landmarks'):
+                    raise
+        return items
+
+    def check(
+        self, items: dict[str, Any], landmarks: LandmarkSet, strict: bool
+    ) -> tuple[dict[str, Any], list[str]]:
+        """Return what is to be solved, and what was left out of it, as sentences.
+
+        strict: refuse a set with a point of an unknown landmark.  Raises ObservationError for
+        image points of another camera, and where no landmark is known.
+        """
+        checked, texts = dict(items), []
+        for topic in self._image_points:
+            self._check_camera(topic, items[topic].frame)
+            checked[topic], reasons = self._known_points(topic, items[topic], landmarks, strict)
+            texts += reasons
+        for topic in self._true_poses:
+            if topic not in items:
+                continue
+            checked[topic], frame = items[topic]
+            if _differ(frame, landmarks.frame):
+                del checked[topic]
+                self.rejected[f'{topic}: in another frame'] += 1
+                texts.append(wording.frames_differ(topic, frame, 'landmarks', landmarks.frame))
+        return checked, texts
+
+    def _known_points(
+        self, topic: str, seen: ImagePoints, landmarks: LandmarkSet, strict: bool
+    ) -> tuple[KnownPoints, list[str]]:
+        points, known = landmarks.landmarks.lookup(seen.landmark)
+        texts = []
+        if seen.rejected:
+            self.rejected[f'{topic}: points without a value'] += seen.rejected
+            count = len(seen.landmark) + seen.rejected
+            texts.append(wording.points_without_value(topic, seen.rejected, count))
+        if known.all():
+            return KnownPoints(seen.landmark, seen.uv, points, seen.frame), texts
+        unknown = seen.landmark[~known]
+        if strict or not known.any():
+            raise ObservationError(wording.unknown_landmark(topic, int(unknown[0])))
+        self.rejected[f'{topic}: points of unknown landmarks'] += len(unknown)
+        texts.append(wording.unknown_landmarks(topic, unknown.tolist(), len(known)))
+        return KnownPoints(seen.landmark[known], seen.uv[known], points[known], seen.frame), texts
+
+    def _check_camera(self, topic: str, frame: str) -> None:
+        """Raise ObservationError for image points of another camera than those before."""
+        now = time.monotonic()
+        before, last = self._frames.get(topic, (frame, now))
+        if _differ(frame, before) and now - last < _FRAME_HOLDS:
+            raise ObservationError(wording.cameras_mixed(topic, frame, before))
+        self._frames[topic] = frame, now
+
+
+def _differ(one: str, other: str) -> bool:
+    """Say whether two frame_ids name different frames; an empty one may be any."""
+    return bool(one and other) and one.lstrip('/') != other.lstrip('/')
+
+
+def _interpolate(poses: NeighborPair) -> FramedPose:
+    (first, frame), (second, other) = poses.first.read(), poses.second.read()
+    if _differ(frame, other):
+        raise ObservationError(wording.frames_differ('true_pose', frame, 'true_pose', other))
+    return FramedPose(Pose(*first.retract(poses.fraction * second.difference(first))), frame)

@@ -1,0 +1,48 @@
+"""What nodes tell of their inputs: topics first, then the reason, the remedy last."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+_MAX_NAMES = 5
+
+
+def points_without_value(topic: str, count: int, of: int) -> str:
+    """Tell of points that hold no number."""
+    return f'{topic}: {count} of {of} points left out: no finite value, or beyond the limit'
+
+
+def unknown_landmark(topic: str, landmark: int) -> str:
+    """Tell of a set that is refused for the sake of one landmark, or of all."""
+    return f'{topic}: landmark {landmark} is not one of the landmarks'
+
+
+def unknown_landmarks(topic: str, landmarks: Sequence[int], of: int) -> str:
+    """Tell of points whose landmarks nobody has published."""
+    names = ', '.join(map(str, landmarks[:_MAX_NAMES])) + (
+        ', ...' if len(landmarks) > _MAX_NAMES else ''
+    )
+    return f'{topic}: {len(landmarks)} of {of} points left out: unknown landmarks {names}'
+
+
+def landmarks_refused(reason: str) -> str:
+    """Tell of a map that cannot be used while the one before is."""
+    return f'landmarks: the latest message is refused, the one before is used ({reason})'
+
+
+def landmarks_left_out(count: int, of: int) -> str:
+    """Tell of landmarks that hold no number."""
+    return f'landmarks: {count} of {of} left out: no finite value, or beyond the limit'
+
+
+def frames_differ(topic: str, frame: str, other_topic: str, other: str) -> str:
+    """Tell of two inputs that cannot belong together."""
+    return (
+        f'{topic}: left out: in frame {frame!r}, but {other_topic} in {other!r}; '
+        'publish both in one frame'
+    )
+
+
+def cameras_mixed(topic: str, frame: str, before: str) -> str:
+    """Tell of two cameras on one topic."""
+    return f'{topic}: from {frame!r}, but {before!r} before; give each camera its own topic'
