@@ -184,6 +184,21 @@ class CameraModel(NamedTuple):
     d: tuple[float, ...]
 
 
+class FramedCamera(NamedTuple):
+    """The model of a camera, and its frame_id."""
+
+    model: CameraModel
+    frame: str
+
+
+class FramedRig(NamedTuple):
+    """The pose of the left camera in the right one, and their frame_ids."""
+
+    pose: Pose
+    left: str
+    right: str
+
+
 class Status(NamedTuple):
     """One status of a DiagnosticArray; level: 0 for OK."""
 
@@ -256,6 +271,12 @@ def read_transform(message: Any, topic: str = 'rig') -> Pose:
     return _pose(message.transform.translation, message.transform.rotation, topic)
 
 
+def read_framed_rig(message: Any, topic: str = 'rig') -> FramedRig:
+    """Return the rig of a TransformStamped: its child is the left camera."""
+    pose = read_transform(message, topic)
+    return FramedRig(pose, str(message.child_frame_id), str(message.header.frame_id))
+
+
 def read_camera_info(message: Any, topic: str = 'camera_info') -> CameraModel:
     """Return the model of a CameraInfo: of the whole, raw image."""
     k, d = [float(value) for value in message.k], tuple(float(value) for value in message.d)
@@ -272,6 +293,16 @@ def read_camera_info(message: Any, topic: str = 'camera_info') -> CameraModel:
             f'{topic}: of a part of the image, or binned; whole images are needed'
         )
     return CameraModel(str(message.distortion_model), size, (k[0], k[4], k[2], k[5], k[1]), d)
+
+
+def read_framed_camera(message: Any, topic: str = 'camera_info') -> FramedCamera:
+    """Return the model of a CameraInfo, and its frame_id."""
+    return FramedCamera(read_camera_info(message, topic), str(message.header.frame_id))
+
+
+def frames_differ(one: str, other: str) -> bool:
+    """Say whether two frame_ids name different frames; an empty one may be any."""
+    return bool(one and other) and one.lstrip('/') != other.lstrip('/')
 
 
 def statuses(message: Any) -> list[Status]:

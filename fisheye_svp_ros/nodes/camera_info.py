@@ -10,13 +10,19 @@ from typing import Any
 
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
-from fisheye_svp_ros.io.decoding import CameraModel, read_camera_info
+from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
+from fisheye_svp_ros.io.decoding import (
+    CameraModel,
+    FramedCamera,
+    frames_differ,
+    read_framed_camera,
+)
 from fisheye_svp_ros.io.lens_formats.ros import lens_of
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.quality import INFO_INPUT, SENSOR
 from fisheye_svp_ros.nodes.subscriptions import Unread
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.reporting.wording import inputs as wording
 
 CAMERA_INFO = 'camera_info'  # the value of the parameter `lens`, and the topic
 _MAX_MESSAGES = 1000  # of each camera, for sets that wait
@@ -46,12 +52,17 @@ class CameraInfos:
     def size(self, topic: str, stamp: int) -> tuple[int, int] | None:
         """Return width and height, px, of the images, where somebody has told of them."""
         with suppress(FisheyeSvpError):
-            return self._model(topic, stamp).size
+            return self._camera(topic, stamp).model.size
         return None
 
-    def lens(self, topic: str, stamp: int) -> Lens:
-        """Return the lens of a set; raise FisheyeSvpError where nobody has told a usable one."""
-        known = self._model(topic, stamp)
+    def lens(self, topic: str, stamp: int, frame: str = '') -> Lens:
+        """Return the lens of a set; raise FisheyeSvpError where nobody has told a usable one.
+
+        frame: that the camera_info must be of, where it is known.
+        """
+        known, own = self._camera(topic, stamp)
+        if frames_differ(own, frame):
+            raise ObservationError(wording.camera_info_of_another(topic, own, frame))
         lens, worst = lens_of(*known, topic.replace('/', '_'), topic)
         if self._told.get(topic) != known:
             self._told[topic] = known
@@ -59,15 +70,15 @@ class CameraInfos:
             self._tell(f'{topic}: {known.model} of {lens.width}x{lens.height} px{off}')
         return lens
 
-    def _model(self, topic: str, stamp: int) -> CameraModel:
+    def _camera(self, topic: str, stamp: int) -> FramedCamera:
         heard = self._heard.get(topic)
         if not heard:
-            raise ParameterError(f'{topic}: no message received; set the parameter lens')
+            raise ParameterError(wording.no_camera_info(topic))
         key = stamp if stamp in heard else next(reversed(heard))
-        if not isinstance(heard[key], CameraModel):
+        if not isinstance(heard[key], FramedCamera):
             heard[key] = heard[key].read()
-        model: CameraModel = heard[key]
-        return model
+        camera: FramedCamera = heard[key]
+        return camera
 
 
 class ImageTopics:
@@ -97,7 +108,12 @@ class ImageTopics:
             name=_compressed_topic(node, topic),
         )
         node.collect(
-            CameraInfo, info, read_camera_info, partial(infos.hear, info), INFO_INPUT, latched=True
+            CameraInfo,
+            info,
+            read_framed_camera,
+            partial(infos.hear, info),
+            INFO_INPUT,
+            latched=True,
         )
 
     def remember(self, stamp: int, image: Unread) -> None:

@@ -20,7 +20,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.decoding import (
     LandmarkSet,
-    read_camera_info,
+    read_framed_camera,
     read_framed_pose,
     read_image_points,
     read_key_values,
@@ -203,7 +203,8 @@ class SolverNode(ManagedNode):
                 )
             return self._lenses[camera]
         if self.settings.lens == CAMERA_INFO:
-            return self._infos.lens(f'{camera}{CAMERA_INFO}', stamp)
+            frame = items[f'{camera}image_points'].frame
+            return self._infos.lens(f'{camera}{CAMERA_INFO}', stamp, frame)
         scenario = items.get('scenario', {})
         if 'lens' not in scenario:
             raise ParameterError('no scenario names a lens; set the parameter lens')
@@ -258,7 +259,7 @@ class SolverNode(ManagedNode):
                 self.collect(
                     CameraInfo,
                     topic,
-                    read_camera_info,
+                    read_framed_camera,
                     functools.partial(hear, topic),
                     INFO_INPUT,
                     latched=True,

@@ -13,7 +13,13 @@ from visualization_msgs.msg import MarkerArray
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError
 from fisheye_svp_ros.io import decoding
-from fisheye_svp_ros.io.decoding import LANDMARKS, structured_array
+from fisheye_svp_ros.io.decoding import (
+    LANDMARKS,
+    FramedRig,
+    frames_differ,
+    read_framed_rig,
+    structured_array,
+)
 from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.messages import camera_shape, epipolar_shapes, landmarks_shape
@@ -21,6 +27,7 @@ from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.solver import SolverNode, true_rig
 from fisheye_svp_ros.nodes.validation import Items
 from fisheye_svp_ros.pose import Pose, identity
+from fisheye_svp_ros.reporting.wording import inputs as wording
 from fisheye_svp_ros.scene.observations import STEREO
 from fisheye_svp_ros.solve.reliability import doubt_of_pairs
 from fisheye_svp_ros.solve.stereo_depth import epipolar_curves
@@ -41,8 +48,8 @@ class StereoDepth(SolverNode):
         super().__init__(node_name, **options)
         self._points = self.announce(PointCloud2, '~/points')
         self._markers = self.announce(MarkerArray, '~/markers', LATCHED)
-        self._latest: Pose | None = None
-        self.listen(TransformStamped, 'rig', decoding.read_transform, self._hear, latched=True)
+        self._latest: FramedRig | None = None
+        self.listen(TransformStamped, 'rig', read_framed_rig, self._hear, latched=True)
         self.start()
 
     def prepare(self, settings: SolverSettings) -> SolverSettings:
@@ -60,7 +67,7 @@ class StereoDepth(SolverNode):
         rig = {'topic': ['rig'], 'true': [f'{camera}true_pose' for camera in self.CAMERAS]}
         return [*super().needed_inputs(), *((t,) for t in rig.get(self.settings.rig, ()))]
 
-    def _hear(self, _: int, rig: Pose) -> None:
+    def _hear(self, _: int, rig: FramedRig) -> None:
         self._latest = rig
 
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
@@ -94,7 +101,13 @@ class StereoDepth(SolverNode):
             self._markers.publish(messages.markers_message(shapes, stamp, frame))
 
     def _rig(self, items: Items) -> Pose:
-        known = true_rig(items) if self.settings.rig == 'true' else self._given or self._latest
+        if self.settings.rig == 'topic' and self._latest is not None:
+            known, *frames = self._latest
+            cameras = [items[f'{camera}image_points'].frame for camera in self.CAMERAS]
+            if any(map(frames_differ, frames, cameras)):
+                raise ObservationError(wording.rig_of_others(frames, cameras))
+            return known
+        known = true_rig(items) if self.settings.rig == 'true' else self._given
         if known is None:
             raise ObservationError(
                 'no rig: true poses of both cameras are needed, or rig:=topic '

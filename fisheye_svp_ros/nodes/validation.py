@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
-from fisheye_svp_ros.io.decoding import FramedPose, ImagePoints, LandmarkSet
+from fisheye_svp_ros.io.decoding import FramedPose, ImagePoints, LandmarkSet, frames_differ
 from fisheye_svp_ros.nodes.join import NeighborPair
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.wording import inputs as wording
@@ -79,7 +79,7 @@ class SetValidation:
             if topic not in items:
                 continue
             checked[topic], frame = items[topic]
-            if _differ(frame, landmarks.frame):
+            if frames_differ(frame, landmarks.frame):
                 del checked[topic]
                 self.rejected[f'{topic}: in another frame'] += 1
                 texts.append(wording.frames_differ(topic, frame, 'landmarks', landmarks.frame))
@@ -107,18 +107,13 @@ class SetValidation:
         """Raise ObservationError for image points of another camera than those before."""
         now = time.monotonic()
         before, last = self._frames.get(topic, (frame, now))
-        if _differ(frame, before) and now - last < _FRAME_HOLDS:
+        if frames_differ(frame, before) and now - last < _FRAME_HOLDS:
             raise ObservationError(wording.cameras_mixed(topic, frame, before))
         self._frames[topic] = frame, now
 
 
-def _differ(one: str, other: str) -> bool:
-    """Say whether two frame_ids name different frames; an empty one may be any."""
-    return bool(one and other) and one.lstrip('/') != other.lstrip('/')
-
-
 def _interpolate(poses: NeighborPair) -> FramedPose:
     (first, frame), (second, other) = poses.first.read(), poses.second.read()
-    if _differ(frame, other):
+    if frames_differ(frame, other):
         raise ObservationError(wording.frames_differ('true_pose', frame, 'true_pose', other))
     return FramedPose(Pose(*first.retract(poses.fraction * second.difference(first))), frame)

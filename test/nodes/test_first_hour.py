@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
-from geometry_msgs.msg import PoseStamped  # isort: skip
+from geometry_msgs.msg import PoseStamped, TransformStamped  # isort: skip
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # isort: skip
 from std_msgs.msg import String  # isort: skip
 
@@ -277,6 +277,82 @@ def another_board(hour: Hour, pattern: str) -> None:
             any(m.status[0].message == 'all inputs usable' for m in hour.reports[1:]),
         )[1]
     )
+
+
+def framed_sets(hour: Hour, *parameters: str) -> tuple[Any, Any]:
+    g = hour.begin(*parameters)
+    g.start(Localizer)
+    told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
+    message = landmarks()
+    message.header.frame_id = 'map'
+    told.publish(message)
+    return told, points
+
+
+def framed(stamp: int, frame: str, ids: Any = None) -> Any:
+    message = image_points(stamp, ids)
+    message.header.frame_id = frame
+    return message
+
+
+@tries('No errors: true poses are in another frame')
+def odometry_frame(hour: Hour, pattern: str) -> None:
+    _, points = framed_sets(hour, *SOLVING)
+    truth = hour.graph.tell(PoseStamped, 'true_pose')
+    hour.says(
+        pattern,
+        lambda: (
+            truth.publish(messages.pose_message(identity(), 7, 'odom')),
+            points.publish(image_points()),
+        ),
+    )
+
+
+@tries('All sets fail: camera_info is of another camera')
+def info_of_another(hour: Hour, pattern: str) -> None:
+    _, points = framed_sets(hour, 'lens:=camera_info', 'patience:=0.1')
+    driver = hour.graph.tell(CameraInfo, 'camera_info', SENSOR)
+    info = CameraInfo(width=640, height=480, distortion_model='equidistant', d=[0.0] * 4)
+    info.header.frame_id = 'right_cam'
+    info.k = [300.0, 0.0, 9.0, 0.0, 300.0, 9.0, 0.0, 0.0, 1.0]
+    hour.says(pattern, lambda: (driver.publish(info), points.publish(framed(7, 'left_cam'))))
+
+
+@tries('Some sets fail: two cameras on one topic')
+def two_cameras(hour: Hour, pattern: str) -> None:
+    _, points = framed_sets(hour, *SOLVING)
+    points.publish(framed(1, 'front'))
+    hour.says(
+        pattern, lambda: [points.publish(framed(n, f)) for n, f in ((2, 'front'), (3, 'rear'))]
+    )
+
+
+@tries("No results: the rig's cameras are exchanged")
+def exchanged_rig(hour: Hour, pattern: str) -> None:
+    g = hour.begin(*SOLVING, 'rig:=topic')
+    g.start(StereoDepth)
+    told, rig = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(TransformStamped, 'rig', LATCHED)
+    points = [g.tell(PointCloud2, f'{name}/image_points') for name in ('left', 'right')]
+    told.publish(landmarks())
+    rig.publish(messages.transform_message(identity(), 7, 'l', 'r'))
+    hour.says(
+        pattern, lambda: [p.publish(framed(7, f)) for p, f in zip(points, 'lr', strict=True)]
+    )
+
+
+@tries('A set has fewer points: landmarks are unknown')
+def unmapped_landmark(hour: Hour, pattern: str) -> None:
+    _, points = framed_sets(hour, *SOLVING)
+    ids = np.arange(len(image_points().data) // 20)
+    ids[3] = 4711
+    hour.says(pattern, lambda: points.publish(image_points(ids=ids)))
+
+
+@tries('An old map is used: the new one is refused')
+def refused_map(hour: Hour, pattern: str) -> None:
+    told, points = framed_sets(hour, *SOLVING)
+    told.publish(PointCloud2())
+    hour.says(pattern, lambda: points.publish(image_points()))
 
 
 @tries('Wrong poses: camera_info is for another image size')

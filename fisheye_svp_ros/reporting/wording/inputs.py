@@ -43,6 +43,24 @@ def frames_differ(topic: str, frame: str, other_topic: str, other: str) -> str:
     )
 
 
+def camera_info_of_another(topic: str, frame: str, points: str) -> str:
+    """Tell of a lens that belongs to another camera than the image points."""
+    return f'{topic}: of {frame!r}, but the image points are of {points!r}; remap {topic}'
+
+
+def rig_of_others(frames: Sequence[str], cameras: Sequence[str]) -> str:
+    """Tell of a rig whose cameras (left, right) are not those of the image points."""
+    return (
+        f'rig: of {frames[0]!r} in {frames[1]!r}, but left and right image points are of '
+        f'{cameras[0]!r} and {cameras[1]!r}; remap rig, or exchange left and right'
+    )
+
+
+def no_camera_info(topic: str) -> str:
+    """Tell of a lens that was to come on a topic."""
+    return f'{topic}: no message received; check its publisher, or set lens:=FILE'
+
+
 def cameras_mixed(topic: str, frame: str, before: str) -> str:
     """Tell of two cameras on one topic."""
     return f'{topic}: from {frame!r}, but {before!r} before; give each camera its own topic'
