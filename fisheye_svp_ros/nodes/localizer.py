@@ -78,7 +78,7 @@ class Localizer(SolverNode):
             sigma = errors.inflate_sigma(self.settings.sigma_px)
             views = views._replace(weight=np.full_like(views.weight, 1 / sigma))
         true: Pose | None = items.get('true_pose')
-        found = self._localize(model, views, true).require()
+        found = self._localize(model, views, true).require(self.settings.gate)
         solution = found.solution
         pose, world = solution.pose.take(0), landmarks.frame
         camera = self.settings.camera_frame or seen.frame

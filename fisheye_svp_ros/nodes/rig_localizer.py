@@ -14,13 +14,18 @@ from fisheye_svp_ros.io.rig_files import load_cameras
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base_pose import BasePose
 from fisheye_svp_ros.nodes.set_collection import make_set, table_of
-from fisheye_svp_ros.nodes.solver import Items, SolverNode
+from fisheye_svp_ros.nodes.solver import SolverNode
 from fisheye_svp_ros.nodes.transforms import Transforms
+from fisheye_svp_ros.nodes.validation import Items
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.wording.poses import rig_reason
 from fisheye_svp_ros.solve.rig_localization import localize_rig
 from fisheye_svp_ros.study.settings import RigLocalizerSettings
-from fisheye_svp_ros.study.solutions import LOCALIZATION_METRICS, localization_metrics
+from fisheye_svp_ros.study.solutions import (
+    LOCALIZATION_METRICS,
+    check_gate,
+    localization_metrics,
+)
 
 
 class RigLocalizer(SolverNode):
@@ -59,7 +64,7 @@ class RigLocalizer(SolverNode):
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Localize the rig of one set; raise GeometryError where its points fix no pose."""
         (names, places), cameras = self.rig, self.cameras
-        table = table_of([make_set(stamp, landmarks, items, cameras)], cameras)
+        table = table_of([make_set(stamp, items, cameras)], cameras)
         table = replace(table, sigma=np.full(len(table), self.settings.sigma_px))
         lenses = {
             name: self.lens(stamp, items, camera)
@@ -68,6 +73,7 @@ class RigLocalizer(SolverNode):
         found = localize_rig(table, lenses, names, places)
         true: Pose | None = items.get(f'{cameras[0]}true_pose')
         residual = found.residual.reshape(1, -1, 2)
+        check_gate(residual / self.settings.sigma_px, self.settings.gate)
         metrics = localization_metrics(
             found.pose, residual, None if true is None else true.take(None)
         )

@@ -38,6 +38,7 @@ from fisheye_svp_ros.nodes.validation import Items, KnownPoints, SetValidation
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.reporting.wording import inputs as wording
 from fisheye_svp_ros.scene.observations import STEREO, Views
 from fisheye_svp_ros.study.settings import SolverSettings
 from fisheye_svp_ros.study.solutions import Pair
@@ -45,7 +46,9 @@ from fisheye_svp_ros.study.solutions import Pair
 _UNREAD = 5 * LIMIT  # messages to look at while there is nothing to solve
 _LONGEST_INTAKE = 0.05  # s of taking in before a set is solved, come what may
 _NS = 10**9
+_SAME_WAY = 0.7  # cosine of the angle between two viewing axes
 _ENDS = ('taken', 'solved', 'not solved', 'dropped', 'incomplete')  # of sets
+_COUNTS = (*_ENDS, 'solved with a warning')
 
 
 class Pace:
@@ -67,7 +70,7 @@ class Pace:
         came = (counts['taken'] - before['taken']) / seconds
         done = sum(counts[end] - before[end] for end in ('solved', 'not solved')) / seconds
         told: dict[str, object] = {
-            **{f'sets: {end}': counts[end] for end in _ENDS},
+            **{f'sets: {what}': counts[what] for what in _COUNTS},
             'sets: waiting': waiting,
             'sets: received per second': round(came, 1),
             'sets: solved per second': round(done, 1),
@@ -232,10 +235,11 @@ class SolverNode(ManagedNode):
 
         problem: why they should not be relied on; what was left out of the set is added.
         """
-        name, problem = (
-            self.get_fully_qualified_name(),
-            '; '.join(filter(None, (problem, *self._left_out))),
-        )
+        name = self.get_fully_qualified_name()
+        if problem and metrics:  # what is not solved, and what is left out, is told where it is
+            self._pace.counts['solved with a warning'] += 1
+            self.warn(f'result: {problem}')
+        problem = '; '.join(filter(None, (problem, *self._left_out)))
         values = {key: float(value[0]) for key, value in metrics.items()}
         for key, value in values.items():
             self._metrics[key].publish(messages.number_message(value))
@@ -405,3 +409,14 @@ def true_rig(items: Items) -> Pose | None:
     """Return the left camera in the right one where both true poses are known."""
     left, right = (items.get(f'{camera}/true_pose') for camera in STEREO)
     return None if left is None or right is None else right.inverse().compose(left)
+
+
+def exchange_reason(rig: Pose) -> str:
+    """Say that left and right are exchanged where a rig looks like that, or nothing.
+
+    rig: the left camera in the right one.  Both look the same way, and it is on the right.
+    """
+    x, y, z = rig.position
+    if rig.rotation[2, 2] > _SAME_WAY and x > max(abs(y), abs(z)):
+        return wording.cameras_exchanged(float(x))
+    return ''

@@ -10,7 +10,7 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.set_collection import CollectedSet, make_set, scenario_of, table_of
-from fisheye_svp_ros.nodes.solver import SolverNode, true_rig
+from fisheye_svp_ros.nodes.solver import SolverNode, exchange_reason, true_rig
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.nodes.validation import Items
 from fisheye_svp_ros.scene.observations import STEREO, stereo_views
@@ -51,7 +51,9 @@ class StereoCalibrator(SolverNode):
         one = make_set(stamp, items, self.CAMERAS)
         window = [*known, one][-self.settings.views :]
         left, right = stereo_views(table_of(window, self.CAMERAS), self.settings.sigma_px)
-        found = solve_rigs(self.models(stamp, items), left, right, true=true_rig(items)).require()
+        found = solve_rigs(self.models(stamp, items), left, right, true=true_rig(items)).require(
+            self.settings.gate
+        )
         # Only now: a set that cannot be used must not spoil those to come.
         self._window, self._scenario = window, scenario
         self._publish(stamp, items, found)
@@ -65,4 +67,5 @@ class StereoCalibrator(SolverNode):
             error = rig.difference(true)
             self._position_error.publish(messages.vector_message(error[:3], stamp, right))
             self._rotation_error.publish(messages.vector_message(error[3:], stamp, right))
-        self.publish_result(stamp, found.metrics, found.reasons[0])
+        problems = filter(None, (found.reasons[0], exchange_reason(rig)))
+        self.publish_result(stamp, found.metrics, '; '.join(problems))

@@ -24,7 +24,7 @@ from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.messages import camera_shape, epipolar_shapes, landmarks_shape
 from fisheye_svp_ros.nodes.quality import LATCHED
-from fisheye_svp_ros.nodes.solver import SolverNode, true_rig
+from fisheye_svp_ros.nodes.solver import SolverNode, exchange_reason, true_rig
 from fisheye_svp_ros.nodes.validation import Items
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.reporting.wording import inputs as wording
@@ -93,7 +93,8 @@ class StereoDepth(SolverNode):
         cloud = structured_array(LANDMARKS, ids[seen], *points[seen].T)
         self._points.publish(messages.cloud_message(cloud, stamp, right.frame))
         doubt = doubt_of_pairs(models, rig.take(None), uv, ids, self.settings.sigma_px)
-        self.publish_result(stamp, found.metrics, doubt)
+        problems = filter(None, (doubt, exchange_reason(rig)))
+        self.publish_result(stamp, found.metrics, '; '.join(problems))
         if self._markers.get_subscription_count():
             pose: Pose | None = items.get('left/true_pose')
             frame = left.frame if pose is None else landmarks.frame
@@ -102,11 +103,11 @@ class StereoDepth(SolverNode):
 
     def _rig(self, items: Items) -> Pose:
         if self.settings.rig == 'topic' and self._latest is not None:
-            known, *frames = self._latest
+            rig, *frames = self._latest
             cameras = [items[f'{camera}image_points'].frame for camera in self.CAMERAS]
             if any(map(frames_differ, frames, cameras)):
                 raise ObservationError(wording.rig_of_others(frames, cameras))
-            return known
+            return rig
         known = true_rig(items) if self.settings.rig == 'true' else self._given
         if known is None:
             raise ObservationError(

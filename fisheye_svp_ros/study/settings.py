@@ -142,7 +142,19 @@ class RigSettings(SolverSettings):
 
 
 @dataclass(frozen=True)
-class RobotSettings(SolverSettings):
+class GateSettings(SolverSettings):
+    """Parameters of every node whose result a robot acts on."""
+
+    gate: float = parameter(
+        0.0,
+        'Largest root mean square of the residuals, in units of `sigma_px`; a set above it has '
+        'a result with the reason, but no pose and no transform. 0: no limit',
+        span=(0.0, 1e6),
+    )
+
+
+@dataclass(frozen=True)
+class RobotSettings(GateSettings):
     """Parameters of every node that poses a robot."""
 
     publish_tf: bool = parameter(
@@ -185,7 +197,7 @@ class LocalizerSettings(RobotSettings):
 
 
 @dataclass(frozen=True)
-class StereoCalibratorSettings(RigSettings):
+class StereoCalibratorSettings(GateSettings, RigSettings):
     """Parameters of the stereo calibrator."""
 
     publish_tf: bool = parameter(

@@ -69,7 +69,8 @@ class SetSolutions(NamedTuple, Generic[T]):
     """The solution of S sets and its metrics, arrays (S,) by name.
 
     solved (S,); unsolved: why the others have no solution; reasons (S,): why a solution should
-    not be relied on, '' for a reliable one, all of them where that was not examined.
+    not be relied on, '' for a reliable one, all of them where that was not examined; sigmas (S,):
+    root mean square of the residuals, whitened, by degrees of freedom.
     """
 
     solution: T
@@ -77,12 +78,22 @@ class SetSolutions(NamedTuple, Generic[T]):
     solved: Mask
     unsolved: str
     reasons: tuple[str, ...] = ('',)
+    sigmas: Array = np.zeros(1)
 
-    def require(self) -> SetSolutions[T]:
-        """Return it as it is; raise GeometryError where a set has no solution."""
+    def require(self, gate: float = 0.0) -> SetSolutions[T]:
+        """Return it as it is; raise GeometryError where a set has no solution.
+
+        gate: nor where its residuals are above this many sigmas; 0: no limit.
+        """
         if not self.solved.all():
             raise GeometryError(self.unsolved)
+        if not self.passes(gate).all():
+            raise GeometryError(gate_reason(gate))
         return self
+
+    def passes(self, gate: float) -> Mask:
+        """Say of which sets (S,) the residuals are no more than `gate` sigmas; 0: of all."""
+        return np.asarray(self.sigmas <= gate) if gate else np.ones(self.solved.shape, dtype=bool)
 
 
 def localize_sets(
@@ -112,7 +123,8 @@ def localize_sets(
         'odds': pose_odds(found),
         'ambiguous': is_ambiguous(found).astype(float),
     }
-    return SetSolutions(found, metrics, found.converged, _NO_POSE, reasons)
+    sigmas = _residual_sigmas(found.cost, 2 * metrics['points'] - 6)
+    return SetSolutions(found, metrics, found.converged, _NO_POSE, reasons, sigmas)
 
 
 def residual_points(model: ForwardModel, views: Views, solution: Localization) -> Points:
@@ -138,7 +150,25 @@ def solve_rigs(
             found.cost, freedom, misfit_fails(found.cost, freedom), strict=True
         )
     )
-    return SetSolutions(found, metrics, found.converged, _NO_RIG, reasons)
+    sigmas = _residual_sigmas(found.cost, freedom)
+    return SetSolutions(found, metrics, found.converged, _NO_RIG, reasons, sigmas)
+
+
+def _residual_sigmas(cost: Array, freedom: Array) -> Array:
+    return np.asarray(np.sqrt(cost / np.maximum(freedom, 1)))
+
+
+def check_gate(residual: Array, gate: float) -> None:
+    """Raise GeometryError where whitened residuals (1, N, 2) of a pose are above a gate."""
+    known = np.isfinite(residual)
+    cost = np.where(known, residual, 0.0) ** 2
+    if gate and _residual_sigmas(cost.sum(), known.sum() - 6) > gate:
+        raise GeometryError(gate_reason(gate))
+
+
+def gate_reason(gate: float) -> str:
+    """Say why a set that was solved has no pose."""
+    return f'image_points: their residuals are above the gate ({gate:g} sigma_px): no pose'
 
 
 def measure_points(

@@ -44,6 +44,7 @@ from fisheye_svp_ros.study.solutions import (
     STEREO_CALIBRATION_METRICS,
     STEREO_DEPTH_METRICS,
     SetSolutions,
+    gate_reason,
     localize_sets,
     measure_points,
     solve_rigs,
@@ -70,8 +71,11 @@ class Outcome:
         self.metrics = {name: np.full(count, np.nan) for name in names}
         self.note = np.full(count, '', dtype=object)
 
-    def attempt(self, index: Index, solve: _Solve) -> None:
-        """Solve sets together; where one of them spoils it, find out which."""
+    def attempt(self, index: Index, solve: _Solve, gate: float = 0.0) -> None:
+        """Solve sets together; where one of them spoils it, find out which.
+
+        gate: sigmas above which the residuals of a set count as no solution; 0: no limit.
+        """
         try:
             found = solve(index)
         except GeometryError as error:
@@ -79,11 +83,13 @@ class Outcome:
                 self.note[index] = str(error)
                 return
             for half in np.array_split(index, 2):
-                self.attempt(half, solve)
+                self.attempt(half, solve, gate)
             return
+        solved = found.solved & found.passes(gate)
+        self.note[index[~found.passes(gate)]] = gate_reason(gate)
         self.note[index[~found.solved]] = found.unsolved
         for name, values in found.metrics.items():
-            self.metrics[name][index[found.solved]] = values[found.solved]
+            self.metrics[name][index[solved]] = values[solved]
 
 
 class _Sets(NamedTuple):
@@ -128,7 +134,7 @@ def localizer(batch: Batch, settings: LocalizerSettings) -> Outcome:
         return localize_sets(model, views, sets.poses[0].take(index))
 
     for index in _chunks(np.arange(len(sets.landmark))):
-        outcome.attempt(index, solve)
+        outcome.attempt(index, solve, settings.gate)
     return outcome
 
 
@@ -157,7 +163,7 @@ def stereo_calibrator(batch: Batch, settings: StereoCalibratorSettings) -> Outco
         lengths = np.array([len(window) for window in windows])
         for length in np.unique(lengths):
             for chunk in _chunks(index[lengths == length]):
-                outcome.attempt(chunk, solve)
+                outcome.attempt(chunk, solve, settings.gate)
         for scenario in np.flatnonzero(outcome.note[index] != ''):
             windows[scenario] = before[scenario]
     return outcome

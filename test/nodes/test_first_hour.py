@@ -29,7 +29,7 @@ from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.measured_camera import MeasuredCamera
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.nodes.subscriptions import Input
-from fisheye_svp_ros.pose import identity
+from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -353,6 +353,33 @@ def refused_map(hour: Hour, pattern: str) -> None:
     told, points = framed_sets(hour, *SOLVING)
     told.publish(PointCloud2())
     hour.says(pattern, lambda: points.publish(image_points()))
+
+
+@tries('Doubtful poses: lens, unit or image size are others')
+def another_lens(hour: Hour, pattern: str) -> None:
+    _, points = framed_sets(hour, 'lens:=fish180', 'patience:=0.1', 'sigma_px:=0.1')
+    hour.says(pattern, lambda: points.publish(image_points()))
+
+
+@tries('No poses: the residuals are above the gate')
+def gated(hour: Hour, pattern: str) -> None:
+    _, points = framed_sets(hour, 'lens:=fish180', 'patience:=0.1', 'sigma_px:=0.1', 'gate:=3.0')
+    hour.says(pattern, lambda: points.publish(image_points()))
+
+
+@tries('Doubtful rig: left and right are exchanged')
+def exchanged_cameras(hour: Hour, pattern: str) -> None:
+    g = hour.begin(*SOLVING, 'rig:=topic')
+    g.start(StereoDepth)
+    told, given = (
+        g.tell(PointCloud2, 'landmarks', LATCHED),
+        g.tell(TransformStamped, 'rig', LATCHED),
+    )
+    points = [g.tell(PointCloud2, f'{name}/image_points') for name in ('left', 'right')]
+    told.publish(landmarks())
+    pose = Pose(np.eye(3), np.array([0.15, 0.0, 0.0]))
+    given.publish(messages.transform_message(pose, 7, '', ''))
+    hour.says(pattern, lambda: [one.publish(image_points()) for one in points])
 
 
 @tries('Wrong poses: camera_info is for another image size')

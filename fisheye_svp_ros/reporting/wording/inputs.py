@@ -56,6 +56,14 @@ def rig_of_others(frames: Sequence[str], cameras: Sequence[str]) -> str:
     )
 
 
+def cameras_exchanged(distance: float) -> str:
+    """Tell of a pair whose left camera is on the right."""
+    return (
+        f'the left camera is {distance:.3g} m to the right of the right one; are left and right '
+        'exchanged?'
+    )
+
+
 def no_camera_info(topic: str) -> str:
     """Tell of a lens that was to come on a topic."""
     return f'{topic}: no message received; check its publisher, or set lens:=FILE'
