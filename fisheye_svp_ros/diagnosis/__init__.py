@@ -6,12 +6,14 @@
     selection        Selection      causes accepted and given up (`stepwise`), round by round
     fitted_model     FittedModel    estimates, residuals, predicted random effects
     evaluation       Evaluation     held-out prediction, shares of variance, uncertainty
+    adequacy         Adequacy       what is wrong with the data, asked before any decision
     diagnosis        Diagnosis      the answer
     stages           diagnose       runs the stages one after another
 
 Other rooms import what stands here, and nothing else.
 """
 
+from fisheye_svp_ros.diagnosis.adequacy import Adequacy
 from fisheye_svp_ros.diagnosis.causes import CONFOUNDED_P, Cause
 from fisheye_svp_ros.diagnosis.checks.two_cameras import Transfer, TwoCameras, deviations
 from fisheye_svp_ros.diagnosis.checks.two_datasets import TwoDatasets
@@ -44,6 +46,7 @@ from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import MAX_RMS_RATIO
 from fisheye_svp_ros.diagnosis.findings import Finding, Reason, Rival, Status, status_of
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
+from fisheye_svp_ros.diagnosis.flaws import Flaw, FlawKind
 from fisheye_svp_ros.diagnosis.model_errors import ErrorParts, LensErrors, pose_maps, pose_summary
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, can_be_included
@@ -62,6 +65,7 @@ __all__ = [
     'TURNED',
     'UNLIKE',
     'Action',
+    'Adequacy',
     'Advice',
     'Cause',
     'Comparison',
@@ -71,6 +75,8 @@ __all__ = [
     'EffectTests',
     'ErrorParts',
     'Finding',
+    'Flaw',
+    'FlawKind',
     'LensErrors',
     'LensFacts',
     'LensReason',

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Index
+from fisheye_svp_ros.diagnosis.adequacy import Adequacy, judge_data
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
@@ -307,13 +308,14 @@ class Conclusion:
     """The decisions about lens, target, photographs, and what they rest on.
 
     candidates: effects that are not confirmed; ray_error: of each camera, of the lens as given
-    and of the extended one, by range.
+    and of the extended one, by range; adequacy: what is wrong with the data.
     """
 
     decision: dict[str, Decision]
     file: FileFigure
     ray_error: dict[str, dict[str, list[RayError]]]
     candidates: list[Finding]
+    adequacy: Adequacy
 
     def ray_error_mrad(self) -> dict[str, Any]:
         """Return the expected ray errors, mrad, of the worst camera, and of each of several."""
@@ -382,9 +384,9 @@ def conclude(
             unit='view' if is_unpaired(evaluation.null.linear.data) else 'frame',
         )
     )
-    return Conclusion(
-        {'lens': lens, 'target': target, 'photographs': photographs}, file, ray_errors, candidates
-    )
+    adequacy = judge_data(evaluation, causes, components, ray_errors)
+    decisions = adequacy.revise({'lens': lens, 'target': target, 'photographs': photographs})
+    return Conclusion(decisions, file, ray_errors, candidates, adequacy)
 
 
 def advice_on_lens(advice: Sequence[Advice], conclusion: Conclusion) -> list[Advice]:

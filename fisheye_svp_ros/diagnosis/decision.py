@@ -8,8 +8,10 @@ from enum import Enum
 from math import erf
 from typing import Literal, NamedTuple
 
+from fisheye_svp_ros.diagnosis.flaws import Flaw
+
 LensAnswer = Literal['keep', 'use_extended', 'recalibrate', 'undecided']
-TargetAnswer = Literal['keep', 'correct', 'measure_again']
+TargetAnswer = Literal['keep', 'correct', 'measure_again', 'undecided']
 PhotographsAnswer = Literal['enough', 'more', 'retake']
 
 _INTRINSIC = ('focal_length', 'principal_point', 'aspect')
@@ -86,7 +88,8 @@ class EffectBound:
 class Decision:
     """One answer: what to do, why, the figure behind it; confidence: 0 to 1, if measured.
 
-    facts: what it was judged by, for the sentence that says why.
+    facts: what it was judged by, for the sentence that says why; flaws: what is wrong with the
+    data, in place of a reason.
     """
 
     say: LensAnswer | TargetAnswer | PhotographsAnswer
@@ -95,6 +98,7 @@ class Decision:
     figure: Figure
     confidence: float | None
     bound: list[EffectBound] = field(default_factory=list)
+    flaws: tuple[Flaw, ...] = ()
 
 
 class LensOffset(NamedTuple):

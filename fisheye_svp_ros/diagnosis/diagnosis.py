@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fisheye_svp_ros.diagnosis.adequacy import Adequacy
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras
@@ -78,6 +79,8 @@ class Diagnosis:
     @property
     def verdict(self) -> str:
         """Whether the simulation is adequate, (partly) explained or unexplained."""
+        if self.adequacy.is_misfit:
+            return 'unexplained'
         if self.causes or self.decision['lens'].say == 'recalibrate':
             return 'partly_explained' if self.remaining else 'explained'
         # Local offsets of the target alone leave the simulation of the lens adequate.
@@ -90,6 +93,11 @@ class Diagnosis:
     def decision(self) -> dict[str, Decision]:
         """What to do about lens, target and photographs."""
         return self.conclusion.decision
+
+    @property
+    def adequacy(self) -> Adequacy:
+        """What is wrong with the data."""
+        return self.conclusion.adequacy
 
     @property
     def offers_extended(self) -> bool:

@@ -62,8 +62,12 @@ class FocalDriftEffect(PlaneEffect):
         return tuple(Parameter(f'relative_t{i + 1}', '1', 0.01) for i in range(self.degree))
 
     def plane_columns(self, scene: Scene) -> Array:
-        powers = np.nan_to_num(self._polynomials(scene.times))
+        powers = self.relative_change(scene)
         return np.asarray(scene.normalized_uv()[..., None] * powers[:, None, None, :])
+
+    def relative_change(self, scene: Scene) -> Array:
+        """Return the derivatives (S, degree) of the relative focal length of each view."""
+        return np.asarray(np.nan_to_num(self._polynomials(scene.times)))
 
     def _polynomials(self, t: Array) -> Array:
         x = np.clip(2 * (t - self.start) / self.duration - 1, -1, 1)
@@ -104,7 +108,7 @@ class SessionStepEffect(Effect):
         return [cls((float(start),), timed) for start in _starts(instants)]
 
     def beside_intrinsics(self, scene: Scene) -> Effect:
-        return replace(self, means=tuple(self._step_design(scene).mean(axis=0).tolist()))
+        return replace(self, means=tuple(self.step_design(scene).mean(axis=0).tolist()))
 
     def holds_for(self, t: Array, known: Array) -> bool:
         return self.timed and super().holds_for(t, known)
@@ -132,11 +136,11 @@ class SessionStepEffect(Effect):
         growth = (scene.normalized_uv() * focal)[..., None]
         shift = np.broadcast_to(np.eye(2), (*scene.uv.shape, 2))
         step = np.concatenate([growth, shift], axis=-1)
-        after = self._step_design(scene) - (self.means or 0.0)
+        after = self.step_design(scene) - (self.means or 0.0)
         columns = step[..., None, :] * after[:, None, None, :, None]
         return np.asarray(columns.reshape(*scene.uv.shape, len(self.parameters)))
 
-    def _step_design(self, scene: Scene) -> Array:
+    def step_design(self, scene: Scene) -> Array:
         """Return 1.0 where views (S,) come after the starts (K,), 0.0 where before: (S, K)."""
         instant = scene.times if self.timed else scene.views.frame
         return np.asarray(instant[:, None] >= np.array(self.starts), dtype=float)

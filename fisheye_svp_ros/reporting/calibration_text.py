@@ -15,6 +15,7 @@ from fisheye_svp_ros.pose import Pose, vector_from_rotation
 from fisheye_svp_ros.reporting.terminal import UNITS, interval, with_error
 from fisheye_svp_ros.scene.observations import Observations, list_frames
 from fisheye_svp_ros.solve.hand_eye import MAX_ODDS, HandEye
+from fisheye_svp_ros.solve.lens_checks import image_coverage, is_no_fit
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured_poses import rms_px
 from fisheye_svp_ros.solve.outliers import WrongLandmark
@@ -27,10 +28,7 @@ STANDARD_ERRORS = (
     'standard errors include local errors of target, frames and image, and the '
     'shape and scale of the target'
 )
-_POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
 _MODEL_ERROR_RATIO = 2.0  # times the noise, from which residuals show a model error
-_MAX_CENTER_OFFSET = 0.1  # of the image, by which a principal point is seldom off its centre
-_MIN_COVERED_RADIUS = 0.7  # of the way to the nearest edge; less is poor coverage
 ROBOT_HEADER = ('transform', 'x, mm', 'y, mm', 'z, mm', 'rx, deg', 'ry, deg', 'rz, deg')
 _LARGE_SHARE = 0.5  # of the squares of all frames: such a pose is wrong
 _MIN_FRAMES = 6
@@ -120,7 +118,7 @@ class CalibratedCamera:
                 'photographs, or check these'
             )
         rms, sigma = (self.lens.calibration or {})['rms_px'], float(np.median(self.table.sigma))
-        if rms > max(_LOST, _POOR * sigma if np.isfinite(sigma) else 0.0):
+        if is_no_fit(rms, sigma):
             found.append(
                 f'{self.model} leaves {rms:.1f} px: the model does not fit this lens, or '
                 'image points and landmarks do not match (check order, units, axes, '
@@ -140,23 +138,18 @@ class CalibratedCamera:
 
     def _image_warnings(self) -> list[str]:
         """Say where the image of the lens lies askew, or was not covered."""
-        lens, views, found = self.lens, self.result.views, []
-        off = lens.cx - (lens.width - 1) / 2, lens.cy - (lens.height - 1) / 2
-        if (
-            abs(off[0]) > _MAX_CENTER_OFFSET * lens.width
-            or abs(off[1]) > _MAX_CENTER_OFFSET * lens.height
-        ):
+        views, found = self.result.views, []
+        image = image_coverage(self.lens, views.uv[views.used])
+        if image.is_off_center:
             found.append(
-                f'the principal point lies {off[0]:.0f}, {off[1]:.0f} px off the center of the '
-                'image; check the image size, and that images are not cropped'
+                f'the principal point lies {image.offset[0]:.0f}, {image.offset[1]:.0f} px off '
+                'the center of the image; check the image size, and that images are not cropped'
             )
-        out = float(np.linalg.norm(views.uv[views.used] - (lens.cx, lens.cy), axis=-1).max())
-        edge = min(lens.cx, lens.width - lens.cx, lens.cy, lens.height - lens.cy)
-        if out < _MIN_COVERED_RADIUS * edge:
+        if image.is_extrapolated:
             found.append(
                 f'the curve is extrapolated beyond {np.degrees(self.result.reached):.0f} deg: '
-                f'image points reach {out:.0f} px from the center, the nearest edge is at '
-                f'{edge:.0f} px; photograph the target near the edges too'
+                f'image points reach {image.radius:.0f} px from the center, the nearest edge is '
+                f'at {image.edge:.0f} px; photograph the target near the edges too'
             )
         return found
 

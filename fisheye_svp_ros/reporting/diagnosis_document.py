@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from math import degrees
 from typing import Any
 
 from fisheye_svp_ros.diagnosis import Advice, Cause, Decision, Diagnosis, Finding
+from fisheye_svp_ros.reporting.wording.adequacy import flaw_document
 from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason
 from fisheye_svp_ros.reporting.wording.findings import finding_reason
@@ -38,6 +40,8 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         'file': d.file._asdict(),
         'candidates': [_candidate(one) for one in d.candidates],
         'decision': {name: _decision(one) for name, one in d.decision.items()},
+        'adequacy': [flaw_document(flaw) for flaw in d.adequacy.flaws],
+        'reached_deg': degrees(d.adequacy.reached),
         'photographs': [
             {'frame': frame, 'camera': camera, 'name': name}
             for (frame, camera), name in photograph_names(d.problem.observations).items()

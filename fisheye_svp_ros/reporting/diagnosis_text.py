@@ -21,6 +21,7 @@ from fisheye_svp_ros.reporting.cause_text import (
     probability,
     size,
 )
+from fisheye_svp_ros.reporting.wording.adequacy import flaw_headline, flaw_reason
 from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason
 from fisheye_svp_ros.scene.observations import frame_name
@@ -74,6 +75,8 @@ _NOISE_RATIO = 1.5  # times the noise, from which an error is more than that
 
 def lens_words(d: Diagnosis) -> str:
     """Return what to do about the lens, or the lenses of several cameras."""
+    if d.adequacy.is_misfit:
+        return LENS['undecided'].partition(';')[0]
     words = (_OF_RIG if len(d.lenses) > 1 else LENS)[d.decision['lens'].say]
     return words if d.offers_extended or not d.is_lens_off else words.partition(', or ')[0]
 
@@ -176,6 +179,8 @@ def _field_sentence(d: Diagnosis) -> str:
 
 
 def _wrong(d: Diagnosis) -> str:
+    if d.adequacy.is_misfit:
+        return ' '.join(f'{flaw_headline(flaw)}.' for flaw in d.adequacy.flaws)
     noise = f'noise of {d.noise_px:.3g} px a coordinate'
     if _shows_no_cause(d):
         but = [
@@ -323,6 +328,8 @@ def _rig_advice(d: Diagnosis) -> list[str]:
 
 def _next_step(d: Diagnosis) -> str:
     lens = lens_words(d)
+    if d.adequacy.flaws:
+        return '; '.join([lens, flaw_reason(d.adequacy.flaws, 'photographs')]) + '.'
     if d.verdict == 'adequate':
         blind = f'; not testable here: {join_names(list(d.untestable))}' if d.untestable else ''
         turned = [advice_text(one) for one in d.advice if one.kind == TURNED]

@@ -42,6 +42,11 @@ from fisheye_svp_ros.reporting.diagnosis_text import (
     lens_words,
     only_gross,
 )
+from fisheye_svp_ros.reporting.wording.adequacy import (
+    NOT_CERTAIN,
+    flaw_headline,
+    flaw_statement,
+)
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason
 from fisheye_svp_ros.reporting.wording.findings import belief, chance, finding_reason
 from fisheye_svp_ros.scene.observations import photograph_names
@@ -60,12 +65,14 @@ TARGET = {
     'keep': 'Keep the target',
     'correct': f'Correct it by {LENS_FILE} (valid for this target only)',
     'measure_again': 'Measure the target',
+    'undecided': 'Undecided about the target',
 }
 PHOTOGRAPHS = {
     'enough': 'Enough',
     'more': 'Take more',
     'retake': 'Take some again',
 }
+_INADEQUATE_PHOTOGRAPHS = {'more': 'Take more', 'retake': 'Do not use them together'}
 NO_CONFIRMED_ERROR = 'no model error is confirmed in these data'
 _HEADLINES = {
     'viewpoint_shift': 'The viewpoint of the lens shifts with the angle',
@@ -117,6 +124,7 @@ class Screen(NamedTuple):
     candidates: str
     bound: str
     truth: str
+    causes_title: str = 'Causes'
 
 
 def first_screen(
@@ -131,7 +139,7 @@ def first_screen(
         ('Target', target_words(d), d.decision['target'], []),
         (
             'Photographs',
-            PHOTOGRAPHS[d.decision['photographs'].say],
+            photographs_words(d),
             d.decision['photographs'],
             about,
         ),
@@ -158,6 +166,7 @@ def first_screen(
             f'{name} {before}' + (f' → {after}' if after != '-' else '')
             for name, before, after, _ in known_rows(d, known or {})
         ),
+        f'Causes ({NOT_CERTAIN})' if d.adequacy.is_misfit else 'Causes',
     )
 
 
@@ -182,7 +191,7 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
             f'{one.about}: {one.do}{names and f": {names}"}. {one.why}'
             f'{one.sure and f" ({one.sure})"}.'
         )
-    lines += [f'Causes: {screen.causes}'] if screen.causes else []
+    lines += [f'{screen.causes_title}: {screen.causes}'] if screen.causes else []
     lines += [f'Against the truth: {screen.truth}'] if screen.truth else []
     lines += [f'Not confirmed: {screen.candidates}'] if screen.candidates else []
     lines += [f'Not excluded: {screen.bound}'] if screen.bound else []
@@ -308,13 +317,23 @@ def _thumbnail(path: str | None) -> str:
     return image_uri(cv2.imencode('.jpg', small)[1].tobytes(), 'jpeg')
 
 
+def photographs_words(d: Diagnosis) -> str:
+    """Return what to do about the photographs."""
+    say = d.decision['photographs'].say
+    return (_INADEQUATE_PHOTOGRAPHS if d.adequacy.is_misfit else PHOTOGRAPHS)[say]
+
+
 def headline(d: Diagnosis) -> str:
-    """Return the largest cause and the decision about the lens."""
+    """Return the largest cause and the decision about the lens, or what is wrong with the data."""
+    if d.adequacy.flaws:
+        return f'{flaw_headline(d.adequacy.flaws[0])}. {lens_words(d)}.'
     return f'{largest_cause(d)}{_displaced_landmarks(d)}. {lens_words(d)}.'
 
 
 def verdict_words(d: Diagnosis) -> str:
     """Return the verdict as a sentence that agrees with the headline."""
+    if d.adequacy.is_misfit:
+        return f'Inadequate data: {flaw_statement(d.adequacy.flaws[0])}'
     if d.verdict == 'unexplained' and only_gross(d):
         return 'Unexplained: outliers; nothing else is wrong'
     if d.verdict == 'adequate' and d.offers_extended:
@@ -328,7 +347,7 @@ def verdict_words(d: Diagnosis) -> str:
 def target_words(d: Diagnosis) -> str:
     """Return what to do about the target."""
     say = d.decision['target'].say
-    if say == 'keep':
+    if say in ('keep', 'undecided'):
         return TARGET[say]
     by_file = d.offers_extended or say != 'correct'
     words = TARGET[say] if by_file else 'Correct the target: measure it'

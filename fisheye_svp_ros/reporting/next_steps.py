@@ -30,7 +30,9 @@ class ReportInputs(NamedTuple):
 
 
 def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
-    """Return the command to go on with, as a shell takes it."""
+    """Return the command to go on with, as a shell takes it; '' where the data are no use."""
+    if diagnosis.adequacy.is_misfit:
+        return ''
     d, files = diagnosis, follow_up_files(diagnosis, inputs)
     observations, lenses = (
         files['observations'],

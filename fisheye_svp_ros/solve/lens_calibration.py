@@ -85,7 +85,7 @@ def calibrate(
     lens.  Where only a few views with points in another order stand in the way, it is fitted
     without them.
     """
-    start = replace(_start_lens(model, image_size, free or (), name), port=port)
+    start = replace(start_lens(model, image_size, free or (), name), port=port)
     names = (*INTRINSICS, *start.image_height.coefficient_names) if free is None else tuple(free)
     names += tuple(n for n in placed_names(start) if n not in names)
     _check_names(start, names)
@@ -93,14 +93,14 @@ def calibrate(
     views, left_out = posable_views(observations)
     _check_rows(observations.source, views, names)
     try:
-        return _as_calibration(observations, _fit_lens(start, views, names), views, left_out)
+        return _as_calibration(observations, fit_lens(start, views, names), views, left_out)
     except GeometryError:
         lost = lost_views(start.svp(), select_points(views, len(views.frame)))
         if not lost.any():
             raise
     views = views.take(np.flatnonzero(~lost))
     _check_rows(observations.source, views, names)
-    return _as_calibration(observations, _fit_lens(start, views, names), views, left_out)
+    return _as_calibration(observations, fit_lens(start, views, names), views, left_out)
 
 
 def calibrate_port(
@@ -161,7 +161,7 @@ def rough_lenses(model: str, image_size: tuple[int, int]) -> list[Lens]:
 
     To begin with where wrong landmarks or image points lead every fit astray.
     """
-    start = _start_lens(model, image_size, (), 'start')
+    start = start_lens(model, image_size, (), 'start')
     focals = _focal_lengths(start)[::_ROUGH_STEP]
     order = np.argsort(np.abs(np.arange(len(focals)) - len(focals) / 3), kind='stable')
     lenses = [replace(start, fx=focal, fy=focal) for focal in focals[order].tolist()]
@@ -220,7 +220,8 @@ def _angles(adjusted: AdjustedLens, views: Views) -> Array:
     return incidence(adjusted.lens, local, limited=False).theta[views.used]
 
 
-def _start_lens(model: str, image_size: tuple[int, int], free: Sequence[str], name: str) -> Lens:
+def start_lens(model: str, image_size: tuple[int, int], free: Sequence[str], name: str) -> Lens:
+    """Return the lens that a fit begins with: neutral, its center in the middle of the image."""
     if model not in IMAGE_HEIGHTS:
         raise LensError(f'model {model!r} is unknown; known are {", ".join(IMAGE_HEIGHTS)}')
     width, height = image_size
@@ -267,7 +268,7 @@ def _check_inside(observations: Observations, image_size: tuple[int, int]) -> No
         )
 
 
-def _fit_lens(start: Lens, views: Views, names: tuple[str, ...]) -> AdjustedLens:
+def fit_lens(start: Lens, views: Views, names: tuple[str, ...]) -> AdjustedLens:
     """Scan the focal length, adjust the best candidates to few points, then to everything."""
     shift = start.viewpoint_shift
     port_names = tuple(name for name in names if name in start.port_names)
@@ -297,7 +298,7 @@ def _fit_port(lens: Lens, few: Views, views: Views, names: tuple[str, ...]) -> A
     """Adjust a lens from several places of its port."""
     assert lens.port is not None
     lenses = [replace(lens, port=port) for port in lens.port.starts()]
-    pose = Pose.stack([_localize_views(one, few).pose for one in lenses])
+    pose = Pose.stack([localize_views(one, few).pose for one in lenses])
     values = np.array([parameter_values(one, names) for one in lenses])
     best = adjust_lens_from(lens, few, pose, values, names, _START_ITERATIONS)
     return _adjust_until_stable(best, views, names)
@@ -305,13 +306,13 @@ def _fit_port(lens: Lens, few: Views, views: Views, names: tuple[str, ...]) -> A
 
 def _adjust_until_stable(lens: Lens, views: Views, names: tuple[str, ...]) -> AdjustedLens:
     """Pose every view and adjust, until no view fits better when it is posed afresh."""
-    pose = _localize_views(lens, views).pose
+    pose = localize_views(lens, views).pose
     for _ in range(_ROUNDS):
         adjusted = adjust_lens(lens, views, pose, names)
         lens, pose = adjusted.lens, adjusted.pose
         if not adjusted.converged:
             break
-        fresh = _localize_views(lens, views)
+        fresh = localize_views(lens, views)
         better = fresh.cost < adjusted.cost * (1 - 1e-6)
         if not better.any():
             break
@@ -319,7 +320,7 @@ def _adjust_until_stable(lens: Lens, views: Views, names: tuple[str, ...]) -> Ad
     return adjusted
 
 
-def _localize_views(lens: Lens, views: Views) -> Localization:
+def localize_views(lens: Lens, views: Views) -> Localization:
     """Pose every view from what lies inside the field of view, however little that is."""
     lens = _with_corner(lens)
     rays = back_project(lens, views.uv)

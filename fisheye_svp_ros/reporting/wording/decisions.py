@@ -16,12 +16,16 @@ from fisheye_svp_ros.diagnosis import (
     TargetFacts,
     TargetReason,
 )
+from fisheye_svp_ros.reporting.wording.adequacy import flaw_reason
 
+_SUBJECTS = {LensFacts: 'lens', TargetFacts: 'target', PhotographsFacts: 'photographs'}
 _ONE_FRAME = 'one frame does not tell errors of the lens from those of the target'
 
 
 def decision_reason(decision: Decision) -> str:
     """Return why, as a clause that begins in lower case and ends without a stop."""
+    if decision.flaws:
+        return flaw_reason(decision.flaws, _SUBJECTS[type(decision.facts)])
     return _reasons(decision.facts)[decision.reason]
 
 

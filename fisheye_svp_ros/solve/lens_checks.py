@@ -1,0 +1,54 @@
+"""What there is to say against a lens that was fitted to image points: facts for every command."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.optics.lens import Lens
+
+_POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
+_MAX_CENTER_OFFSET = 0.1  # of the image, by which a principal point is seldom off its center
+_MIN_COVERED_RADIUS = 0.7  # of the way to the nearest edge; less is poor coverage
+
+
+class ImageCoverage(NamedTuple):
+    """Where the image of a lens lies, and how much of it image points cover.
+
+    offset: of the principal point from the center of the image, px; size: of the image, px;
+    radius, edge: of the outermost image point and of the nearest edge of the image from the
+    principal point, px.
+    """
+
+    offset: tuple[float, float]
+    size: tuple[int, int]
+    radius: float
+    edge: float
+
+    @property
+    def is_off_center(self) -> bool:
+        """Whether the principal point is where few cameras have theirs."""
+        return any(
+            abs(off) > _MAX_CENTER_OFFSET * size
+            for off, size in zip(self.offset, self.size, strict=True)
+        )
+
+    @property
+    def is_extrapolated(self) -> bool:
+        """Whether the curve is a guess in a large part of the image."""
+        return self.radius < _MIN_COVERED_RADIUS * self.edge
+
+
+def image_coverage(lens: Lens, uv: Array) -> ImageCoverage:
+    """Return where image points uv (N, 2), px, lie in the image of a lens."""
+    off = lens.cx - (lens.width - 1) / 2, lens.cy - (lens.height - 1) / 2
+    out = float(np.linalg.norm(uv - (lens.cx, lens.cy), axis=-1).max())
+    edge = min(lens.cx, lens.width - lens.cx, lens.cy, lens.height - lens.cy)
+    return ImageCoverage(off, (lens.width, lens.height), out, edge)
+
+
+def is_no_fit(rms_px: float, sigma_px: float) -> bool:
+    """Whether a lens leaves so much that it is no model of its points; sigma: NaN if unknown."""
+    return rms_px > max(_LOST, _POOR * sigma_px if np.isfinite(sigma_px) else 0.0)

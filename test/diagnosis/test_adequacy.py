@@ -1,0 +1,93 @@
+"""Where data are not adequate, nothing reassures, and what is wrong with them is said."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers.flawed_sets import flawed
+
+from fisheye_svp_ros.diagnosis import DiagnosisOptions, FlawKind, diagnose
+from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
+from fisheye_svp_ros.scene.observations import group_views
+from fisheye_svp_ros.solve.frame_groups import find_frame_groups
+from fisheye_svp_ros.solve.lens_calibration import calibrate
+
+EVEN, ODD = tuple(range(0, 16, 2)), tuple(range(1, 16, 2))
+
+
+@cache
+def diagnosed(name):
+    table, size = flawed(name)
+    lens = calibrate(table, 'kannala_brandt', size).adjusted.lens
+    return diagnose(table, lens, options=DiagnosisOptions(quick=True))
+
+
+def screen(found):
+    return ' '.join(terminal_lines(first_screen(found, 'set.csv'), ''))
+
+
+FLAWED = {
+    'zoom alternates': FlawKind.FOCAL_VARIES,
+    'zoom in groups': FlawKind.FOCAL_VARIES,
+    'stabilizer': FlawKind.CENTER_VARIES,
+    'two cameras of one kind': FlawKind.CAMERAS_MIXED,
+    'central': FlawKind.ANGLE_SHORT,
+    'tiny board': FlawKind.LENS_UNKNOWN,
+}
+
+
+def once(name):
+    """Return the mark of tests that share a diagnosis."""
+    return pytest.mark.xdist_group(f'adequacy of {name}')
+
+
+@pytest.mark.parametrize('name', [pytest.param(name, marks=once(name)) for name in FLAWED])
+def test_nothing_reassures_on_inadequate_data(name):
+    found = diagnosed(name)
+    assert found.adequacy.flaws[0].kind == FLAWED[name]
+    answers = {about: one.say for about, one in found.decision.items()}
+    assert 'keep' not in answers.values()
+    assert answers['photographs'] == ('retake' if found.adequacy.is_misfit else 'more')
+    assert not any(one.bound or one.confidence is not None for one in found.decision.values())
+    text = screen(found)
+    assert 'Keep' not in text and 'Enough' not in text and '% sure' not in text
+    if found.adequacy.is_misfit:
+        assert found.verdict == 'unexplained'
+
+
+def test_sound_data_are_adequate():
+    found = diagnosed('sound')
+    assert not found.adequacy.flaws
+    assert [one.say for one in found.decision.values()] == ['keep', 'keep', 'enough']
+
+
+@once('zoom alternates')
+def test_alternating_zoom_is_told_in_percent_and_by_frames():
+    flaw = diagnosed('zoom alternates').adequacy.flaws[0]
+    assert flaw.size == pytest.approx(0.06, rel=0.2)
+    assert set(flaw.groups) == {EVEN, ODD}
+
+
+@once('stabilizer')
+def test_shifted_images_are_told_in_pixels():
+    flaw = diagnosed('stabilizer').adequacy.flaws[0]
+    assert 5 < flaw.size < 20
+
+
+@once('two cameras of one kind')
+def test_frames_of_two_cameras_are_told_by_number():
+    assert set(diagnosed('two cameras of one kind').adequacy.flaws[0].groups) == {EVEN, ODD}
+
+
+@once('central')
+def test_angle_of_the_points_is_told():
+    flaw = diagnosed('central').adequacy.flaws[0]
+    assert np.degrees(flaw.size) == pytest.approx(11, abs=3)
+    assert 'nothing is known beyond' in screen(diagnosed('central'))
+
+
+def test_groups_of_frames_are_found_where_no_lens_fits():
+    table, size = flawed('two cameras in blocks')
+    views = group_views(table)
+    groups = find_frame_groups(views, size, 0.05)
+    assert [group.tolist() for group in groups] == [[*range(8)], [*range(8, 16)]]
