@@ -280,6 +280,7 @@ def test_the_command_to_go_on_solves_the_same_problem(found: Diagnosis) -> None:
         offers_extended=False,
         problem=SimpleNamespace(plannable=True),
         is_lens_off=False,
+        adequacy=SimpleNamespace(is_misfit=False),
     )
     assert command_to_go_on(open_, inputs) == (
         "fisheye-svp diagnose 'a b.csv' --lens l.yaml --poses p.csv --free intrinsics --next 6 "
