@@ -292,8 +292,11 @@ class BaseNode(Node):  # type: ignore[misc]
                 f'{topic}: received': one.count.received,
                 f'{topic}: read': one.count.read,
                 f'{topic}: dropped': one.count.dropped,
+                f'{topic}: lost': one.count.lost,
             }
             one.adapt()
+            if losses := one.losses():
+                self.warn(losses)
         more, trouble = self.report()
         now = self.get_clock().now().nanoseconds
         clock = '' if now else 'use_sim_time is true, but /clock has no time yet'

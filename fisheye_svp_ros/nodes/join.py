@@ -241,23 +241,31 @@ class StampJoin:
 class LatchedLandmarks:
     """The landmarks of sets without any of their stamp: the latest, unless they come set by set.
 
-    They do once a set had landmarks of its own stamp and landmarks of other stamps come as
-    well: those of one set must not stand in for those of another.  Stamp 0 says that they hold.
+    They do where they differ from message to message and most of the latest sets had some of
+    their own stamp: those of one set must not stand in for those of another.  A map with stamps
+    of its own meets those of few sets, by chance.  Sets count once another message has come:
+    landmarks that stop are no map.  Stamp 0 says that landmarks hold.
     """
 
     def __init__(self) -> None:
         self.trouble = ''  # with the latest message, until another comes
         self._latest: LandmarkSet | None = None
-        self._stamp: int | None = None
-        self._matched = self._vary = False
+        self._content: int | None = None  # a hash
+        self._vary = False
+        self._matched = deque[bool](maxlen=_MAX_MISSED)  # of the sets before the latest message
+        self._misses = 0  # sets since then without their own
 
     def hear(self, stamp: int, unread: Unread) -> None:
         """Take note of landmarks; raise ObservationError where they cannot be used."""
-        if not stamp:
-            self._stamp, self._matched, self._vary = None, False, False
-        elif stamp != self._stamp:
-            self._vary = self._stamp is not None
-            self._stamp = stamp
+        if stamp:
+            content, before = unread.content, self._content
+            self._vary = self._vary or before not in (None, content)
+            self._content = content
+            self._matched.extend([False] * min(self._misses, _MAX_MISSED))
+        else:
+            self._content, self._vary = None, False
+            self._matched.clear()
+        self._misses = 0
         self.trouble = ''
         if not self._is_series:
             self._read(unread)
@@ -277,9 +285,10 @@ class LatchedLandmarks:
 
         own: those of its stamp; distance: of the nearest stamp there was, ns.
         """
-        self._matched = self._matched or own is not None
         if own is not None:
+            self._matched.append(True)
             return own
+        self._misses += 1
         if self._is_series:
             raise ObservationError(
                 f'no landmarks of its stamp, the nearest is {1e-6 * (distance or 0):.1f} ms off: '
@@ -292,4 +301,4 @@ class LatchedLandmarks:
 
     @property
     def _is_series(self) -> bool:
-        return self._matched and self._vary
+        return self._vary and 2 * sum(self._matched) >= max(len(self._matched), 1)

@@ -46,6 +46,7 @@ from fisheye_svp_ros.study.solutions import Pair
 _UNREAD = 5 * LIMIT  # messages to look at while there is nothing to solve
 _LONGEST_INTAKE = 0.05  # s of taking in before a set is solved, come what may
 _NS = 10**9
+_MAX_UNANSWERED = 10  # sets that wait for a topic on which nothing has ever come
 _SAME_WAY = 0.7  # cosine of the angle between two viewing axes
 _ENDS = ('taken', 'solved', 'not solved', 'dropped', 'incomplete')  # of sets
 _COUNTS = (*_ENDS, 'solved with a warning')
@@ -248,8 +249,11 @@ class SolverNode(ManagedNode):
 
     def report(self) -> tuple[Mapping[str, object], str]:
         """Return what became of every set, and whether this node keeps up."""
-        counts, trouble = self._pace.report(len(self._backlog) + len(self._join))
-        troubles = filter(None, (trouble, self._latched_landmarks.trouble))
+        counts, overload = self._pace.report(len(self._backlog) + len(self._join))
+        if overload:
+            self.warn(overload)
+        inactive = '' if self.listening else wording.inactive(self.get_fully_qualified_name())
+        troubles = filter(None, (inactive, self._latched_landmarks.trouble))
         return {**counts, **self._validation.rejected}, '; '.join(troubles)
 
     def _listen_to_camera_info(self) -> None:
@@ -327,9 +331,12 @@ class SolverNode(ManagedNode):
             pass
 
     def _skip_unpublished(self) -> None:
-        """Do not let sets wait for true poses that nobody publishes."""
-        for topic in self._poses if len(self._join) else ():
-            if not self.count_publishers(self._inputs[topic].resolved):
+        """Do not let sets wait for what nobody publishes, or has never sent for many sets."""
+        optional = (*self._poses, *(['scenario'] if self.settings.lens else []))
+        for topic in optional if len(self._join) else ():
+            one = self._inputs[topic]
+            silent = not one.has_messages and len(self._join) > _MAX_UNANSWERED
+            if silent or not self.count_publishers(one.resolved):
                 self._join.expect_no_more(topic)
 
     def _compare_stamps(self, one: Pending) -> None:

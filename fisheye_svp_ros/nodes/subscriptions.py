@@ -31,6 +31,7 @@ from rclpy.serialization import deserialize_message
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.decoding import nanoseconds
 from fisheye_svp_ros.nodes.quality import INPUT, PREFIX, create_with_qos, overridden, qos_words
+from fisheye_svp_ros.reporting.wording.inputs import messages_lost
 
 _LONG_INTERVALS = 3  # of a topic, without a message: it has stopped
 # Messages by which one subscription of a topic may be ahead of another: as many as may wait.
@@ -41,15 +42,18 @@ _MIN_BYTES = 12  # bytes: the head of CDR and a stamp
 _Kind = tuple[bool, bool]  # of a subscription: reliable, latched
 LIMIT = 5.0  # s without a message after which it is said
 _MAX_PROPOSALS = 3  # topics to propose
+_MAX_LOSS = 0.1  # of the messages between two reports, lost on the way
+_LARGE = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 
 
 @dataclass
 class Count:
-    """How many messages of a topic came, were looked at, and could not be used."""
+    """How many messages of a topic came, were looked at, could not be used, and did not come."""
 
     received: int = 0
     read: int = 0
     dropped: int = 0
+    lost: int = 0
 
 
 class Unread:
@@ -74,6 +78,11 @@ class Unread:
         except ObservationError:
             self._counts.read += 1
             raise
+
+    @property
+    def content(self) -> int:
+        """A hash of what it holds, but for its stamp."""
+        return hash(self._data[_MIN_BYTES:])
 
     def read(self) -> Any:
         """Return what it holds; raise ObservationError where it cannot be used."""
@@ -101,7 +110,7 @@ class _Subscription(NamedTuple):
     """One of rclpy, and what is called with each of its messages."""
 
     of_rclpy: Any
-    hear: Callable[[bytes], None]
+    hear: Callable[[bytes, Any], None]
 
 
 class Input:
@@ -124,10 +133,13 @@ class Input:
         self.resolved = str(node.resolve_topic_name(name))
         self.typename = f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
         self._node, self._kind, self._receive = node, kind, receive
-        self._qos, self._latched = qos, latched
+        self._qos, self.latched = qos, latched
         self._subscriptions: dict[_Kind, _Subscription] = {}
         self._since = self._first = self._latest = 0.0  # s
         self._heard = 0
+        self._has_one_publisher = False
+        self._number: int | None = None  # of the latest message, as its publisher counts
+        self._reported = Count()
 
     @property
     def profiles(self) -> list[Any]:
@@ -150,7 +162,7 @@ class Input:
 
         What is latched has come for good; else three times the mean interval is long.
         """
-        if self._heard and self._latched:
+        if self._heard and self.latched:
             return False
         interval = (self._latest - self._first) / max(self._heard - 1, 1)
         return self.silent_for() > max(limit, _LONG_INTERVALS * interval)
@@ -159,7 +171,7 @@ class Input:
         """Listen."""
         self._since, self._heard = time.monotonic(), 0
         self._first = self._latest = self._since
-        self._filter = DuplicateFilter(self._hear, self._latched)
+        self._filter = DuplicateFilter(self._hear, self.latched)
         reliable = self._qos.reliability != ReliabilityPolicy.BEST_EFFORT
         self._add_subscription((reliable, False), self._qos)
 
@@ -184,17 +196,21 @@ class Input:
                 message = handle.take_message(self._kind, True)
             if message is not None:
                 taken = True
-                one.hear(message[0])
+                one.hear(*message)
         return taken
 
     def adapt(self) -> None:
         """Add the subscriptions that the publishers of the topic need."""
-        if not self._subscriptions or self._is_fixed():
+        if not self._subscriptions:
+            return
+        publishers = self._node.get_publishers_info_by_topic(self.resolved)
+        self._has_one_publisher = len(publishers) == 1
+        if self._is_fixed():
             return
         usual = next(iter(self._subscriptions))
-        for publisher in self._node.get_publishers_info_by_topic(self.resolved):
+        for publisher in publishers:
             offered = publisher.qos_profile
-            latched = self._latched and offered.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            latched = self.latched and offered.durability == DurabilityPolicy.TRANSIENT_LOCAL
             reliable = offered.reliability != ReliabilityPolicy.BEST_EFFORT
             needed = reliable and (usual[0] or latched), latched
             if publisher.topic_type == self.typename and needed not in self._subscriptions:
@@ -206,6 +222,26 @@ class Input:
                     qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
                 self._add_subscription(needed, qos)
 
+    def losses(self) -> str:
+        """Say how many messages have been lost since the last call, where that is many."""
+        lost, received = (
+            getattr(self.count, name) - getattr(self._reported, name)
+            for name in ('lost', 'received')
+        )
+        self._reported = copy(self.count)
+        if lost <= _MAX_LOSS * (lost + received):
+            return ''
+        return messages_lost(self.name, lost, lost + received, f'{PREFIX}{self.resolved}')
+
+    def _count_losses(self, number: int | None) -> None:
+        """Count what is missing between two messages of one publisher, which numbers them.
+
+        number: None where the middleware does not tell.
+        """
+        last, self._number = self._number, number
+        if self._has_one_publisher and None not in (last, number):
+            self.count.lost += max(int(number or 0) - int(last or 0) - 1, 0)
+
     def _is_fixed(self) -> bool:
         """Say whether the user has decided what to ask for."""
         chosen = overridden(self._node, self.resolved, 'subscription')
@@ -215,13 +251,18 @@ class Input:
         node = self._node
         adapt = node.guard_callback(lambda _: self.adapt())
         events = SubscriptionEventCallbacks(
-            matched=adapt if self._latched else None,
+            matched=adapt if self.latched else None,
             incompatible_qos=None if self._is_fixed() else adapt,
         )
-        hear = self._filter.callback()
+        hear_data, first = self._filter.callback(), not self._subscriptions
 
-        def receive(data: bytes) -> None:
-            hear(data)
+        def hear(data: bytes, info: Any) -> None:
+            if first:
+                self._count_losses(info['publication_sequence_number'])
+            hear_data(data)
+
+        def receive(data: bytes, info: Any) -> None:
+            hear(data, info)
             node.after_message()
 
         self._subscriptions[kind] = _Subscription(
@@ -323,14 +364,20 @@ def _reason(node: Any, inputs: Sequence[Input], one: Input, publishers: Sequence
             f'{names} offers {qos_words(offers[0])}, but this node requests '
             f'{qos_words(one.profiles[0])}; remove {PREFIX}{one.resolved}.subscription.*'
         )
-    lossy = all(asked.reliability == ReliabilityPolicy.BEST_EFFORT for asked in one.profiles)
-    large = (
-        ' (best effort loses large messages: raise net.core.rmem_max, or set '
-        f'{PREFIX}{one.resolved}.subscription.reliability:=reliable)'
-        if lossy
-        else ''
-    )
-    return f'{names} is connected, but no message has arrived{large}'
+    return f'{names} is connected, but no message has arrived{_remedy(one, offers)}'
+
+
+def _remedy(one: Input, offers: Sequence[Any]) -> str:
+    """Return what may help where a publisher that is heard has sent nothing, or nothing came."""
+    if one.typename not in _LARGE:
+        volatile = all(offer.durability == DurabilityPolicy.VOLATILE for offer in offers)
+        if one.latched and volatile:
+            return ' (volatile: what was sent before this node started is lost; publish it again)'
+        return f'; check its own input, and run ros2 topic hz {one.resolved}'
+    override = f'set {PREFIX}{one.resolved}.subscription.reliability:=reliable'
+    if all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers):
+        return f'; if ros2 topic hz {one.resolved} shows messages, {override}'
+    return f' (best effort loses large messages: raise net.core.rmem_max, or {override})'
 
 
 def _comes_from_elsewhere(node: Any, topic: str) -> bool:

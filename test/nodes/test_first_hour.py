@@ -120,8 +120,8 @@ def image_points(stamp: int = 7, ids: Any = None) -> Any:
     )
 
 
-def landmarks(stamp: int = 0) -> Any:
-    return messages.landmarks_message(environment('whole', 2.0), stamp, 'world')
+def landmarks(stamp: int = 0, radius: float = 2.0) -> Any:
+    return messages.landmarks_message(environment('whole', radius), stamp, 'world')
 
 
 @tries('No messages: wrong topic name')
@@ -167,6 +167,29 @@ def large_images(hour: Hour, pattern: str) -> None:
     g = hour.begin(f'board:={BOARD}')
     g.probe.create_publisher(Image, '/image', SENSOR)
     g.start(Detector)
+    hour.says(pattern)
+
+
+@tries('Some messages are lost: large images, best effort')
+def lost_images(hour: Hour, pattern: str) -> None:
+    g = hour.begin(f'board:={BOARD}')
+    images = g.probe.create_publisher(Image, '/image', SENSOR)
+    g.start(Detector)
+    blank = messages.image_message(np.zeros((16, 16), np.uint8), 7, 'camera')
+    hour.says(pattern, lambda: [images.publish(blank) for _ in range(30)])
+
+
+@tries('No messages: landmarks were sent before the node started')
+def volatile_landmarks(hour: Hour, pattern: str) -> None:
+    g = hour.begin(*SOLVING)
+    g.probe.create_publisher(PointCloud2, '/landmarks', 1).publish(landmarks())
+    g.start(Localizer)
+    hour.says(pattern)
+
+
+@tries('No results: a managed node is not active')
+def inactive(hour: Hour, pattern: str) -> None:
+    hour.begin(*SOLVING, 'lifecycle:=true').start(Localizer)
     hour.says(pattern)
 
 
@@ -243,7 +266,7 @@ def landmarks_of_one_set(hour: Hour, pattern: str) -> None:
     g.start(Localizer)
     told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
     for stamp in (1000, 2000):
-        told.publish(landmarks(stamp * MS))
+        told.publish(landmarks(stamp * MS, stamp / 1000))
         points.publish(image_points(stamp * MS))
     hour.says(pattern, lambda: points.publish(image_points(3000 * MS)))
 

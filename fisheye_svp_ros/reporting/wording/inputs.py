@@ -64,6 +64,19 @@ def cameras_exchanged(distance: float) -> str:
     )
 
 
+def inactive(node: str) -> str:
+    """Tell of a managed node that listens to nothing."""
+    return f'not active, so no set is solved; run ros2 lifecycle set {node} activate'
+
+
+def messages_lost(topic: str, count: int, of: int, override: str) -> str:
+    """Tell of messages that were sent and have not come; override: of the QoS."""
+    return (
+        f'{topic}: {count} of {of} messages were lost; raise net.core.rmem_max, or set '
+        f'{override}.subscription.reliability:=reliable'
+    )
+
+
 def no_camera_info(topic: str) -> str:
     """Tell of a lens that was to come on a topic."""
     return f'{topic}: no message received; check its publisher, or set lens:=FILE'
