@@ -54,6 +54,8 @@ setup(
         'opencv-python-headless>=4.6',
         'rosbags>=0.11.9',
         'mcap>=1.1',
+        'lz4>=3.1',
+        'zstandard>=0.17',
         'threadpoolctl>=3.2',
     ],
     extras_require={

@@ -14,35 +14,35 @@ _HOMES = {
     'Lens': 'optics.lens',
     'Observations': 'scene.observations',
     'rig': 'scene.rigs',
-    'Columns': 'library_results',
+    'Columns': 'library.results',
     'read_observations': 'io.readers',
     'write_observations': 'io.readers',
     'read_poses': 'io.readers',
     'detect': '',
-    'observations': 'library_boards',
-    'render': 'library_boards',
-    'plan': 'library_boards',
-    'write_lens': 'library_boards',
-    'load_lens': 'library',
+    'observations': 'library.boards',
+    'render': 'library.boards',
+    'plan': 'library.boards',
+    'write_lens': 'library.boards',
+    'load_lens': 'library.functions',
     'load_rig': 'io.rig_files',
-    'save_lens': 'library',
-    'project': 'library',
-    'back_project': 'library',
-    'localize': 'library',
-    'calibrate': 'library',
-    'calibrate_stereo': 'library',
-    'calibrate_rig': 'library_boards',
-    'localize_rig': 'library_boards',
-    'stereo_depth': 'library',
-    'simulate_scenario': 'library',
-    'sweep': 'library',
-    'diagnose': 'library',
-    'budget': 'library',
-    'undistort_maps': 'library',
-    'rectify_maps': 'library',
-    'plot_lens': 'library_plots',
-    'plot_residuals': 'library_plots',
-    'plot_budget': 'library_plots',
+    'save_lens': 'library.functions',
+    'project': 'library.functions',
+    'back_project': 'library.functions',
+    'localize': 'library.functions',
+    'calibrate': 'library.functions',
+    'calibrate_stereo': 'library.functions',
+    'calibrate_rig': 'library.boards',
+    'localize_rig': 'library.boards',
+    'stereo_depth': 'library.functions',
+    'simulate_scenario': 'library.functions',
+    'sweep': 'library.functions',
+    'diagnose': 'library.functions',
+    'budget': 'library.functions',
+    'undistort_maps': 'library.functions',
+    'rectify_maps': 'library.functions',
+    'plot_lens': 'library.plots',
+    'plot_residuals': 'library.plots',
+    'plot_budget': 'library.plots',
 }
 __all__ = [*_HOMES]
 
@@ -52,7 +52,12 @@ def __getattr__(name: str) -> _Any:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     if not _HOMES[name]:  # a room that can be called
         return _import_module(f'{__name__}.{name}')
-    return getattr(_import_module(f'{__name__}.{_HOMES[name]}'), name)
+    found = getattr(_import_module(f'{__name__}.{_HOMES[name]}'), name)
+    if not isinstance(found, type):
+        from fisheye_svp_ros.errors import only_own_errors
+
+        found = only_own_errors(found)
+    return globals().setdefault(name, found)
 
 
 def __dir__() -> list[str]:

@@ -73,8 +73,8 @@ class Batch:
 
     @classmethod
     def _from_fields(cls, parts: Any) -> Self:
-        make: Any = cls
-        made: Self = make(*parts)
+        kind: Any = cls
+        made: Self = kind._make(parts)
         return made
 
     def _fields_tuple(self) -> tuple[Any, ...]:

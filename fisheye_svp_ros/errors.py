@@ -1,7 +1,13 @@
 """The errors of this package: one root, one subclass a kind of bad input."""
 
 import re
+from collections.abc import Callable
+from functools import wraps
+from inspect import signature
+from typing import ParamSpec, TypeVar
 
+_P = ParamSpec('_P')
+_R = TypeVar('_R')
 _MAX_LENGTH = 1500  # characters; what is quoted may be a whole file
 _CONTROL_CHARACTERS = re.compile(r'\s*[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]+\s*')
 
@@ -46,3 +52,23 @@ class SweepError(FisheyeSvpError):
 
 class GraphError(FisheyeSvpError):
     """A graph of nodes cannot be: ROS 2 or a part of it is missing, or a process has failed."""
+
+
+def only_own_errors(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Return the function, from which errors of this package come alone, if the call fits it."""
+    takes = signature(function)
+
+    @wraps(function)
+    def wrapper(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        takes.bind(*args, **kwargs)
+        try:
+            return function(*args, **kwargs)
+        except (FisheyeSvpError, ImportError, MemoryError):
+            raise
+        except Exception as cause:
+            raise ParameterError(
+                f'{function.__name__}: the arguments cannot be used '
+                f'({type(cause).__name__}: {cause})'
+            ) from cause
+
+    return wrapper

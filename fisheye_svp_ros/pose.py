@@ -7,17 +7,19 @@ of geometry_msgs/PoseWithCovariance.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fisheye_svp_ros.arrays import Array, Batch, Mask
+from fisheye_svp_ros.errors import GeometryError
 
 # Kita's camera at the origin gazes along -z with x right, y up; the optical frame has y down.
 PAPER_FROM_OPTICAL: Array = np.diag([1.0, -1.0, -1.0])
 
 _IDENTITY: Array = np.eye(3)
+_ORTHONORMAL = 1e-3  # printed digits are forgiven, another convention is not
 # [v]x, row by row, of the unit vectors
 _CROSS: Array = np.array(
     [
@@ -38,6 +40,24 @@ class Pose(_Pose, Batch):
 
     __slots__ = ()
 
+    def __new__(cls, rotation: ArrayLike, position: ArrayLike) -> Self:
+        """Check the arrays; raise GeometryError for other shapes, and for no rotation.
+
+        NaN stands for a pose that is not known.  Poses made of poses, `_make`, are not checked.
+        """
+        turn, place = np.asarray(rotation, dtype=float), np.asarray(position, dtype=float)
+        if turn.shape[-2:] != (3, 3) or place.shape[-1:] != (3,):
+            raise GeometryError(
+                f'a pose has a rotation (..., 3, 3) and a position (..., 3), not {turn.shape} '
+                f'and {place.shape}'
+            )
+        gram = turn @ np.swapaxes(turn, -1, -2)
+        if (np.abs(gram - _IDENTITY) > _ORTHONORMAL).any() or (np.linalg.det(turn) < 0).any():
+            raise GeometryError(
+                'a pose has a matrix that is no rotation; R RT = 1 and det R = 1 are needed'
+            )
+        return super().__new__(cls, turn, place)
+
     def __repr__(self) -> str:
         if self.position.ndim > 1:
             return f'Pose{self.position.shape[:-1]}'
@@ -48,11 +68,11 @@ class Pose(_Pose, Batch):
     def inverse(self) -> Pose:
         """Return the reference frame in the body."""
         rotation = np.swapaxes(self.rotation, -1, -2)
-        return Pose(rotation, -(rotation @ self.position[..., None])[..., 0])
+        return Pose._make((rotation, -(rotation @ self.position[..., None])[..., 0]))
 
     def compose(self, other: Pose) -> Pose:
         """Return the pose of `other`'s body, given in this body's frame, in this reference."""
-        return Pose(self.rotation @ other.rotation, self.transform(other.position))
+        return Pose._make((self.rotation @ other.rotation, self.transform(other.position)))
 
     def transform(self, points: Array) -> Array:
         """Map points (..., 3) from the body to the reference frame, one a pose."""
@@ -65,7 +85,7 @@ class Pose(_Pose, Batch):
     def retract(self, change: Array) -> Pose:
         """Apply small changes (..., 6): m, rad."""
         rotation = rotation_from_vector(change[..., 3:]) @ self.rotation
-        return Pose(rotation, self.position + change[..., :3])
+        return Pose._make((rotation, self.position + change[..., :3]))
 
     def difference(self, true: Pose) -> Array:
         """Return the change (..., 6) that leads from `true` to this pose."""
@@ -79,26 +99,30 @@ class Pose(_Pose, Batch):
 
     def reshape(self, *shape: int) -> Pose:
         """Return the same poses with other leading axes."""
-        return Pose(self.rotation.reshape(*shape, 3, 3), self.position.reshape(*shape, 3))
+        return Pose._make((self.rotation.reshape(*shape, 3, 3), self.position.reshape(*shape, 3)))
 
     def broadcast_to(self, *shape: int) -> Pose:
         """Return the poses repeated along leading axes; not to be written to."""
-        return Pose(
-            np.broadcast_to(self.rotation, (*shape, 3, 3)),
-            np.broadcast_to(self.position, (*shape, 3)),
+        return Pose._make(
+            (
+                np.broadcast_to(self.rotation, (*shape, 3, 3)),
+                np.broadcast_to(self.position, (*shape, 3)),
+            )
         )
 
     def where(self, chosen: Mask, other: Pose) -> Pose:
         """Return these poses where chosen (...), and others where not."""
-        return Pose(
-            np.where(chosen[..., None, None], self.rotation, other.rotation),
-            np.where(chosen[..., None], self.position, other.position),
+        return Pose._make(
+            (
+                np.where(chosen[..., None, None], self.rotation, other.rotation),
+                np.where(chosen[..., None], self.position, other.position),
+            )
         )
 
 
 def identity(*shape: int) -> Pose:
     """Return identity poses of the given batch shape."""
-    return Pose(np.tile(_IDENTITY, (*shape, 1, 1)), np.zeros((*shape, 3)))
+    return Pose._make((np.tile(_IDENTITY, (*shape, 1, 1)), np.zeros((*shape, 3))))
 
 
 def rotation_from_vector(vector: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import os
 import re
@@ -31,6 +32,8 @@ ROSDEP = {
     'setuptools': 'python3-setuptools',
     'pyarrow': None,
     'mcap': None,
+    'lz4': None,
+    'zstandard': None,
     'threadpoolctl': None,
     'pytest': 'python3-pytest',
     'pytest-xdist': 'python3-pytest-xdist',
@@ -42,6 +45,9 @@ ROSDEP = {
     'statsmodels': None,
     'pytest-rerunfailures': None,
 }
+
+
+OF_ROS = {'apriltag_msgs', 'builtin_interfaces', 'action_msgs', 'unique_identifier_msgs'}
 
 
 @pytest.fixture(scope='module')
@@ -94,6 +100,27 @@ def test_every_dependency_has_its_line(distribution: Any) -> None:
     required = _names([*distribution.install_requires, *(r for e in extras.values() for r in e)])
     assert not required - cells
     assert _extras(distribution) <= cells
+
+
+def test_what_is_imported_is_declared(distribution: Any) -> None:
+    """A dependency of a dependency may go with its next release."""
+    extras = distribution.extras_require.values()
+    listed = [*distribution.install_requires, *(name for extra in extras for name in extra)]
+    distributions = {'cv2': 'opencv-python-headless', 'yaml': 'PyYAML', 'jinja2': 'Jinja2'}
+    imported = {
+        name.partition('.')[0]
+        for path in (ROOT / 'fisheye_svp_ros').rglob('*.py')
+        for node in ast.walk(ast.parse(path.read_text()))
+        for name in (
+            [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else [str(node.module)]
+            if isinstance(node, ast.ImportFrom)
+            else []
+        )
+    }
+    foreign = imported - sys.stdlib_module_names - {'fisheye_svp_ros', *_tags('exec_depend')}
+    assert {distributions.get(name, name) for name in foreign} <= _names(listed) | OF_ROS
 
 
 def test_readme_names_the_extras(distribution: Any) -> None:

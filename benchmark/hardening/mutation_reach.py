@@ -32,7 +32,7 @@ GROUPS = {
         'rectify',
         'study',
         'test_pose.py',
-        'test_library.py',
+        'library',
         'test_registry.py',
     ],
     'uncompiled': ['optics', 'solve/test_least_squares.py', '-k', 'numba or engine or compiled'],

@@ -53,7 +53,7 @@ from fisheye_svp_ros.diagnosis import (  # noqa: E402
     diagnose,
     predict_other_data,
 )
-from fisheye_svp_ros.library_results import Localized  # noqa: E402
+from fisheye_svp_ros.library.results import Localized  # noqa: E402
 from fisheye_svp_ros.scene.observations import Observations  # noqa: E402
 from fisheye_svp_ros.solve.initial_rig import localize_frames  # noqa: E402
 from fisheye_svp_ros.solve.measured_poses import (  # noqa: E402

@@ -12,6 +12,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from fisheye_svp_ros.errors import only_own_errors
+
 if TYPE_CHECKING:
     from fisheye_svp_ros.detect.detection import Detection
 
@@ -23,6 +25,7 @@ os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(1 << 26))
 class _CallablePackage(ModuleType):
     """A package that is a function of the library, too: both have the name `detect`."""
 
+    @only_own_errors
     def __call__(
         self,
         photographs: str | Path | Sequence[str | Path],

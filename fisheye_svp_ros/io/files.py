@@ -192,6 +192,12 @@ def write_json(path: str | Path, document: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(_finite(document), indent=2, allow_nan=False) + '\n')
 
 
+def as_read(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a document as it is read back from what `write_json` writes."""
+    found: dict[str, Any] = json.loads(json.dumps(_finite(document)))
+    return found
+
+
 def _finite(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _finite(item) for key, item in value.items()}

@@ -45,11 +45,11 @@ class Lens:
     max_incidence: float
     viewpoint_shift: ViewpointShift | None = None
     port: Port | None = None
-    image_field: ImageField | None = field(default=None, repr=False)
-    corrections: Mapping[str, Any] = field(default_factory=dict)
-    target: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    calibration: Mapping[str, Any] | None = field(default=None, repr=False)
-    uncertainty: Mapping[str, Any] | None = field(default=None, repr=False)
+    image_field: ImageField | None = field(default=None, repr=False, hash=False)
+    corrections: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    target: Mapping[str, Any] = field(default_factory=dict, repr=False, hash=False)
+    calibration: Mapping[str, Any] | None = field(default=None, repr=False, hash=False)
+    uncertainty: Mapping[str, Any] | None = field(default=None, repr=False, hash=False)
     neglected: Lens | None = field(default=None, repr=False, compare=False)
 
     @property

@@ -59,7 +59,7 @@ def check_landmarks(landmarks: Landmarks, where: str) -> Landmarks:
     return landmarks
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Observations:
     """One row an image point; every array has N rows, in the order of the source.
 

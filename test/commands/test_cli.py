@@ -24,7 +24,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_files import CsvTable
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
-from fisheye_svp_ros.library import calibrate
+from fisheye_svp_ros.library.functions import calibrate
 from fisheye_svp_ros.optics.camera import back_project
 from fisheye_svp_ros.optics.curves import Equidistant
 from fisheye_svp_ros.optics.lens import Lens

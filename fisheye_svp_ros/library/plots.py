@@ -9,15 +9,15 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.library import (
+from fisheye_svp_ros.library.checks import check_type
+from fisheye_svp_ros.library.functions import (
     AnyLens,
     AnyObservations,
     load_lens,
     localize,
     table_and_lens,
 )
-from fisheye_svp_ros.library_checks import check_type
-from fisheye_svp_ros.library_results import Budgeted
+from fisheye_svp_ros.library.results import Budgeted
 from fisheye_svp_ros.reporting.budget_report import DISPLAY_UNITS
 from fisheye_svp_ros.reporting.diagnosis_plots import draw_arrows, draw_image_frame
 from fisheye_svp_ros.solve.measured_poses import rms_px

@@ -19,7 +19,7 @@ from helpers.nodes import ROOT
 import fisheye_svp_ros as fsvp
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.library_results import Columns, Localized, Result, Simulated
+from fisheye_svp_ros.library.results import Columns, Localized, Result, Simulated
 
 _BLOCK = re.compile(r'```python\n(.*?)```(?:\n\n```text\n(.*?)```)?', re.DOTALL)
 
@@ -51,7 +51,7 @@ RECORDINGS = ('rosbags', 'mcap', 'apsw', 'zstandard')
             ('numpy', 'scipy', 'matplotlib', 'numba', 'pyarrow', 'yaml', 'cv2', *RECORDINGS),
         ),
         ('import fisheye_svp_ros.commands.paper', ('numpy',)),
-        ('import fisheye_svp_ros.library, fisheye_svp_ros.commands.sweep', RECORDINGS),
+        ('import fisheye_svp_ros.library.functions, fisheye_svp_ros.commands.sweep', RECORDINGS),
     ],
 )
 def test_what_is_not_needed_is_not_loaded(statement: str, heavy: tuple[str, ...]) -> None:

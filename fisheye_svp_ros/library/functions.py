@@ -19,12 +19,14 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io import lens_files
 from fisheye_svp_ros.io.csv_files import FramePoses
+from fisheye_svp_ros.io.files import as_read
 from fisheye_svp_ros.io.parameters import SWEEP, rows, with_values
 from fisheye_svp_ros.io.readers import check_size_given, check_sizes, read_observations, read_poses
 from fisheye_svp_ros.io.rig_files import load_pair
 from fisheye_svp_ros.io.share import typed_lens_path
-from fisheye_svp_ros.library_checks import (
+from fisheye_svp_ros.library.checks import (
     check_list,
+    check_number,
     check_numbers,
     check_parameters,
     check_pose,
@@ -32,7 +34,7 @@ from fisheye_svp_ros.library_checks import (
     check_type,
     is_at_most,
 )
-from fisheye_svp_ros.library_results import (
+from fisheye_svp_ros.library.results import (
     Budgeted,
     Calibrated,
     CalibratedRig,
@@ -79,6 +81,10 @@ def load_lens(lens: AnyLens) -> Lens:
 
     Raises LensError, naming file and field, for anything impossible.
     """
+    if not isinstance(lens, Lens | str | Path):
+        raise ParameterError(
+            f'lens is of type {type(lens).__name__}; a Lens, a file or a name is needed'
+        )
     return lens if isinstance(lens, Lens) else lens_files.load_lens(typed_lens_path(str(lens)))
 
 
@@ -92,8 +98,7 @@ def project(lens: AnyLens, points: Array) -> Image:
     points = _check_last_axis(3, points, 'points')
     # Beyond, squares overflow; the image is that of the direction long before.
     largest = np.abs(points).max(axis=-1, keepdims=True)
-    too_far = (largest > _MAX_DISTANCE) & (largest < np.inf)
-    scale = np.where(too_far, largest / _MAX_DISTANCE, 1.0)
+    scale = np.where(largest > _MAX_DISTANCE, largest / _MAX_DISTANCE, 1.0)
     return forward.project(load_lens(lens), points / scale)
 
 
@@ -110,7 +115,7 @@ def _check_last_axis(size: int, values: Array, name: str) -> Array:
     numbers = check_numbers(values, name, f'(..., {size})')
     if numbers.shape[-1:] != (size,):
         raise ParameterError(f'{name} has the shape {numbers.shape}; (..., {size}) is needed')
-    return numbers
+    return np.where(np.isfinite(numbers), numbers, np.nan)
 
 
 @limit_threads
@@ -341,7 +346,7 @@ def diagnose(
         poses=given,
         progress=progress,
     )
-    return Diagnosed(found.verdict, diagnosis_document(found), found.lens)
+    return Diagnosed(found.verdict, as_read(diagnosis_document(found)), found.lens)
 
 
 @limit_threads
@@ -353,7 +358,9 @@ def budget(
     style, baseline (m): of the stereo rig.
     Raises LensError for a lens without a viewpoint shift, ParameterError for impossible noise.
     """
-    setup = budgets.Setup(load_lens(lens), rig(style, baseline), noise_px)
+    noise = check_number(noise_px, 'noise_px', 'a number of px')
+    width = check_number(baseline, 'baseline', 'a number of m')
+    setup = budgets.Setup(load_lens(lens), rig(style, width), noise)
     return Budgeted(*budgets.make_budget(setup))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +15,7 @@ from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_formats import write_foreign
 from fisheye_svp_ros.io.rig_files import load_cameras
-from fisheye_svp_ros.library import (
-    AnyLens,
-    AnyObservations,
-    check_images,
-    load_lens,
-    save_lens,
-    table_of,
-)
-from fisheye_svp_ros.library_checks import (
+from fisheye_svp_ros.library.checks import (
     check_count,
     check_numbers,
     check_pair,
@@ -31,6 +23,14 @@ from fisheye_svp_ros.library_checks import (
     check_type,
     check_whole_numbers,
     is_at_most,
+)
+from fisheye_svp_ros.library.functions import (
+    AnyLens,
+    AnyObservations,
+    check_images,
+    load_lens,
+    save_lens,
+    table_of,
 )
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.planning import MAX_VIEWS
@@ -52,9 +52,15 @@ def observations(
     """Return a table of image points u, v (N,), px, of landmarks (N,).
 
     board: as in `--board`, or places (L, 3), m, of landmarks 0 to L - 1; frame (N,).
+    Points that a mask hides in any of the arrays are left out.
     Raises ParameterError for arrays of different lengths, image points that are not finite, and
     landmarks that are not there or twice in a frame.
     """
+    columns: Any = (u, v, landmark, frame)
+    if any(isinstance(column, np.ma.MaskedArray) for column in columns):
+        whole = np.ma.atleast_1d(*np.broadcast_arrays(*columns, subok=True))
+        kept = ~np.any([np.ma.getmaskarray(column) for column in whole], axis=0)
+        u, v, landmark, frame = (np.ma.getdata(column)[kept] for column in whole)
     places = (
         parse_pattern(board).points
         if isinstance(board, str)

@@ -13,7 +13,7 @@ import fisheye_svp_ros as fsvp
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands import notes
 from fisheye_svp_ros.commands.watch import _display_unit
-from fisheye_svp_ros.library_results import Budgeted
+from fisheye_svp_ros.library.results import Budgeted
 
 
 def test_photographs_are_searched_as_by_the_command(tmp_path: Path) -> None:

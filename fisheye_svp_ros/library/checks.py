@@ -58,8 +58,13 @@ def check_parameters(values: Any, name: str) -> dict[str, Any]:
 
 
 def check_numbers(values: Any, name: str, needed: str) -> Array:
-    """Return an array of numbers; raise ParameterError, naming what is needed, for others."""
+    """Return an array of numbers; raise ParameterError, naming what is needed, for others.
+
+    What a mask hides is NaN.
+    """
     try:
+        if isinstance(values, np.ma.MaskedArray):
+            values = np.ma.filled(values.astype(float), np.nan)
         if np.asarray(values).dtype.kind not in 'USc':
             return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
@@ -89,6 +94,13 @@ def check_pair(values: Any, name: str, needed: str) -> tuple[float, float]:
     if numbers.shape != (2,) or numbers.dtype.kind not in 'iuf':
         raise ParameterError(f'{name} is {values!r}; {needed} is needed')
     return float(numbers[0]), float(numbers[1])
+
+
+def check_number(value: Any, name: str, needed: str) -> float:
+    """Return a number; raise ParameterError, naming what is needed, for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise ParameterError(f'{name} is {value!r}; {needed} is needed')
+    return float(value)
 
 
 def is_at_most(value: Any, most: float) -> bool:
