@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import argparse
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.commands.executors import dask, process_pool
 from fisheye_svp_ros.commands.node_sweeps import read_sweep
 from fisheye_svp_ros.commands.notes import counted, note_formats, say
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.errors import OutputError, ParameterError
-from fisheye_svp_ros.io.columns import TableParts, as_numbers, read_columns
+from fisheye_svp_ros.io.columns import TableParts
 from fisheye_svp_ros.io.files import (
     read_json,
     read_text,
     write_json,
     write_text,
     write_together,
-    written,
 )
 from fisheye_svp_ros.io.share import sweep_path
 from fisheye_svp_ros.optics import engines
@@ -92,8 +93,8 @@ def run(args: argparse.Namespace) -> None:
                 'compute them again with --resume'
             )
         with write_together():
-            parts.join(args.output / 'sweep')
-            _report(path, args.output, plan, mine)
+            metrics = parts.join(args.output / 'sweep', _metrics(plan))
+            _report(path, args.output, plan, mine, metrics)
         note_formats()
     shutil.rmtree(parts.folder, ignore_errors=True)
 
@@ -137,11 +138,13 @@ def _solve(args: argparse.Namespace, plan: Plan, parts: TableParts, engine: str)
             advance(len(numbers))
 
 
-def _report(path: Path, folder: Path, plan: Plan, mine: str) -> None:
+def _metrics(plan: Plan) -> list[str]:
+    return [name for name, kind in column_types(plan).items() if kind is float and '.' in name]
+
+
+def _report(path: Path, folder: Path, plan: Plan, mine: str, metrics: Mapping[str, Array]) -> None:
     """Print and write what came out, metric by metric."""
-    table = read_columns(written(folder / 'sweep.csv'))
-    metrics = [name for name, kind in column_types(plan).items() if kind is float and '.' in name]
-    found = {name: summarise(as_numbers(table[name])) for name in metrics}
+    found = {name: summarise(values) for name, values in metrics.items()}
     count = len(plan.sweep)
     print_table(
         f'{path}: {counted(count, "scenario")}',

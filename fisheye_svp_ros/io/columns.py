@@ -77,10 +77,22 @@ class TableParts:
             ),
         )
 
-    def join(self, path: Path) -> list[Path]:
-        """Write all parts in order as `write_columns` does; raise OutputError for a bad one."""
-        parts = map(self._read, sorted(self.numbers()))
-        return _write(path, list(self._types), self._types, parts)
+    def join(self, path: Path, numbers: Sequence[str] = ()) -> dict[str, Array]:
+        """Write all parts in order as `write_columns` does; return some columns, NaN = empty.
+
+        No more than one part is held, and those columns (N,).  Raises OutputError for a bad part.
+        """
+        kept: dict[str, list[Array]] = {name: [] for name in numbers}
+
+        def parts() -> Iterator[Columns]:
+            for number in sorted(self.numbers()):
+                part = self._read(number)
+                for name, found in kept.items():
+                    found.append(np.array(part[name], dtype=float))
+                yield part
+
+        _write(path, list(self._types), self._types, parts())
+        return {name: np.concatenate([*found, np.empty(0)]) for name, found in kept.items()}
 
     def _read(self, number: int) -> Columns:
         path = self._path(number)
@@ -105,11 +117,6 @@ class TableParts:
 
 def _checksum(names: Sequence[str]) -> bytes:
     return b'%08x' % zlib.crc32('\0'.join(names).encode())
-
-
-def as_numbers(cells: Sequence[float | None]) -> Array:
-    """Return a column of numbers (N,), NaN = empty."""
-    return np.array([np.nan if cell is None else cell for cell in cells], dtype=float)
 
 
 def read_columns(path: Path) -> dict[str, list[Any]]:

@@ -25,7 +25,8 @@ from typing import Any, ClassVar
 import numpy as np
 import yaml
 
-from fisheye_svp_ros.errors import FisheyeSvpError, OutputError, ParameterError
+from fisheye_svp_ros.errors import FisheyeSvpError, OutputError
+from fisheye_svp_ros.io.paths import final_path
 
 MAX_BYTES = 1 << 30  # bytes of a table or a photograph
 
@@ -39,13 +40,6 @@ _MOST_VALUES, _DEEPEST = 100_000, 50
 _Base: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _BaseDumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 _INT, _FLOAT, _TIMESTAMP = (f'tag:yaml.org,2002:{kind}' for kind in ('int', 'float', 'timestamp'))
-
-
-def path_of(given: str | Path) -> Path:
-    """Return a path; raise ParameterError for what is none."""
-    if not isinstance(given, str | os.PathLike):
-        raise ParameterError(f'a {type(given).__name__} is no path; the name of a file is needed')
-    return Path(given)
 
 
 def read_bytes(path: str | Path, error: type[FisheyeSvpError], most: int = MAX_BYTES) -> bytes:
@@ -111,14 +105,6 @@ def replacing(path: str | Path) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
-
-
-def final_path(path: str | Path) -> Path:
-    """Return where a path leads, through all symbolic links; raise OutputError for a circle."""
-    found = Path(os.path.realpath(path_of(path)))
-    if found.is_symlink():
-        raise OutputError(f'{path}: its symbolic links lead in a circle; choose another name')
-    return found
 
 
 @contextmanager

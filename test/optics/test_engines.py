@@ -4,22 +4,28 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.lenses import LENSES, points_around, points_on_rays
+from helpers.lenses import HEIGHTS, LENSES, SHIFTS, make_lens, points_around, points_on_rays
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.optics import engines
+from fisheye_svp_ros.optics import engines, formulas
 from fisheye_svp_ros.optics.camera import project, project_with_jacobian
 from fisheye_svp_ros.optics.curve_base import SumOfShifts
-from fisheye_svp_ros.optics.curves import Equidistant, Gennery
+from fisheye_svp_ros.optics.curves import (
+    IMAGE_HEIGHTS,
+    VIEWPOINT_SHIFTS,
+    Equidistant,
+    Gennery,
+    KannalaBrandt,
+)
 from fisheye_svp_ros.optics.engines import marquardt, numpy_engine
 from fisheye_svp_ros.optics.engines.results import PLANARITY
 from fisheye_svp_ros.optics.lens import Lens
@@ -435,3 +441,66 @@ def test_the_engine_changes_no_answer_of_the_camera(engine):
     points = points_around(np.random.default_rng(97), 200, 0.01, 1.0, 180.0)
     image = project_with_jacobian(FISH214, points)
     both_equal(numpy_engine.project(FISH214, points, True), (image.uv, image.valid), scale=1e3)
+
+
+@dataclass(frozen=True)
+class Bent(KannalaBrandt):
+    """A curve of a user's own, made of one of the package."""
+
+    def value_and_slope(self, theta):
+        height, slope = super().value_and_slope(theta)
+        return height + 0.05 * theta**3, slope + 0.15 * theta**2
+
+
+@dataclass(frozen=True)
+class Doubled(Gennery):
+    @property
+    def coefficients(self):
+        return tuple(2 * value for value in super().coefficients)
+
+
+@dataclass(frozen=True)
+class Enlarged(KannalaBrandt):
+    """One with a formula of its own."""
+
+    @staticmethod
+    def formula(theta, *k):
+        height, slope = formulas.kannala_brandt(theta, *k)
+        return 1.1 * height, 1.1 * slope
+
+
+@pytest.mark.parametrize(
+    'changes',
+    [
+        {'image_height': Bent(-0.01, 0.002)},
+        {'image_height': Enlarged(-0.01, 0.002)},
+        {'viewpoint_shift': Doubled(0.0, 0.01)},
+    ],
+)
+def test_a_curve_that_is_not_compiled_is_never_computed_as_another(compiled, changes):
+    lens = replace(make_lens('kannala_brandt', 'gennery'), max_incidence=1.2, **changes)
+    points = np.random.default_rng(5).uniform((-0.3, -0.3, 0.2), (0.3, 0.3, 0.6), (200, 3))
+    uv, valid = compiled.project(lens, points, True)
+    known, also = numpy_engine.project(lens, points, True)
+    assert valid.tolist() == also.tolist() and valid.sum() > 100
+    np.testing.assert_allclose(uv[valid], known[valid], atol=1e-9)
+
+
+def test_a_formula_without_lines_in_the_kernels_gives_nothing(compiled):
+    from fisheye_svp_ros.optics.engines import entries, kernels
+
+    lens = make_lens('kannala_brandt', 'svp')
+    numbers = compiled.pack_lens(lens).copy()
+    numbers[kernels.HEIGHT_KIND] = len(kernels.HEIGHTS)
+    uv, state = np.empty((1, 2)), np.empty(1)
+    entries.project(np.array([[0.1, 0.2, 0.5]]), numbers, 1.5, uv, state)
+    assert np.isnan(uv).all()
+
+
+def test_the_engines_are_compared_over_the_registries(compiled):
+    from fisheye_svp_ros.optics.engines import kernels
+
+    assert {*HEIGHTS} == {*IMAGE_HEIGHTS}
+    assert {type(shift) for shift in SHIFTS.values() if shift} == {*VIEWPOINT_SHIFTS.values()}
+    for known, registry in ((kernels.HEIGHTS, IMAGE_HEIGHTS), (kernels.SHIFTS, VIEWPOINT_SHIFTS)):
+        assert {*known} <= {kind.formula for kind in registry.values()}

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -574,6 +575,31 @@ def test_without_pyarrow_there_is_csv_and_one_line_that_says_so(
     assert (tmp_path / 'out' / 'sweep.csv').read_text() == (
         tmp_path / 'with' / 'sweep.csv'
     ).read_text()
+
+
+@pytest.mark.parametrize('parquet', [True, False])
+def test_memory_does_not_grow_with_a_sweep_but_for_its_metrics(
+    parquet: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if parquet and tables.arrow()[0] is None:
+        pytest.skip('pyarrow is not here')
+    if not parquet:
+        monkeypatch.setattr(tables, 'arrow', lambda: (None, ''))
+    rows, columns = 500, [f'column_{i}' for i in range(20)]
+    parts = tables.TableParts(tmp_path / 'parts', dict.fromkeys(columns, float))
+    peaks: list[int] = []
+    for first, total in ((0, 40), (40, 160)):
+        for number in range(first, total):
+            values = (np.arange(rows) + number / 7).tolist()
+            parts.write(number, dict.fromkeys(columns, values))
+        tracemalloc.start()
+        found = parts.join(tmp_path / 'whole', columns[:2])
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert {*found} == {*columns[:2]} and len(found['column_0']) == 160 * rows
+    assert found['column_1'][-1] == rows - 1 + 159 / 7
+    # Two columns, and what concatenating and formatting them takes
+    assert peaks[1] - peaks[0] < 3 * 2 * 8 * 120 * rows
 
 
 def test_a_damaged_part_is_named(tmp_path: Path) -> None:

@@ -163,11 +163,14 @@ def _newton_steps(w, first, last, lens):
             w[U + i], w[V + i] = formulas.gennery(
                 w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1], k[2], k[3]
             )
-    else:
+    elif lens[SHIFT_KIND] == 1:
         for i in range(first, last):
             w[U + i], w[V + i] = formulas.flat_port(
                 w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1]
             )
+    else:
+        for i in range(first, last):
+            w[U + i] = w[V + i] = np.nan
     late = 0
     for i in range(first, last):
         step, clearance = formulas.newton_step(
@@ -198,11 +201,14 @@ def image(w, n, lens):
     elif kind == 3:
         for i in range(n):
             w[RATIO + i], w[SLOPE + i] = formulas.stereographic(w[SIN + i], w[COS + i])
-    else:
+    elif kind == 4:
         for i in range(n):
             w[RATIO + i], w[SLOPE + i] = formulas.kannala_brandt(
                 w[THETA + i], k[0], k[1], k[2], k[3]
             )
+    else:  # a formula that has no lines here: nothing rather than another one
+        for i in range(n):
+            w[RATIO + i] = w[SLOPE + i] = np.nan
     fx, fy, cx, cy = lens[FX], lens[FY], lens[CX], lens[CY]
     for i in range(n):
         w[RATIO + i] /= w[R + i]

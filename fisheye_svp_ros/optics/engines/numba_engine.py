@@ -174,12 +174,24 @@ def _pack(lens: Lens) -> Array | None:
         curves.append((shift, kernels.SHIFTS, kernels.SHIFT_KIND, kernels.SHIFT_K))
         numbers[kernels.NEAR] = caustic_range(shift, search_limit(shift, lens.max_incidence))
     for curve, known, kind, first in curves:
-        formula = getattr(curve, 'formula', None)
-        if formula not in known:
+        if not _is_compiled(curve, known):
             return None
-        numbers[kind] = known.index(formula)
+        numbers[kind] = known.index(curve.formula)
         numbers[first : first + len(curve.coefficients)] = curve.coefficients
     return numbers
+
+
+def _is_compiled(curve: Any, known: tuple[Any, ...]) -> bool:
+    """Say whether a curve is a formula of the kernels, and not what a subclass makes of it."""
+    if getattr(curve, 'formula', None) not in known:
+        return False
+    of = {name: _depth(curve, name) for name in ('formula', 'value_and_slope', 'coefficients')}
+    return of['formula'] <= min(of['value_and_slope'], of['coefficients'])
+
+
+def _depth(curve: Any, name: str) -> int:
+    """Return how many classes above that of a curve an attribute is defined."""
+    return next(i for i, kind in enumerate(type(curve).__mro__) if name in vars(kind))
 
 
 def _contiguous(*arrays: Any) -> list[Any]:
