@@ -77,7 +77,7 @@ def test_processes_of_the_package_ask_for_one(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_the_library_is_single_threaded() -> None:
-    from fisheye_svp_ros import library
+    from fisheye_svp_ros.library import functions as library
 
     for name in (
         'localize',

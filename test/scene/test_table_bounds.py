@@ -7,11 +7,11 @@ import pytest
 from helpers.robot import LENS
 from helpers.targets import plane, poses_around
 
-from fisheye_svp_ros import library
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.io.csv_files import read, write_observations
+from fisheye_svp_ros.library import functions as library
 from fisheye_svp_ros.scene.table_checks import too_exact
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.initial_rig import initial_state

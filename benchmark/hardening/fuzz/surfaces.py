@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 
 from benchmark.hardening.fuzz.mutations import mutated, nasty
-from fisheye_svp_ros import library
 from fisheye_svp_ros.commands.node_sweeps import read_sweep
 from fisheye_svp_ros.commands.processes import missing_rclpy
 from fisheye_svp_ros.detect.patterns import parse_pattern
@@ -37,6 +36,7 @@ from fisheye_svp_ros.io.readers import (
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.io.recording import read as read_observations_bag
 from fisheye_svp_ros.io.share import config_path, lens_path
+from fisheye_svp_ros.library import functions as library
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
