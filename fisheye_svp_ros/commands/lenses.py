@@ -15,6 +15,7 @@ from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file
 from fisheye_svp_ros.io.share import is_there, typed_lens_path, without_camera
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.optics.ports import MEDIA, DomeGlass, FlatGlass, Port
+from fisheye_svp_ros.solve.lens_checks import is_known_in_part
 
 LARGE_DEVIATION = 0.5  # px, of a lens from what another tool's file says
 _MAX_SHIFT = 0.1  # m, of the viewpoint at the edge of the field: no lens has so much
@@ -57,6 +58,12 @@ def note_odd(lens: Lens, path: str | Path, worst: float) -> None:
         say(
             f'{path}: the viewpoint shift is {shift:.2g} m at {limit:.3g} deg; its '
             'coefficients are in m'
+        )
+    if is_known_in_part(lens) and lens.calibrated_angle is not None:
+        known = np.degrees(lens.calibrated_angle)
+        say(
+            f'{path}: image points of its calibration reach {known:.0f} deg of {limit:.0f} deg; '
+            'nothing is known beyond'
         )
     if limit < _MIN_FIELD_DEG:
         say(f'{path}: max_incidence_deg is {limit:.3g}; it is in degrees')

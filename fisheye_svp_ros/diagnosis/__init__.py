@@ -33,6 +33,7 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
 from fisheye_svp_ros.diagnosis.decision import (
     MIN_FRAMES,
     Decision,
+    EffectBound,
     LensFacts,
     LensReason,
     PhotographsFacts,
@@ -72,6 +73,7 @@ __all__ = [
     'Decision',
     'Diagnosis',
     'DiagnosisOptions',
+    'EffectBound',
     'EffectTests',
     'ErrorParts',
     'Finding',

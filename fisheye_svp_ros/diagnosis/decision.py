@@ -73,7 +73,8 @@ class EffectBound:
     """The largest size of an effect that these data do not exclude (95 %).
 
     z: the estimate over its standard error; edge_px, edge_mrad: what that size costs at the edge
-    of what was photographed, poses fitted anew.
+    of what was photographed, poses fitted anew; edge: incidence angles there, rad, from and to;
+    ranges: those of the points, m, from and to.
     """
 
     effect: str
@@ -82,6 +83,8 @@ class EffectBound:
     z: float
     edge_px: float
     edge_mrad: float
+    edge: tuple[float, float] | None = None
+    ranges: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

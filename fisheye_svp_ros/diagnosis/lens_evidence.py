@@ -157,12 +157,17 @@ def _effect_bound(
     z = float(np.sqrt(max(value @ np.linalg.pinv(covariance) @ value / count, 0.0)))
     largest = size + _NORMAL_95 * error
     way = value / size if size > error else vectors[:, -1]
-    px, mrad = _edge_cost(null, (null.fixed.border[..., mine] * scale) @ (largest * way))
-    return EffectBound(effect.name, largest, effect.parameters[0].unit, z, px, mrad)
+    cost = _edge_cost(null, (null.fixed.border[..., mine] * scale) @ (largest * way))
+    return EffectBound(effect.name, largest, effect.parameters[0].unit, z, *cost)
 
 
-def _edge_cost(null: NullModel, moves: Array) -> tuple[float, float]:
-    """Return what whitened moves (F, M) are at the edge once poses took up theirs, px and mrad."""
+def _edge_cost(
+    null: NullModel, moves: Array
+) -> tuple[float, float, tuple[float, float], tuple[float, float]]:
+    """Return what whitened moves (F, M) are at the edge once poses took up theirs, px and mrad.
+
+    Then the incidence angles, rad, and the ranges, m, that this is of.
+    """
     linear = null.linear
     left = project_out(moves[..., None], linear.frame_columns)[..., 0]
     weight = np.where(linear.row_weight > 0, linear.row_weight, np.inf)
@@ -173,7 +178,9 @@ def _edge_cost(null: NullModel, moves: Array) -> tuple[float, float]:
     cost = float(np.sqrt((px[edge] ** 2).mean()))
     lens = linear.state.lens
     slope = lens.fx * float(np.mean(lens.image_height.value_and_slope(theta[edge])[1]))
-    return cost, 1e3 * cost / max(slope, 1e-9)
+    away = np.linalg.norm(linear.linear.image.points, axis=-1)[linear.data.views.used]
+    angles = float(theta[edge].min()), float(theta[edge].max())
+    return cost, 1e3 * cost / max(slope, 1e-9), angles, (float(away.min()), float(away.max()))
 
 
 def find_lens_rays(

@@ -47,7 +47,7 @@ from fisheye_svp_ros.reporting.wording.adequacy import (
     flaw_headline,
     flaw_statement,
 )
-from fisheye_svp_ros.reporting.wording.decisions import decision_reason
+from fisheye_svp_ros.reporting.wording.decisions import bound_place, decision_reason
 from fisheye_svp_ros.reporting.wording.findings import belief, chance, finding_reason
 from fisheye_svp_ros.scene.observations import photograph_names
 
@@ -297,7 +297,8 @@ def _bound_text(decision: Decision) -> str:
             f'{one.effect} up to {factor * one.value:.2g} {unit}'.rstrip()
             + f' ({one.edge_px:.2g} px, {one.edge_mrad:.2g} mrad at the edge)'
         )
-    return '; '.join(words)
+    place = bound_place(decision.bound[0]) if decision.bound else ''
+    return '; '.join(words) + (f'; {place}' if place.endswith(')') else '')
 
 
 def _paths(d: Diagnosis) -> dict[str, str]:

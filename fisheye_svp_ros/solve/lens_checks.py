@@ -45,10 +45,23 @@ def image_coverage(lens: Lens, uv: Array) -> ImageCoverage:
     """Return where image points uv (N, 2), px, lie in the image of a lens."""
     off = lens.cx - (lens.width - 1) / 2, lens.cy - (lens.height - 1) / 2
     out = float(np.linalg.norm(uv - (lens.cx, lens.cy), axis=-1).max())
-    edge = min(lens.cx, lens.width - lens.cx, lens.cy, lens.height - lens.cy)
-    return ImageCoverage(off, (lens.width, lens.height), out, edge)
+    return ImageCoverage(off, (lens.width, lens.height), out, _nearest_edge(lens))
+
+
+def _nearest_edge(lens: Lens) -> float:
+    """Return how far the nearest edge of the image is from the principal point, px."""
+    return min(lens.cx, lens.width - lens.cx, lens.cy, lens.height - lens.cy)
 
 
 def is_no_fit(rms_px: float, sigma_px: float) -> bool:
     """Whether a lens leaves so much that it is no model of its points; sigma: NaN if unknown."""
     return rms_px > max(_LOST, _POOR * sigma_px if np.isfinite(sigma_px) else 0.0)
+
+
+def is_known_in_part(lens: Lens) -> bool:
+    """Whether a lens was calibrated far within its image, by points or by what its file says."""
+    angle = lens.calibrated_angle
+    if angle is None or angle >= lens.max_incidence:
+        return False
+    height = float(lens.image_height.value_and_slope(np.asarray(angle))[0])
+    return height * lens.focal < _MIN_COVERED_RADIUS * _nearest_edge(lens)

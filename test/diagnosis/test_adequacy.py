@@ -1,12 +1,16 @@
 """Where data are not adequate, nothing reassures, and what is wrong with them is said."""
 
+import re
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from helpers.flawed_sets import flawed
 
+from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, FlawKind, diagnose
+from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
 from fisheye_svp_ros.scene.observations import group_views
 from fisheye_svp_ros.solve.frame_groups import find_frame_groups
@@ -55,6 +59,7 @@ def test_nothing_reassures_on_inadequate_data(name):
         assert found.verdict == 'unexplained'
 
 
+@once('sound')
 def test_sound_data_are_adequate():
     found = diagnosed('sound')
     assert not found.adequacy.flaws
@@ -84,6 +89,23 @@ def test_angle_of_the_points_is_told():
     flaw = diagnosed('central').adequacy.flaws[0]
     assert np.degrees(flaw.size) == pytest.approx(11, abs=3)
     assert 'nothing is known beyond' in screen(diagnosed('central'))
+
+
+def test_a_lens_known_in_part_is_told_by_every_command(tmp_path, capsys):
+    table, size = flawed('central')
+    lens = calibrate(table, 'kannala_brandt', size).adjusted.lens
+    wide = replace(lens, image_height=type(lens.image_height)(), max_incidence=np.radians(95))
+    save_lens(wide, tmp_path / 'lens.yaml')
+    load_with_notes(tmp_path / 'lens.yaml')
+    assert 'reach 12 deg of 95 deg; nothing is known beyond' in capsys.readouterr().err
+
+
+@once('sound')
+def test_bounds_name_their_angles_and_ranges():
+    assert re.search(
+        r'at the edge of the points \(\d+ to 85 deg, 0.\d+ to 0.\d+ m\)',
+        screen(diagnosed('sound')),
+    )
 
 
 def test_groups_of_frames_are_found_where_no_lens_fits():

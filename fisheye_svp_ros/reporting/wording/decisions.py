@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import degrees
 from typing import Any
 
 from fisheye_svp_ros.diagnosis import (
     MIN_FRAMES,
     Decision,
+    EffectBound,
     LensFacts,
     LensReason,
     PhotographsFacts,
@@ -77,7 +79,7 @@ def _likely_effects(facts: LensFacts) -> str:
         return ''
     return (
         f'likely but not confirmed: {" or ".join(one.effect for one in likely)}, '
-        f'which may cause up to {likely[0].edge_px:.2g} px at the edge'
+        f'which may cause up to {likely[0].edge_px:.2g} px {bound_place(likely[0])}'
     )
 
 
@@ -88,9 +90,18 @@ def _nothing_confirmed(facts: LensFacts) -> str:
     if worst is not None:
         cost = (
             f'; effects that these data do not exclude cause at most {worst.edge_px:.2g} px '
-            f'({worst.edge_mrad:.2g} mrad) at the edge'
+            f'({worst.edge_mrad:.2g} mrad) {bound_place(worst)}'
         )
     return f'no cause in the lens is confirmed{fit}{cost}'
+
+
+def bound_place(bound: EffectBound) -> str:
+    """Return the angles and ranges that a bound holds for."""
+    if bound.edge is None or bound.ranges is None:
+        return 'at the edge'
+    low, high = (f'{degrees(angle):.0f}' for angle in bound.edge)
+    near, far = bound.ranges
+    return f'at the edge of the points ({low} to {high} deg, {near:.2g} to {far:.2g} m)'
 
 
 def _target_reasons(facts: TargetFacts) -> dict[TargetReason, str]:
