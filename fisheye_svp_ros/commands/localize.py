@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--model-error',
         action='store_true',
         help='include in the covariances the errors stated in the lens file: of '
-        'its parameters, and unexplained (extended_lens.yaml)',
+        'its parameters and, by diagnose, unexplained; noise at least as measured',
     )
     parser.add_argument(
         '--rig',

@@ -27,7 +27,13 @@ from fisheye_svp_ros.effects.base import Effect, Term
 from fisheye_svp_ros.effects.extension import Target
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.mixed_model import LAMBDA_ABSENT, RandomColumns, Variances, pseudo_inverse
+from fisheye_svp_ros.mixed_model import (
+    LAMBDA_ABSENT,
+    RandomColumns,
+    Variances,
+    no_variances,
+    pseudo_inverse,
+)
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import Views
@@ -57,13 +63,13 @@ class ModelErrors:
     """What is known of the errors of a model.
 
     names (K,), covariance (K, K): of its parameters, beside its random effects; variances: of
-    these; geometry: what they are of.
+    these; geometry: what they are of, None for a lens without such effects.
     """
 
     names: tuple[str, ...]
     covariance: Array
     variances: Variances
-    geometry: ColumnGeometry
+    geometry: ColumnGeometry | None
 
     @classmethod
     def from_null_model(cls, null: NullModel, fitted: FittedModel) -> ModelErrors:
@@ -100,6 +106,9 @@ class ModelErrors:
         shared = maps @ _shared_columns(linear)
         covariance = self._covariance_of(linear)
         parameters = shared @ covariance @ np.swapaxes(shared, -1, -2)
+        noise = self.variances.sigma**2 * maps @ turned
+        if self.geometry is None:
+            return ErrorParts(noise, parameters, np.zeros_like(noise))
         random, variance = self._random_columns(linear)
         own = maps @ random.group
         misfit = (own * variance[random.group_label]) @ np.swapaxes(own, -1, -2)
@@ -108,7 +117,7 @@ class ModelErrors:
         for f in range(len(maps)):
             field = (columns[f * rows : (f + 1) * rows].T @ turned[f]).T
             misfit[f] += (field * variance[random.shared_label]) @ field.T
-        return ErrorParts(self.variances.sigma**2 * maps @ turned, parameters, misfit)
+        return ErrorParts(noise, parameters, misfit)
 
     def of_points(self, linear: Linearization) -> ErrorParts:
         """Return variances (F, M), px^2, of u and v of the points of a fit.
@@ -165,6 +174,7 @@ class ModelErrors:
 
     def _landmark_covariances(self, random: RandomColumns, maps: Array) -> Array:
         """Return covariances (F, Q, Q) of linear functions (F, Q, M) by what the target is off."""
+        assert self.geometry is not None
         frames, count = random.unit.shape
         shown = (random.unit >= 0)[..., None]
         shift = maps.reshape(frames, -1, count, 2).swapaxes(1, 2) @ random.offset / MILLIMETRE
@@ -304,6 +314,7 @@ def _entry(
     names: list[str],
 ) -> dict[str, Any]:
     geometry, variances = errors.geometry, errors.variances
+    assert geometry is not None
     sizes = {
         name: float(size)
         for name, size in zip(NAMES, variances.tau, strict=True)
@@ -340,6 +351,28 @@ def _mean_normals(entry: Mapping[str, Any], boards: Index) -> Array:
     return np.array(entry.get('normals', np.zeros(shape)), dtype=float).reshape(shape)
 
 
+def calibrated_covariance(lens: Lens) -> tuple[tuple[str, ...], Array] | None:
+    """Return names and covariance (K, K) from the `calibration` block of a lens; None without.
+
+    Raises LensError for half of it, or what cannot be.
+    """
+    stated = lens.calibration or {}
+    if stated.get('covariance') is None:
+        return None
+    try:
+        names, whole = tuple(stated['stderr']), np.array(stated['covariance'], dtype=float)
+        right = whole.shape == (len(names), len(names)) and np.isfinite(whole).all()
+        if not (right and (np.diag(whole) >= 0).all()):
+            raise ValueError
+    except (KeyError, TypeError, ValueError) as cause:
+        raise LensError(
+            f'lens {lens.name!r}: calibration: covariance is no matrix of finite '
+            'numbers, a row and a column for each name in stderr; calibrate anew, or '
+            'leave it out'
+        ) from cause
+    return names, whole
+
+
 @dataclass(frozen=True)
 class LensErrors:
     """A lens and what its file says of its errors.
@@ -358,10 +391,7 @@ class LensErrors:
         """Return what a lens carries; raise LensError for one that carries nothing, or half."""
         entry = lens.uncertainty
         if entry is None:
-            raise LensError(
-                f'lens {lens.name!r} has no uncertainty; use the extended_lens.yaml '
-                'that `diagnose -o` writes'
-            )
+            return cls._from_calibration(lens)
         try:
             size = np.array([float(entry['components'].get(name, 0.0)) for name in NAMES])
             lam = np.where(size > 0, 1 / np.maximum(size, 1e-30) ** 2, LAMBDA_ABSENT)
@@ -405,6 +435,19 @@ class LensErrors:
             raise LensError(f'lens {lens.name!r}: uncertainty holds a number that cannot be')
         return found
 
+    @classmethod
+    def _from_calibration(cls, lens: Lens) -> LensErrors:
+        """Return what `calibrate` states: whatever its fit leaves counts as noise."""
+        stated, rms = calibrated_covariance(lens), (lens.calibration or {}).get('rms_px')
+        if stated is None or not isinstance(rms, float) or not 0 < rms < np.inf:
+            raise LensError(
+                f'lens {lens.name!r} has no uncertainty; use a lens that `calibrate` or '
+                '`diagnose -o` writes'
+            )
+        return cls(
+            lens, rms / 2**0.5, 0.0, ModelErrors(*stated, no_variances(len(NAMES), 0), None)
+        )
+
     def inflate_sigma(self, sigma: Array | float) -> Array | float:
         """Return sigma (...), px, of image points by this lens: noise and what remains."""
         return np.hypot(sigma, self.misfit)
@@ -419,8 +462,9 @@ class LensErrors:
     ) -> ErrorParts:
         """Return covariances (S, 6, 6), m and rad, of the change in `Pose.retract` of poses.
 
-        sigma: noise that was estimated with weights of 1, px, in whose place that of the lens is
-        taken; None where weights are 1 / `inflate_sigma(sigma)`.  A pose whose misfit the solver
+        sigma: noise and misfit that were estimated with weights of 1, px: the noise is what they
+        leave beside the misfit of the lens, and at least that of the lens; None where weights are
+        1 / `inflate_sigma(sigma)`.  A pose whose misfit the solver
         found to be more than it may be is so much more uncertain.
         """
         linear = self.linearize(views, solved.pose)
@@ -432,7 +476,9 @@ class LensErrors:
             weight = linear.data.blocks(views.weight[..., None] * np.ones(2))
             of_noise = 1 - (self.misfit * weight) ** 2
         else:
-            of_noise = np.full(maps.shape[::2], self.noise**2)
+            # Points of a room need not be as sharp as those of a board.
+            measured = max(sigma**2 - self.misfit**2, 0.0)
+            of_noise = np.full(maps.shape[::2], max(self.noise**2, measured))
         parts = parts._replace(noise=(maps * of_noise[:, None]) @ np.swapaxes(maps, -1, -2))
         parts = ErrorParts(*(part * excess[:, None, None] for part in parts))
         return parts._replace(noise=parts.noise + solved.added)
@@ -442,6 +488,6 @@ class LensErrors:
         model = ForwardModel(self.lens)
         views, terms = model.assign_boards(views), model.terms_for(views)
         bare = replace(self.lens, corrections={}, target={})
-        own = [name for name in self.model.names if name in bare.parameters]
+        own = [name for name in self.model.names if name == 'f' or name in bare.parameters]
         state = RigState(pose, identity(1), bare, terms)
         return Linearization(RigViews.of_one_camera(views), state, own)

@@ -67,6 +67,7 @@ AnyLens = Lens | str | Path
 AnyObservations = Observations | str | Path
 AnyPoses = FramePoses | str | Path
 AnyRig = Pose | str | Path
+_ROBUST_SIGMA = 1.4826  # standard deviation over the median absolute value, of normal errors
 _MAX_DISTANCE = 1e50  # m
 # Called with a stage of long work and the share (0 to 1) that is done.
 Progress = Callable[[str, float], None]
@@ -243,8 +244,8 @@ def stereo_depth(
 ) -> StereoDepth:
     """Measure every landmark that both cameras of a rig (left in right) see, with SVP or not.
 
-    model_error: covariances, too: of the noise, and of what the lenses say of their own errors
-    (`uncertainty`); the rig is taken as it is.
+    model_error: covariances, too: of the noise (that of the lenses, or of the image points where
+    that is more), and of what the lenses say of their own errors; the rig is taken as it is.
     Raises ObservationError for a missing camera, LensError for a lens that does not know its
     errors.
     """
@@ -255,19 +256,26 @@ def stereo_depth(
     known = (*models, rig, one.uv[both], other.uv[both])
     solved = triangulate(*known)
     frame = np.broadcast_to(one.frame[:, None], both.shape)
+    distance = epipolar_offset(*known).distance
     covariance = None
     if model_error:
         from fisheye_svp_ros.diagnosis import LensErrors
         from fisheye_svp_ros.study.trust import depth_errors
 
         errors = [LensErrors.from_lens(load_lens(lens)) for lens in (left, right)]
-        covariance = depth_errors(errors[0], errors[1], rig, solved.points).total
+        # Both points of a pair move the point off the curve.
+        sigma = (
+            float(np.median(table.sigma))
+            if sigma_known(table)
+            else _ROBUST_SIGMA * float(np.nanmedian(np.abs(distance))) / 2**0.5
+        )
+        covariance = depth_errors(errors[0], errors[1], rig, solved.points, sigma).total
     return StereoDepth(
         frame[both],
         one.landmark[both],
         solved.points,
         solved.gap,
-        epipolar_offset(*known).distance,
+        distance,
         covariance,
     )
 

@@ -192,7 +192,7 @@ class LocalizerSettings(RobotSettings):
     model_error: bool = parameter(
         False,
         'Include the errors of the lens in the covariance of the pose, besides `sigma_px`; '
-        'the lens file must hold `uncertainty`, as `diagnose` writes it',
+        'the lens file must state them, as those of `calibrate` and `diagnose` do',
     )
 
 

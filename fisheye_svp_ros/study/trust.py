@@ -203,12 +203,16 @@ def localize_with_errors(
     return found._replace(result=found.result._replace(covariance=parts.total)), parts
 
 
-def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) -> ErrorParts:
+def depth_errors(
+    left: LensErrors, right: LensErrors, rig: Pose, points: Array, sigma: float = 0.0
+) -> ErrorParts:
     """Return covariances (N, 3, 3), m^2, of stereo points (N, 3), m, in the right camera.
 
-    Of points of least reprojection error; rig: left camera in the right one, taken as it is.  NaN
-    where a point is NaN or a camera does not see it.
+    Of points of least reprojection error; rig: left camera in the right one, taken as it is;
+    sigma: noise of the image points, px, where it is more than that of the lenses.  NaN where a
+    point is NaN or a camera does not see it.
     """
+    noise = [max(errors.noise, sigma) for errors in (left, right)]
     found = [np.full((len(points), 3, 3), np.nan) for _ in ErrorParts._fields]
     known = np.flatnonzero(np.isfinite(points).all(axis=1))
     for rows in (known[i : i + _MAX_POINTS] for i in range(0, len(known), _MAX_POINTS)):
@@ -217,16 +221,19 @@ def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) 
             (errors, errors.linearize(views, pose))
             for errors, pose in ((left, rig.broadcast_to(len(rows))), (right, identity(len(rows))))
         ]
-        by = [linear.whiten(linear.linear.d_target) / errors.noise for errors, linear in pairs]
+        by = [
+            linear.whiten(linear.linear.d_target) / px
+            for px, (_, linear) in zip(noise, pairs, strict=True)
+        ]
         seen = np.asarray(np.isfinite(by[0] + by[1]).all(axis=(1, 2)))
         by = [np.where(seen[:, None, None], one, np.eye(2, 3)) for one in by]
         rows_of_both = np.concatenate(by, axis=1)
         information = np.swapaxes(rows_of_both, -1, -2) @ rows_of_both
         information[~seen] = np.eye(3)
-        for (errors, linear), one in zip(pairs, by, strict=True):
-            maps = np.linalg.solve(information * errors.noise, np.swapaxes(one, -1, -2))
+        for px, (errors, linear), one in zip(noise, pairs, by, strict=True):
+            maps = np.linalg.solve(information * px, np.swapaxes(one, -1, -2))
             parts = errors.model.propagate(linear, np.asarray(maps))
-            parts = parts._replace(noise=parts.noise * errors.noise**2)
+            parts = parts._replace(noise=parts.noise * px**2)
             for whole, part in zip(found, parts, strict=True):
                 whole[rows] = np.nan_to_num(whole[rows]) + part
         for whole in found:

@@ -149,6 +149,54 @@ def board_table(lens, rng, frames):
     )
 
 
+def room_poses(lens, noise, rng, frames=150):
+    """Return landmarks of a room as a lens sees them with noise of its own, px, and true poses."""
+    points = rng.uniform(-2.0, 2.0, (40, 3)) * (1, 1, 0.4) + (0, 0, 3.0)
+    poses = Pose(
+        np.stack([rotation_from_vector(0.2 * turn) for turn in rng.normal(size=(frames, 3))]),
+        rng.uniform(-0.3, 0.3, (frames, 3)),
+    )
+    uv = np.stack(
+        [ForwardModel(lens).project(poses.take(i).into_body(points)).uv for i in range(frames)]
+    )
+    uv = (uv + noise * rng.normal(size=uv.shape)).reshape(-1, 2)
+    frame, landmark = np.divmod(np.arange(len(uv)), len(points))
+    return make_observations(frame, landmark, uv, points[landmark]), poses
+
+
+@pytest.mark.parametrize('calibrated', [False, True])
+def test_poses_among_landmarks_that_are_less_sharp_than_a_board_say_so(calibrated):
+    rng = np.random.default_rng(8)
+    lens = uncertain()
+    if calibrated:  # as `calibrate` writes a lens
+        block = {
+            'rms_px': NOISE,
+            'stderr': {'fx': 1e-6, 'fy': 1e-6},
+            'covariance': (1e-12 * np.eye(2)).tolist(),
+        }
+        lens = replace(lens, uncertainty=None, calibration=block)
+    table, poses = room_poses(lens, 6 * NOISE, rng)
+    errors = LensErrors.from_lens(lens)
+    if not calibrated:  # noise alone: neither components nor misfit
+        exact = replace(errors.model, geometry=None, covariance=0 * errors.model.covariance)
+        errors = replace(errors, misfit=0.0, model=exact)
+    found, parts = localize_with_errors(errors, table)
+    off = found.result.pose.difference(poses)
+    pull = np.einsum('si,sij,sj->s', off, np.linalg.inv(parts.total), off) / 6
+    assert pull.mean() == pytest.approx(1, abs=0.15)
+
+
+def test_stereo_points_take_the_noise_that_is_measured():
+    lens = LensErrors.from_lens(uncertain())
+    rig = Pose(np.eye(3), np.array([-0.15, 0.0, 0.0]))
+    points = np.array([[0.1, 0.05, 0.6]])
+    board, room, sharper = (
+        depth_errors(lens, lens, rig, points, sigma).noise for sigma in (0.0, 3 * NOISE, NOISE / 3)
+    )
+    np.testing.assert_allclose(room, 9 * board)
+    np.testing.assert_allclose(sharper, board)
+
+
 def test_library_and_core_say_the_same_and_misfit_is_no_doubt():
     lens, rng = uncertain(), np.random.default_rng(4)
     pose = Pose(rotation_from_vector(np.array([0.2, -0.2, 0.1])), np.array([0.1, 0.1, -0.3]))
@@ -200,8 +248,9 @@ def test_a_budget_of_a_lens_that_knows_its_errors():
 
 def test_a_lens_without_errors_or_with_half_of_them_is_refused():
     lens = uncertain()
-    with pytest.raises(LensError, match='no uncertainty'):
-        LensErrors.from_lens(replace(lens, uncertainty=None))
+    for calibration in (None, {'rms_px': 0.2}, {'stderr': {'fx': 1.0}, 'covariance': [[1.0]]}):
+        with pytest.raises(LensError, match='no uncertainty'):
+            LensErrors.from_lens(replace(lens, uncertainty=None, calibration=calibration))
     for name, value in (
         ('noise_px', -1.0),
         ('covariance', [[1.0]]),

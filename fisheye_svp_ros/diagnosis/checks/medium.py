@@ -9,21 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy import special
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, predict_other_data
-from fisheye_svp_ros.diagnosis.model_errors import LensErrors
+from fisheye_svp_ros.diagnosis.model_errors import LensErrors, calibrated_covariance
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import Problem, Progress
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
 from fisheye_svp_ros.diagnosis.variance_budget import Component
 from fisheye_svp_ros.effects.ray_effects import FlatPortEffect
 from fisheye_svp_ros.effects.recording_effects import SessionStepEffect
-from fisheye_svp_ros.errors import GeometryError, LensError
+from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.lens import (
     INTRINSICS,
     Lens,
@@ -159,10 +158,10 @@ class InAir:
         if lens.uncertainty is not None:
             errors = LensErrors.from_lens(lens)
             known, whole = errors.model.names, errors.model.covariance
-        elif (said := lens.calibration or {}).get('covariance') is None:
+        elif (stated := calibrated_covariance(lens)) is None:
             return None
         else:
-            known, whole = _stated_covariance(lens, said)
+            known, whole = stated
         at = [i for i, name in enumerate(known) if name in ('f', *intrinsic_names(lens))]
         names = tuple(known[i] for i in at)
         return cls(lens, names, whole[np.ix_(at, at)]) if {'f', 'fx'} & set(names) else None
@@ -252,22 +251,6 @@ class InAir:
         root[0, 0] = 1 / _INDEX_SIGMA
         root[1:, 1 : 1 + len(self.names)] = self._root
         return Prior(mean, noise * root)
-
-
-def _stated_covariance(lens: Lens, said: Mapping[str, Any]) -> tuple[tuple[str, ...], Array]:
-    """Return names and covariance (K, K) from the `calibration` block of a lens file."""
-    try:
-        names, whole = tuple(said['stderr']), np.array(said['covariance'], dtype=float)
-        right = whole.shape == (len(names), len(names)) and np.isfinite(whole).all()
-        if not (right and (np.diag(whole) >= 0).all()):
-            raise ValueError
-    except (KeyError, TypeError, ValueError) as cause:
-        raise LensError(
-            f'lens {lens.name!r}: calibration: covariance is no matrix of finite '
-            'numbers, a row and a column for each name in stderr; calibrate anew, or '
-            'leave it out'
-        ) from cause
-    return names, whole
 
 
 def stated_parameters(lenses: Mapping[str, Lens]) -> dict[str, tuple[float, float]]:
