@@ -51,6 +51,7 @@ from fisheye_svp_ros.reporting.calibration_text import (
     hand_eye_sentence,
 )
 from fisheye_svp_ros.reporting.terminal import print_table, progress, stages
+from fisheye_svp_ros.reporting.wording.calibration import estimate_sentence
 from fisheye_svp_ros.scene.observations import Observations, list_frames, rig_cameras
 from fisheye_svp_ros.scene.table_checks import check_frames_differ, remove_copies
 from fisheye_svp_ros.solve.lens_calibration import (
@@ -111,6 +112,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'base; also fits the pose of the camera in the flange',
     )
     parser.add_argument(
+        '--plain',
+        action='store_true',
+        help='write the least-squares estimate, which bends the lens to errors of the board',
+    )
+    parser.add_argument(
         '-o',
         '--output',
         type=output_path,
@@ -146,10 +152,7 @@ def run(args: argparse.Namespace) -> None:
         found[camera] = _calibrate_camera(table, args, size, name)
     rig = None
     if len(found) > 1:
-        rig = fit_rig(
-            _join_tables([one.table for one in found.values()]),
-            {camera: one.lens for camera, one in found.items()},
-        )
+        rig = _fit_rig(found, args.plain)
     if rig and not args.poses:  # the robot's transforms are those of the lenses as they are
         for camera, lens in zip(rig.cameras, rig.lenses, strict=True):
             found[camera] = found[camera].with_lens(lens)
@@ -249,6 +252,7 @@ def _calibrate_camera(
     from fisheye_svp_ros.study.trust import (
         assess_lens,
         calibrate_without_outliers,
+        generalize,
         with_covariance,
     )
 
@@ -265,10 +269,10 @@ def _calibrate_camera(
         starts = () if air else rough_lenses(args.model, size)
         result, kept, gross = calibrate_without_outliers(table, fit_rows, starts)
     note_gross_errors(table, gross)
-    hand_eye = None
-    if args.poses:
+    hand_eye, poses = None, read_poses(args.poses).by_frame() if args.poses else None
+    if poses:
         with progress('fitting the robot'):
-            result, hand_eye = calibrate_hand_eye(result, kept, read_poses(args.poses).by_frame())
+            result, hand_eye = calibrate_hand_eye(result, kept, poses)
     known = [*result.adjusted.lens.parameters.items()][:4]
     values = ', '.join(f'{name} {value:.6g}' for name, value in known)
     try:  # the lens is there in a second, its errors take longer
@@ -280,8 +284,22 @@ def _calibrate_camera(
             f'{table.source}: the fitted lens has no rays to some of the observed '
             f'points ({cause}); {remedy}'
         ) from cause
+    plain = result.adjusted.lens
+    if not args.plain:
+        result = generalize(result, trusted)
+        if poses:  # the transforms of the lens that is written
+            result, hand_eye = calibrate_hand_eye(result, kept, poses, ())
     lens = with_covariance(result.adjusted.lens, trusted)
-    return CalibratedCamera(lens, result, trusted, kept, args.model, hand_eye, gross.landmarks)
+    return CalibratedCamera(
+        lens,
+        with_covariance(plain, trusted),
+        result,
+        trusted,
+        kept,
+        args.model,
+        hand_eye,
+        gross.landmarks,
+    )
 
 
 def _print(found: CalibratedCamera) -> None:
@@ -296,6 +314,8 @@ def _print(found: CalibratedCamera) -> None:
             for name, value, error, range_, unit in found.parameter_rows()
         ],
     )
+    if sentence := estimate_sentence(figures):
+        print(f'  {sentence}')
     if open_ones:
         print('  with any target: 95 %, with shape, scale and boards of the target estimated too')
     print(
@@ -321,6 +341,24 @@ def _document(found: CalibratedCamera) -> dict[str, Any]:
         'admissible': {name: asdict(range_) for name, range_ in found.trust.admissible.items()},
         'warnings': list(found.warnings),
     }
+
+
+def _fit_rig(found: Mapping[str, CalibratedCamera], plain: bool) -> RigCalibration | None:
+    """Fit the rig, its lenses by least squares; unless plain, again with the generalized ones."""
+    table = _join_tables([camera.table for camera in found.values()])
+    rig = fit_rig(table, {name: camera.least_squares for name, camera in found.items()})
+    if rig is None or plain:
+        return rig
+    known = {
+        name: found[name].generalize(lens)
+        for name, lens in zip(rig.cameras, rig.lenses, strict=True)
+    }
+    try:
+        final = calibrate_rig(posable_observations(table, known)[0], known, rig.cameras)
+    except FisheyeSvpError:
+        return rig
+    lenses = (replace(known[name], calibration=found[name].lens.calibration) for name in known)
+    return final._replace(lenses=tuple(lenses), covariance=rig.covariance)
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -53,7 +53,7 @@ from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, can_be_included
 from fisheye_svp_ros.diagnosis.stages import diagnose, diagnose_against
 from fisheye_svp_ros.diagnosis.stepwise import NAMED_P
-from fisheye_svp_ros.diagnosis.uncertainty import total_errors
+from fisheye_svp_ros.diagnosis.uncertainty import standard_errors, total_errors
 from fisheye_svp_ros.diagnosis.variance_budget import stage_shares
 
 __all__ = [

@@ -161,9 +161,13 @@ def calibrate(
     name: str = 'lens',
     *,
     poses: AnyPoses | None = None,
+    plain: bool = False,
     progress: Progress = _silent,
 ) -> Calibrated:
     """Fit a lens to image points of known targets, see `solve.lens_calibration.calibrate`.
+
+    By generalized least squares, so that the lens does not bend to errors of the target; plain:
+    by least squares.
 
     image_size: width, height, px; free: names of what is fitted, all by default.
     Outliers are rejected, and standard errors are honest, as those of the command.
@@ -176,6 +180,7 @@ def calibrate(
     from fisheye_svp_ros.study.trust import (
         assess_lens,
         calibrate_without_outliers,
+        generalize,
         with_covariance,
     )
 
@@ -191,9 +196,13 @@ def calibrate(
     )
     if poses is not None:
         found, _ = lens_calibration.calibrate_hand_eye(found, kept, _by_frame(poses))
-    adjusted = found.adjusted
     progress('estimating standard errors', 0.3)
-    trusted = assess_lens(kept, adjusted.lens, adjusted.names)
+    trusted = assess_lens(kept, found.adjusted.lens, found.adjusted.names)
+    if not plain:
+        found = generalize(found, trusted)
+        if poses is not None:
+            found, _ = lens_calibration.calibrate_hand_eye(found, kept, _by_frame(poses), ())
+    adjusted = found.adjusted
     return Calibrated(
         with_covariance(adjusted.lens, trusted),
         tuple(adjusted.names),

@@ -15,6 +15,7 @@ from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.reporting.blocks import page, png_uri
 from fisheye_svp_ros.reporting.calibration_text import STANDARD_ERRORS, CalibratedCamera
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, drawing, round_number
+from fisheye_svp_ros.reporting.wording.calibration import estimate_sentence
 from fisheye_svp_ros.scene.observations import frame_name
 from fisheye_svp_ros.solve.ray_errors import RANGES, RayModel, ray_model, typical_points
 
@@ -52,6 +53,7 @@ def _camera(name: str, one: CalibratedCamera) -> dict[str, Any]:
         'frames': figures['frames'],
         'photographs': bool(one.table.photographs),
         'rms': figures['rms_px'],
+        'estimate': estimate_sentence(figures),
         'noise': one.result.sigma,
         'warnings': one.warnings,
         'rows': one.parameter_rows(),

@@ -10,7 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.lens import Lens, monotone_limit, parameter_values
 from fisheye_svp_ros.pose import Pose, vector_from_rotation
 from fisheye_svp_ros.reporting.terminal import UNITS, interval, with_error
 from fisheye_svp_ros.scene.observations import Observations, list_frames
@@ -40,16 +40,30 @@ _MIN_MM = 100.0  # such a factor, too large for a mistaken board, is that of mm
 class CalibratedCamera:
     """One camera's lens with its errors, the fit, its trust, its table, and the robot, if any.
 
-    wrong_landmarks: that are not where the table says, their points rejected.
+    least_squares: the lens of least squares, with the same errors; wrong_landmarks: that are not
+    where the table says, their points rejected.
     """
 
     lens: Lens
+    least_squares: Lens
     result: Calibration
     trust: LensTrust
     table: Observations
     model: str
     hand_eye: HandEye | None = None
     wrong_landmarks: tuple[WrongLandmark, ...] = ()
+
+    def generalize(self, lens: Lens) -> Lens:
+        """Return a lens of least squares, fitted to more, moved as far as that of the camera was.
+
+        It states no errors: it is to stay as it is.
+        """
+        names = self.result.adjusted.names
+        values = [np.array(parameter_values(of, names)) for of in (lens, self.lens)]
+        moved = values[1] - parameter_values(self.least_squares, names)
+        lens = lens.with_parameters(names, (values[0] + moved).tolist())
+        limit = min(self.lens.max_incidence, monotone_limit(lens))
+        return replace(lens, calibration=None, max_incidence=limit)
 
     def with_lens(self, lens: Lens) -> CalibratedCamera:
         """Return the camera with a lens fitted to more, and the poses of its views by it."""

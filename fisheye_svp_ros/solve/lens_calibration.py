@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -122,18 +122,21 @@ def calibrate_port(
 
 
 def calibrate_hand_eye(
-    found: Calibration, observations: Observations, poses: dict[int, Pose]
+    found: Calibration,
+    observations: Observations,
+    poses: dict[int, Pose],
+    free: Sequence[str] | None = None,
 ) -> tuple[Calibration, HandEye]:
     """Fit a calibrated lens anew, together with the robot that carried the camera, or the target.
 
     found: the calibration of the observations without poses; poses: of the flange, by frame; a
-    frame may have none.
+    frame may have none; free: parameters of the lens to fit, those of the calibration by default.
     Raises ObservationError where these do not determine the hand-eye transform, or fit none.
     """
     adjusted, views = found.adjusted, found.views
     data = replace(RigViews.of_one_camera(views), table=observations)
     state = RigState(adjusted.pose, identity(1), adjusted.lens, (), corrected=True)
-    names = adjusted.names
+    names = adjusted.names if free is None else tuple(free)
     try:
         state, hand_eye = fit_hand_eye(data, state, names, *flange_poses(data, poses))
     except GeometryError as cause:
@@ -144,16 +147,44 @@ def calibrate_hand_eye(
     linear = Linearization(data, state, names)
     # The covariances stay those of the images alone, which are no smaller.
     adjusted = adjusted._replace(lens=state.lens, pose=state.pose, residual=linear.residual_px)
-    theta = _angles(adjusted, views)
+    return _with_figures(found, adjusted, hand_eye=hand_eye.to_dict()), hand_eye
+
+
+def with_values(found: Calibration, values: Sequence[float]) -> Calibration:
+    """Return a calibration with other values of its parameters, its views posed anew.
+
+    Raises LensError where these are no lens.
+    """
+    adjusted = found.adjusted
+    block = adjusted.lens.calibration or {}
+    lens = _with_corner(adjusted.lens.with_parameters(adjusted.names, list(values)))
+    lens = replace(lens, calibration=block)
+    solved = localize(ForwardModel(lens), found.views, adjusted.pose)
+    adjusted = adjusted._replace(
+        lens=lens,
+        pose=solved.pose,
+        residual=solved.residual,
+        cost=solved.cost,
+        converged=adjusted.converged and bool(np.all(solved.converged)),
+    )
+    moved = _with_figures(found, adjusted, least_squares_rms_px=block['rms_px'])
+    return moved._replace(
+        adjusted=moved.adjusted._replace(lens=check_lens(moved.adjusted.lens, lens.name)),
+        beyond=int((_angles(adjusted, found.views) > moved.adjusted.lens.max_incidence).sum()),
+    )
+
+
+def _with_figures(found: Calibration, adjusted: AdjustedLens, **more: Any) -> Calibration:
+    """Return a calibration with another fit of its views, and the figures of that."""
+    theta = _angles(adjusted, found.views)
     block = {
         **(adjusted.lens.calibration or {}),
         'rms_px': rms_px(adjusted.residual),
-        'hand_eye': hand_eye.to_dict(),
+        **more,
         'reached_deg': float(np.degrees(theta.max())),
     }
     lens = replace(_with_field(adjusted, theta), calibration=block)
-    found = found._replace(adjusted=adjusted._replace(lens=lens), reached=float(theta.max()))
-    return found, hand_eye
+    return found._replace(adjusted=adjusted._replace(lens=lens), reached=float(theta.max()))
 
 
 def rough_lenses(model: str, image_size: tuple[int, int]) -> list[Lens]:

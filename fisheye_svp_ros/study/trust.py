@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis import (
@@ -14,19 +16,20 @@ from fisheye_svp_ros.diagnosis import (
     LensErrors,
     NullModel,
     compare_errors,
+    standard_errors,
     total_errors,
 )
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.mixed_model import pseudo_inverse
+from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError
+from fisheye_svp_ros.mixed_model import FactoredEquations, factor_equations, pseudo_inverse
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import Pose, axis_angle_between, identity
 from fisheye_svp_ros.scene.observations import Observations, views_of
 from fisheye_svp_ros.scene.table_checks import check_frames_differ
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state, localize_cameras
-from fisheye_svp_ros.solve.lens_calibration import Calibration
-from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measured
+from fisheye_svp_ros.solve.lens_calibration import Calibration, with_values
+from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measured, rms_px
 from fisheye_svp_ros.solve.outliers import NO_OUTLIERS, Outliers, find_outliers
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 from fisheye_svp_ros.solve.stereo_depth import triangulate
@@ -37,6 +40,8 @@ _INTERVAL_SIGMAS = 2.0  # standard errors of an interval
 _MAX_ROUNDS = 4
 _MAX_POINTS = 500  # stereo points
 _FOLDS = 3
+_TARGET_SHARES = (0.0, 0.03, 0.1, 0.3, 1.0)  # of what is large for an error of the target
+_MAX_RMS_RATIO = 2.0  # residuals over those of least squares: beyond, nothing is linear
 
 
 @dataclass(frozen=True)
@@ -56,11 +61,13 @@ class Admissible:
 class LensTrust:
     """Standard errors of parameters, the target as it is said to be, and their ranges, by name.
 
-    covariance (K, K): of all of them, over all targets that the data admit.
+    moved (K,): from the values of least squares to those of generalized least squares, the target
+    as far from what it is said to be as the data make likely; covariance (K, K): of these.
     """
 
     stderr: dict[str, float]
     admissible: dict[str, Admissible]
+    moved: Array
     covariance: Array
 
     @property
@@ -124,20 +131,39 @@ def assess_lens(observations: Observations, lens: Lens, names: Sequence[str]) ->
     # What else the lens has, its corrections, is fitted along and follows them.
     errors = total_errors(null)[: len(names)]
     stderr = {name: float(error) for name, error in zip(names, errors, strict=True)}
-    moved, covariance = _free_target(null, len(names))
-    values = parameter_values(lens, names)
+    targets = _fit_targets(null, len(names))
+    values, free = parameter_values(lens, names), targets[-1]
     admissible = {
         name: _admissible(name, (value, error), (value + step, spread))
         for name, value, error, step, spread in zip(
-            names, values, errors, moved, np.sqrt(np.diag(covariance)), strict=True
+            names, values, errors, free.step, np.sqrt(np.diag(free.covariance)), strict=True
         )
     }
-    # The values stand for a target as it is said to be: what another would move them by is
-    # doubt, too.
-    covariance = covariance + np.outer(moved, moved)
-    known = np.sqrt(np.diag(covariance))
-    larger = np.maximum(np.nan_to_num(errors), known) / np.maximum(known, 1e-300)
-    return LensTrust(stderr, admissible, covariance * np.outer(larger, larger))
+    moved, covariance = _average_fits([_fit_without_random_parts(null, targets[0]), *targets])
+    # What frames left out say of the errors holds for any target.
+    known = np.sqrt(np.diag(targets[0].covariance))
+    larger = np.maximum(np.nan_to_num(standard_errors(null)[: len(names)]), known)
+    larger = larger / np.maximum(known, 1e-300)
+    return LensTrust(stderr, admissible, moved, covariance * np.outer(larger, larger))
+
+
+def generalize(found: Calibration, trusted: LensTrust) -> Calibration:
+    """Return a calibration at the values of generalized least squares.
+
+    As it is where these are no lens, or one that is not near: the equations are linear.
+    """
+    adjusted = found.adjusted
+    if adjusted.lens.port is not None or not np.isfinite(trusted.moved).all():
+        return found
+    values = np.array(parameter_values(adjusted.lens, adjusted.names)) + trusted.moved
+    try:
+        moved = with_values(found, values.tolist())
+    except FisheyeSvpError:
+        return found
+    near = moved.adjusted.converged and rms_px(moved.adjusted.residual) < (
+        _MAX_RMS_RATIO * rms_px(adjusted.residual)
+    )
+    return moved if near else found
 
 
 def with_covariance(lens: Lens, trusted: LensTrust) -> Lens:
@@ -156,26 +182,70 @@ def with_covariance(lens: Lens, trusted: LensTrust) -> Lens:
     )
 
 
-def _free_target(null: NullModel, count: int) -> tuple[Array, Array]:
-    """Return how far parameters (K,) move once the target is free, and their covariance (K, K).
+class _Fit(NamedTuple):
+    """Steps (K,) of parameters and their covariance (K, K), and the log evidence of a model."""
 
-    count: of these, the first of what is in the model.
+    step: Array
+    covariance: Array
+    evidence: float
+
+
+def _fit_targets(null: NullModel, count: int) -> list[_Fit]:
+    """Return how parameters move for a target as it is said to be, and for ones that err more.
+
+    The errors of the target are normal, with a share of what is large for each as their standard
+    deviation, from none to all; larger ones are no target that anybody would take for exact.
+    count: of these parameters, the first of what is in the model.
     """
-    own = null.included_columns
-    columns, prior = [own], [np.zeros(null.column_count)]
+    own, information = null.included_columns, null.information
+    columns, precision = [own], [np.zeros(null.column_count)]
     for form, effect in enumerate(null.fixed.forms.effects):
         if effect.budget_stage() == 'target':
             columns.append(null.form_columns(form))
-            prior.append(null.prior_precision(columns[-1], effect))
-    every, information = np.concatenate(columns), null.information
-    # Larger errors than `large` are no target that anybody would take for exact.
-    inverse = pseudo_inverse(
-        information[np.ix_(every, every)] + np.diag(np.concatenate(prior)), 1e-13
-    )
-    own, scale = own[:count], null.scale[:count]
-    return (inverse @ information[every, -1])[own] / scale, (
-        inverse[np.ix_(own, own)] / np.outer(scale, scale)
-    )
+            precision.append(null.prior_precision(columns[-1], effect))
+    every, prior = np.concatenate(columns), np.concatenate(precision)
+    scale, fits = null.scale[:count], []
+    for share in _TARGET_SHARES:
+        at = every if share else own
+        more = prior[: len(at)] / share**2 if share else np.zeros(len(own))
+        inside = information[np.ix_(at, at)] + np.diag(more)
+        inverse, score = pseudo_inverse(inside, 1e-13), information[at, -1]
+        evidence = score @ inverse @ score - np.linalg.slogdet(inside)[1]
+        evidence += np.log(more[len(own) :]).sum()
+        mine = inverse[:count, :count] / np.outer(scale, scale)
+        fits.append(_Fit((inverse @ score)[:count] / scale, mine, float(evidence) / 2))
+    return fits
+
+
+def _fit_without_random_parts(null: NullModel, other: _Fit) -> _Fit:
+    """Return the fit of least squares, which does not move; other: with random parts as they are.
+
+    Evidence by the restricted likelihood; a variance counts as a parameter (BIC): in data without
+    anything of its own, chance calls for a small one.
+    """
+    own, plain = null.included_columns, np.zeros_like(null.variances.alive)
+    bare = factor_equations(null.full.select(plain), null.variances.lam, null.variances.weight)
+
+    def likelihood(f: FactoredEquations) -> float:
+        noise = null.remaining_information(f.information, own)[-1, -1] / null.freedom
+        determinant = np.linalg.slogdet(f.information[np.ix_(own, own)])[1]
+        return -float(f.log_determinant + determinant + null.freedom * np.log(noise)) / 2
+
+    cost = int(null.variances.alive.sum()) * np.log(null.full.rows) / 2
+    gain = likelihood(null.factorization) - likelihood(bare) - cost
+    return _Fit(np.zeros_like(other.step), other.covariance, other.evidence - gain)
+
+
+def _average_fits(fits: Sequence[_Fit]) -> tuple[Array, Array]:
+    """Return the mean step (K,) and its covariance (K, K), each model weighted by its evidence.
+
+    Source: Hoeting et al., Bayesian model averaging: a tutorial, Statistical Science 14 (1999).
+    """
+    weight = special.softmax([fit.evidence for fit in fits])
+    steps = np.array([fit.step for fit in fits])
+    mean = weight @ steps
+    within = np.einsum('t,tkl->kl', weight, np.array([fit.covariance for fit in fits]))
+    return mean, within + (steps - mean).T @ (weight[:, None] * (steps - mean))
 
 
 def _admissible(name: str, *found: tuple[float, float]) -> Admissible:

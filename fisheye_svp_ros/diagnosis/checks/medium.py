@@ -310,6 +310,7 @@ def behind_port(problem: Problem, medium: Medium) -> Problem:
         data=medium.air.data,
         outliers=medium.outliers,
         base=medium.state,
+        start=medium.state,
         free=medium.names,
         options=options,
     )
