@@ -105,6 +105,7 @@ __all__ = [
     'pose_summary',
     'predict_other_data',
     'stage_shares',
+    'standard_errors',
     'status_of',
     'total_errors',
 ]

@@ -5,7 +5,7 @@ Advice comes in the order of what it brings; nothing that held-out data refute.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
@@ -355,7 +355,6 @@ def conclude(
         LensFacts(
             lens_causes=[c.effect for c in causes if c.stage == 'lens'],
             causes=[c.effect for c in causes if c.stage != 'noise'],
-            has_likely_shift=bool(evaluation.averaged_model.shifts),
             named_gain=(gain.value, gain.low),
             file=file,
             offset=offset if evaluation.free else None,
@@ -364,6 +363,8 @@ def conclude(
             falling=evaluation.falling,
             frames=evaluation.frames,
             refuted=[one.effect for one in candidates if one.status is Status.REFUTED],
+            rays=_worst_rays(ray_errors),
+            written=_unnamed_parts(evaluation),
         )
     )
     scatter = np.hypot.reduce(
@@ -407,6 +408,32 @@ def frames_of(advice: Sequence[Advice], kind: str) -> list[str]:
             for name in (one.photographs or [f'frame {n}' for n in one.frames])
         )
     )
+
+
+def _worst_rays(errors: Mapping[str, Mapping[str, Sequence[RayError]]]) -> tuple[float, float]:
+    """Return the rms over ranges, mrad, of the expected errors of a lens as given and extended.
+
+    Of the camera that gains most; zeros where nothing is known.
+    """
+    each = [
+        tuple(
+            1e3 * float(np.sqrt(np.mean([one.value**2 for one in sides[side]])))
+            for side in ('given', 'extended')
+        )
+        for sides in errors.values()
+    ]
+    given, extended = max(each, key=lambda both: both[0] / max(both[1], 1e-12), default=(0.0, 0.0))
+    return given, extended
+
+
+def _unnamed_parts(evaluation: Evaluation) -> list[str]:
+    """Return what the written lens has that no confirmed cause stands for."""
+    field = evaluation.written_field
+    parts = {
+        'viewpoint_shift': bool(evaluation.averaged_model.shifts),
+        'image_field': field is not None and bool(field.fields),
+    }
+    return [name for name, there in parts.items() if there]
 
 
 def _target_facts(

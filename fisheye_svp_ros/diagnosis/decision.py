@@ -17,6 +17,7 @@ PhotographsAnswer = Literal['enough', 'more', 'retake']
 _INTRINSIC = ('focal_length', 'principal_point', 'aspect')
 _OFF_P = 0.04  # of the offset by chance: below, the lens is another one
 _OFF_PX = 0.2  # of the noise: a difference that matters
+_RAY_RATIO = 2.0  # of expected ray errors: a lens so much better is worth the change
 _HINT = 2.4  # standard errors: an effect that is not named, and yet likely there
 MIN_FRAMES = 8  # frames
 _MAX_REJECTED_SHARE = 0.1  # of the frames
@@ -35,6 +36,7 @@ class LensReason(Enum):
     GAIN_UNCERTAIN = 7
     EFFECT_LIKELY = 8
     NOTHING_CONFIRMED = 9
+    RAYS_BETTER = 10
 
 
 class TargetReason(Enum):
@@ -156,15 +158,15 @@ class LensFacts(NamedTuple):
     """What the lens is judged by.
 
     lens_causes, causes: confirmed ones of the lens, and all that move predictions;
-    has_likely_shift: whether the extended lens has a viewpoint shift that is likely and not named;
     named_gain: value, low of what all causes gain held out; offset: None where intrinsics were
     not fitted; falling: whether no error rises with the causes on the fitted frames; frames: how
     many; refuted: effects that held-out data, or their size, refute.
+    many; rays: expected errors, mrad, of the lens as given and the extended one, over all ranges,
+    zeros where unknown; written: what the extended lens has without a confirmed cause.
     """
 
     lens_causes: Sequence[str]
     causes: Sequence[str]
-    has_likely_shift: bool
     named_gain: tuple[float, float]
     file: FileFigure
     offset: LensOffset | None
@@ -173,6 +175,19 @@ class LensFacts(NamedTuple):
     falling: bool
     frames: int
     refuted: Sequence[str] = ()
+    rays: tuple[float, float] = (0.0, 0.0)
+    written: Sequence[str] = ()
+
+    @property
+    def is_better_held_out(self) -> bool:
+        """Whether the extended lens predicts better, its confirmed causes (if any) likewise."""
+        return self.file.low > 0 and not (self.causes and self.named_gain[0] <= 0)
+
+    @property
+    def has_better_rays(self) -> bool:
+        """Whether the expected error of the rays halves, and held-out frames do not refute it."""
+        given, extended = self.rays
+        return extended > 0 and given >= _RAY_RATIO * extended and self.file.high > 0
 
     @property
     def wrong_intrinsics(self) -> list[str]:
@@ -209,9 +224,10 @@ def decide_lens(facts: LensFacts) -> Decision:
         return decide('undecided', LensReason.ONE_FRAME, None)
     if facts.wrong_intrinsics:
         return decide('recalibrate', LensReason.INTRINSICS_WRONG, sure)
-    borne_out = facts.named_gain[0] > 0 if facts.causes else facts.has_likely_shift
-    if borne_out and file.low > 0:
+    if facts.is_better_held_out:
         return decide('use_extended', LensReason.PREDICTS_BETTER, sure)
+    if facts.has_better_rays:
+        return decide('use_extended', LensReason.RAYS_BETTER, None)
     if facts.causes and file.high < 0 < facts.named_gain[1]:
         reason = LensReason.LENS_ALONE_PREDICTS_WORSE
         return decide('undecided', reason, 1 - sure, bounded=True)

@@ -33,7 +33,7 @@ SAME = FileFigure(0.1, 0.1, 0.01, -0.2, 0.2, 0.55)
 SMALL = EffectBound('viewpoint_shift', 0.0004, 'm', 0.7, 0.02, 0.05)
 LIKELY = EffectBound('viewpoint_shift', 0.0092, 'm', 2.6, 0.32, 0.58)
 SOUND = LensFacts(
-    [], [], False, (0.0, 0.0), SAME, LensOffset(0.3, 0.8, 0.6, 0.1), [SMALL], 0.05, True, 12
+    [], [], (0.0, 0.0), SAME, LensOffset(0.3, 0.8, 0.6, 0.1), [SMALL], 0.05, True, 12
 )
 
 
@@ -66,10 +66,16 @@ def test_the_extended_lens_is_used_where_it_predicts_better_on_the_same_target()
     assert found.say == 'use_extended' and found.figure == ('file_gain', 0.75, '1')
 
 
-def test_a_lens_with_a_likely_shift_and_no_cause_is_used_where_it_predicts_better() -> None:
-    assert decide_lens(SOUND._replace(has_likely_shift=True, file=BETTER)).say == 'use_extended'
-    assert decide_lens(SOUND._replace(file=BETTER)).say == 'keep'
-    assert decide_lens(SOUND._replace(has_likely_shift=True)).say == 'keep'
+def test_a_lens_that_is_expected_to_be_better_is_offered_named_cause_or_not() -> None:
+    found = decide_lens(SOUND._replace(file=BETTER))
+    assert (found.say, found.reason) == ('use_extended', LensReason.PREDICTS_BETTER)
+    halved = decide_lens(SOUND._replace(rays=(1.2, 0.5)))
+    assert (halved.say, halved.reason) == ('use_extended', LensReason.RAYS_BETTER)
+    assert decide_lens(SOUND._replace(rays=(0.9, 0.5))).say == 'keep'
+    refuted = SOUND._replace(rays=(1.2, 0.5), file=WORSE)
+    assert decide_lens(refuted).say == 'keep'
+    caused = SOUND._replace(causes=['target_shape'], named_gain=(-0.1, -0.2), file=BETTER)
+    assert decide_lens(caused).say != 'use_extended'
 
 
 def test_figures_that_disagree_leave_it_undecided() -> None:

@@ -31,7 +31,6 @@ from fisheye_svp_ros.reporting.wording.findings import finding_reason
 LENS = LensFacts(
     lens_causes=['sensor_tilt'],
     causes=['sensor_tilt', 'focal_length'],
-    has_likely_shift=False,
     named_gain=(0.1, 0.02),
     file=FileFigure(0.123, 0.081, 0.75, 0.6, 0.84, 0.93),
     offset=LensOffset(1.2, 3.0, 0.001, 1.5),

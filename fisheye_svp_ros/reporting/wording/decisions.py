@@ -50,7 +50,10 @@ def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
         LensReason.INTRINSICS_WRONG: 'the lens as given is wrong in '
         f'{", ".join(facts.wrong_intrinsics)}',
         LensReason.PREDICTS_BETTER: 'on the same corrected target it takes the held-out error '
-        f'from {file.given_px:.3g} to {file.extended_px:.3g} px',
+        f'from {file.given_px:.3g} to {file.extended_px:.3g} px{_unnamed_parts(facts)}',
+        LensReason.RAYS_BETTER: 'the expected error of its rays is '
+        f'{facts.rays[1]:.2g} mrad, of the lens as given {facts.rays[0]:.2g} mrad'
+        f'{_unnamed_parts(facts)}',
         LensReason.LENS_ALONE_PREDICTS_WORSE: f'held-out error {file.extended_px:.3g} px with the '
         f'extended lens alone, {file.given_px:.3g} px with the lens as given; only all causes '
         'together reduce it',
@@ -60,6 +63,16 @@ def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
         LensReason.EFFECT_LIKELY: _likely_effects(facts),
         LensReason.NOTHING_CONFIRMED: _nothing_confirmed(facts),
     }
+
+
+def _unnamed_parts(facts: LensFacts) -> str:
+    """Return what the extended lens has without a confirmed cause, as a clause; '' for nothing."""
+    if facts.written:
+        parts = ', '.join(name.replace('_', ' ') for name in facts.written)
+        return f'; unconfirmed in it: {parts}'
+    if facts.lens_causes:
+        return ''
+    return '; its parameters are estimated with errors of the target'
 
 
 def _offset(facts: LensFacts) -> str:
