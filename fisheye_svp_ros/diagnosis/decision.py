@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from math import erf
+from math import erf, inf
 from typing import Literal, NamedTuple
 
 from fisheye_svp_ros.diagnosis.flaws import Flaw
@@ -109,10 +109,11 @@ class Decision:
 class LensOffset(NamedTuple):
     """How far the lens as given is off what the data say.
 
-    mrad: rms of the rays at 1 m, of the fit with causes or of that without, whichever is nearer;
-    ratio: of the distance over what the stated errors and those of the fit let expect, by their
-    covariance; p_value: of so much by chance; px: mrad in the image; stated: whether the lens
-    file states errors; camera: whose lens, of several.
+    mrad: least rms of the errors of its rays at 1 m (95 % sure), by the fit with causes or that
+    without, whichever is nearer; ratio: of the distance over what the stated errors and those of
+    the fit let expect, by their covariance; p_value: of so much by chance; px: mrad in the image;
+    stated: whether the lens file states errors; camera: whose lens, of several; gain: its expected
+    error over that of a fresh calibration.
     """
 
     mrad: float
@@ -121,11 +122,20 @@ class LensOffset(NamedTuple):
     px: float
     stated: bool = True
     camera: str = ''
+    gain: float = inf
+
+    @property
+    def is_chance(self) -> bool:
+        """Whether chance alone may set the lens off by so much."""
+        return self.p_value >= _OFF_P
 
     def matters(self, noise_px: float) -> bool:
-        """Say whether the lens is another one; of a lens without errors only what costs counts."""
+        """Say whether the lens is another one, and a fresh calibration clearly better.
+
+        Of a lens without errors only what costs counts.
+        """
         least = _OFF_PX if self.stated else 1.0
-        return self.p_value < _OFF_P and self.px > least * noise_px
+        return not self.is_chance and self.px > least * noise_px and self.gain >= _RAY_RATIO
 
 
 def least_likely_offset(offsets: Sequence[LensOffset]) -> LensOffset | None:

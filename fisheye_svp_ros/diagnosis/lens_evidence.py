@@ -47,6 +47,7 @@ _LINEARITY = 0.05  # of a change: beyond it, its columns are no measure
 _DIRECTIONS = 64  # more than a lens has parameters
 _NEGLIGIBLE = 1e-8  # of a variance
 _ROUNDING = 1e-10  # of the variance of an angle: below it, a covariance has no root
+_BOUND_QUANTILE = 0.95
 _NEAR_RANGE = 1  # of ray_errors.RANGES: 1 m
 
 
@@ -264,7 +265,7 @@ def _offset(
     noise: px; angles far below it, and what a large change is by more than linear, do not count.
     """
     nearer = min((one[_NEAR_RANGE] for one in off), key=_rms)
-    expected = model.sample(_NEAR_RANGE)
+    fresh = expected = model.sample(_NEAR_RANGE)
     stated = _stated_sample(given, uv)
     if stated is not None and stated.shape == expected.shape:
         expected = expected + stated
@@ -273,7 +274,12 @@ def _offset(
     distance, drawn = _distances(nearer, expected, floor)
     p_value = float((1 + (drawn >= distance).sum()) / (1 + len(drawn)))
     ratio = distance / max(float(np.sqrt((drawn**2).mean())), 1.0)
-    return LensOffset(1e3 * _rms(nearer), ratio, p_value, _rms(nearer) * focal, stated is not None)
+    # What the fit errs by along the difference may be a part of it.
+    size, error = _rms(nearer), float(np.sqrt((fresh**2).sum(axis=1).mean()))
+    along = (nearer[..., None] * fresh).sum(axis=(0, 1)) / (len(nearer) * max(size, 1e-300))
+    least = max(size - float(np.quantile(along, _BOUND_QUANTILE)), 0.0)
+    gain = float(np.hypot(size, error)) / max(error, 1e-300)
+    return LensOffset(1e3 * least, ratio, p_value, least * focal, stated is not None, gain=gain)
 
 
 def _distances(off: Array, samples: Array, floor: float) -> tuple[float, Array]:

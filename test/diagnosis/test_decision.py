@@ -53,6 +53,12 @@ def test_a_lens_off_by_three_of_its_errors_is_to_be_calibrated_again(causes: lis
     assert found.confidence is not None and found.confidence > 0.99
 
 
+def test_a_lens_is_calibrated_again_only_where_that_makes_it_twice_as_good() -> None:
+    off = LensOffset(1.2, 3.0, 0.001, 1.5, gain=1.6)
+    assert decide_lens(SOUND._replace(offset=off)).say == 'keep'
+    assert decide_lens(SOUND._replace(offset=off._replace(gain=2.5))).say == 'recalibrate'
+
+
 def test_a_lens_that_is_off_by_less_than_matters_is_not() -> None:
     little = LensOffset(0.02, 4.0, 0.001, 0.004)
     assert decide_lens(SOUND._replace(offset=little)).say == 'keep'

@@ -100,7 +100,7 @@ def test_every_reason_is_a_short_clause(
         ),
         (
             LensReason.NOTHING_CONFIRMED,
-            LENS,
+            LENS._replace(offset=LensOffset(0.3, 0.8, 0.6, 0.1)),
             'no cause in the lens is confirmed and its parameters agree with these data within '
             'their errors; effects that these data do not exclude cause at most 0.32 px '
             '(0.58 mrad) at the edge',

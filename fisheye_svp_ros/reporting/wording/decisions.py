@@ -98,7 +98,8 @@ def _likely_effects(facts: LensFacts) -> str:
 
 def _nothing_confirmed(facts: LensFacts) -> str:
     worst = max(facts.bounds, key=lambda one: one.edge_px, default=None)
-    fit = ' and its parameters agree with these data within their errors' if facts.offset else ''
+    agrees = facts.offset is not None and facts.offset.is_chance
+    fit = ' and its parameters agree with these data within their errors' if agrees else ''
     cost = ''
     if worst is not None:
         cost = (
