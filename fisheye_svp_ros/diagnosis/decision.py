@@ -170,8 +170,8 @@ class LensFacts(NamedTuple):
     lens_causes, causes: confirmed ones of the lens, and all that move predictions;
     named_gain: value, low of what all causes gain held out; offset: None where intrinsics were
     not fitted; falling: whether no error rises with the causes on the fitted frames; frames: how
-    many; refuted: effects that held-out data, or their size, refute.
-    many; rays: expected errors, mrad, of the lens as given and the extended one, over all ranges,
+    many; refuted: effects that held-out data, or their size, refute;
+    rays: expected errors, mrad, of the lens as given and the extended one, over all ranges,
     zeros where unknown; written: what the extended lens has without a confirmed cause.
     """
 
