@@ -87,6 +87,18 @@ def test_a_diagnosis_is_what_its_schema_says() -> None:
     assert document['causes']
     validator.validate(json.loads(json.dumps(document)))
     assert not validator.is_valid({**document, 'verdict': 'good'})
+    assert set(document) <= set(validator.schema['properties'])
+
+
+def test_the_schema_is_that_of_the_records() -> None:
+    """It lacked candidates, decision and file."""
+    sys.path.insert(0, str(ROOT / 'docs'))
+    try:
+        import diagnosis_schema
+    finally:
+        sys.path.remove(str(ROOT / 'docs'))
+    stale = 'stale; run: python docs/diagnosis_schema.py'
+    assert diagnosis_schema.SCHEMA.read_text(encoding='utf-8') == diagnosis_schema.text(), stale
 
 
 def test_the_figures_of_the_first_pages_are_those_of_the_results() -> None:

@@ -1,17 +1,108 @@
-"""diagnosis.json: facts of a diagnosis by the keys of the design, with their sentences."""
+"""diagnosis.json: facts of a diagnosis by the keys of the design, with their sentences.
+
+docs/reference/diagnosis.schema.json is generated from the entries here and the records that they
+hold: python docs/diagnosis_schema.py
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from math import degrees
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
 
-from fisheye_svp_ros.diagnosis import Advice, Cause, Decision, Diagnosis, Finding
+from fisheye_svp_ros.diagnosis import (
+    Advice,
+    Cause,
+    Decision,
+    Diagnosis,
+    EffectBound,
+    Figure,
+    Finding,
+    Status,
+)
 from fisheye_svp_ros.reporting.wording.adequacy import flaw_document
 from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason
 from fisheye_svp_ros.reporting.wording.findings import finding_reason
 from fisheye_svp_ros.scene.observations import photograph_names
+
+
+class Parameter(TypedDict):
+    """An estimate."""
+
+    value: float
+    stderr: float
+    unit: str
+
+
+Parameters = Annotated[Mapping[str, Any], dict[str, Parameter]]  # what the schema says of it
+StatusName = Annotated[str, Status]
+
+
+class CauseEntry(TypedDict):
+    """A cause."""
+
+    effect: str
+    form: str
+    parameters: Parameters
+    p_value: float
+    probability: float
+    status: StatusName
+    share: float
+    survives: bool
+    heldout_rms_px: float
+    gain: float
+    indistinguishable_from: list[str]
+    to_separate: str
+    refuted_by_frames: Sequence[tuple[int, int]]
+
+
+class CandidateEntry(TypedDict):
+    """An effect that is not confirmed."""
+
+    effect: str
+    parameters: Parameters
+    p_value: float
+    probability: float
+    status: StatusName
+    why: str
+
+
+class StepEntry(TypedDict):
+    """What was tried in the selection."""
+
+    effect: str
+    statistic: float
+    rank: int
+    p_value: float
+    corrected: float
+    held_out: float
+    held_out_stderr: float
+    accepted: bool
+    why: str
+
+
+class AdviceEntry(TypedDict):
+    """What to do."""
+
+    what: str
+    frames: list[int]
+    photographs: list[str]
+    landmarks: list[int]
+    boards: list[int]
+    gain: float
+    kind: str
+
+
+class DecisionEntry(TypedDict):
+    """What to do about lens, target or photographs."""
+
+    say: str
+    why: str
+    figure: Annotated[Mapping[str, Any], Figure]
+    confidence: float | None
+    bound: NotRequired[Annotated[list[dict[str, Any]], list[EffectBound]]]
 
 
 def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
@@ -60,18 +151,19 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _decision(one: Decision) -> dict[str, Any]:
-    bound = {'bound': [asdict(bound) for bound in one.bound]} if one.bound else {}
-    return {
+def _decision(one: Decision) -> DecisionEntry:
+    entry: DecisionEntry = {
         'say': one.say,
         'why': decision_reason(one),
         'figure': one.figure._asdict(),
         'confidence': one.confidence,
-        **bound,
     }
+    if one.bound:
+        entry['bound'] = [asdict(bound) for bound in one.bound]
+    return entry
 
 
-def _cause(one: Cause) -> dict[str, Any]:
+def _cause(one: Cause) -> CauseEntry:
     return {
         'effect': one.effect,
         'form': one.form,
@@ -89,7 +181,7 @@ def _cause(one: Cause) -> dict[str, Any]:
     }
 
 
-def _advice(one: Advice) -> dict[str, Any]:
+def _advice(one: Advice) -> AdviceEntry:
     return {
         'what': advised_action(one),
         'frames': one.frames,
@@ -101,7 +193,7 @@ def _advice(one: Advice) -> dict[str, Any]:
     }
 
 
-def _candidate(one: Finding) -> dict[str, Any]:
+def _candidate(one: Finding) -> CandidateEntry:
     return {
         'effect': one.effect,
         'parameters': one.parameters,
@@ -112,7 +204,7 @@ def _candidate(one: Finding) -> dict[str, Any]:
     }
 
 
-def _step(one: Finding) -> dict[str, Any]:
+def _step(one: Finding) -> StepEntry:
     return {
         'effect': one.form,
         'statistic': one.statistic,

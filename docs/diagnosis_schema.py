@@ -1,0 +1,195 @@
+"""Writes diagnosis.schema.json from the entries and records of a diagnosis.
+
+A test compares.  Run: python docs/diagnosis_schema.py
+Types and keys are those of the code.  reference/diagnosis_meanings.json tells what each key
+means, by its path or, for all of a name, by *.name; what lacks a meaning or its key is an error.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import is_dataclass
+from enum import Enum
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NotRequired,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
+
+DOCS = Path(__file__).resolve().parent
+sys.path.insert(0, str(DOCS.parent))
+
+from fisheye_svp_ros.diagnosis import FileFigure  # noqa: E402
+from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame  # noqa: E402
+from fisheye_svp_ros.diagnosis.evaluation import FitQuality, Intrinsic  # noqa: E402
+from fisheye_svp_ros.diagnosis.variance_budget import Component, Structure  # noqa: E402
+from fisheye_svp_ros.diagnosis.written_lens import AveragedShift  # noqa: E402
+from fisheye_svp_ros.reporting.diagnosis_document import (  # noqa: E402
+    AdviceEntry,
+    CandidateEntry,
+    CauseEntry,
+    DecisionEntry,
+    StepEntry,
+)
+
+SCHEMA = DOCS / 'reference' / 'diagnosis.schema.json'
+MEANINGS = DOCS / 'reference' / 'diagnosis_meanings.json'
+Verdict = Literal['adequate', 'explained', 'partly_explained', 'unexplained']
+Fields = dict[str, Any]
+
+
+class Optional(Fields):
+    """Keys of an object that may be absent."""
+
+
+FIELDS: Fields = {
+    'verdict': Verdict,
+    'noise_px': float,
+    'frames': int,
+    'observations': int,
+    'base': FitQuality,
+    'components': list[Component],
+    'causes': list[CauseEntry],
+    'named': FitQuality,
+    'lens': {
+        'rms_px': float,
+        'heldout_rms_px': float,
+        'ray_error_mrad': dict,
+        'averaged_shift': NotRequired[list[AveragedShift]],
+        'image_field': NotRequired[dict],
+    },
+    'extended': FitQuality,
+    'file': FileFigure,
+    'candidates': list[CandidateEntry],
+    'decision': dict[str, DecisionEntry],
+    'adequacy': [
+        {
+            'flaw': str,
+            'size': float,
+            'beside': float,
+            'frames': list[list[int]],
+            'photographs': list[list[str]],
+            'camera': str,
+            'why': str,
+            'do': str,
+        }
+    ],
+    'reached_deg': float,
+    'photographs': list[dict],
+    'gross': list[dict],
+    'advice': list[AdviceEntry],
+    'remaining': {'structure': list[Structure]},
+    'untestable': [{'effect': str, 'why': str}],
+    'gain': {'value': float, 'low': float, 'high': float},
+    'intrinsics': dict[str, Intrinsic],
+    'uncertainty': dict,
+    'trace': list[StepEntry],
+    'external': NotRequired[dict],
+    'turned': list[TurnedFrame],
+    'hand_eye': Optional(
+        camera_in_flange=NotRequired[dict],
+        target_in_base=NotRequired[dict],
+        camera_in_base=NotRequired[dict],
+        target_in_flange=NotRequired[dict],
+        odds=NotRequired[float],
+        scale=float,
+        covariance=list,
+        noise_m=float,
+        noise_rad=float,
+        frames=int,
+    ),
+    'known_truth': NotRequired[dict],
+    'next': NotRequired[list],
+}
+_NAMES: dict[Any, str] = {float: 'number', int: 'integer', str: 'string', bool: 'boolean'}
+
+
+def schema() -> dict[str, Any]:
+    """Return the JSON Schema of diagnosis.json."""
+    meanings = json.loads(MEANINGS.read_text(encoding='utf-8'))
+    used: set[str] = set()
+    root = {
+        '$schema': 'https://json-schema.org/draft/2020-12/schema',
+        'title': 'diagnosis.json',
+        'description': meanings[''],
+        **_record(FIELDS, '', meanings, used),
+    }
+    if stale := set(meanings) - used - {''}:
+        raise KeyError(f'{MEANINGS.name}: no such keys: {", ".join(sorted(stale))}')
+    return root
+
+
+def _record(fields: Fields, path: str, meanings: Mapping[str, str], used: set[str]) -> Fields:
+    """Return the schema of an object with some keys."""
+    properties, required = {}, []
+    for name, kind in fields.items():
+        where = f'{path}.{name}'.lstrip('.')
+        known = where if where in meanings else f'*.{name}'
+        used.add(known)
+        properties[name] = {
+            **_node(kind, where, meanings, used),
+            'description': meanings[known],
+        }
+        if not _may_be_absent(kind):
+            required.append(name)
+    return {'type': 'object', 'required': required, 'properties': properties}
+
+
+def _may_be_absent(kind: Any) -> bool:
+    """Whether a key is left out where there is nothing to say."""
+    if get_origin(kind) is NotRequired or isinstance(kind, Optional):
+        return True
+    return get_origin(kind) in (Union, UnionType) and NoneType in get_args(kind)
+
+
+def _node(kind: Any, path: str, meanings: Mapping[str, str], used: set[str]) -> dict[str, Any]:
+    """Return the schema of a type; a number that is not known is null."""
+    origin, inside = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return _node(inside[1], path, meanings, used)
+    if origin is NotRequired:
+        return _node(inside[0], path, meanings, used)
+    if origin is Literal:
+        return {'enum': list(inside)}
+    if origin in (Union, UnionType):
+        node = _node(inside[0], path, meanings, used)
+        kinds = node['type'] if isinstance(node['type'], list) else [node['type']]
+        return {**node, 'type': [*dict.fromkeys([*kinds, 'null'])]}
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return {'enum': [member.value for member in kind]}
+    if isinstance(kind, dict):
+        return _record(kind, path, meanings, used)
+    if isinstance(kind, list):
+        return {'type': 'array', 'items': _record(kind[0], path, meanings, used)}
+    if origin is tuple:
+        return {'type': 'array', 'items': _node(inside[0], path, meanings, used)}
+    if origin in (list, Sequence):
+        return {'type': 'array', 'items': _node(inside[0], path, meanings, used)}
+    if origin is dict:
+        item = _node(inside[1], f'{path}.NAME', meanings, used)
+        return {'type': 'object', 'additionalProperties': item}
+    if is_typeddict(kind) or is_dataclass(kind) or hasattr(kind, '_fields'):
+        fields = get_type_hints(kind, include_extras=True)
+        return _record(fields, path, meanings, used)
+    if kind is float:
+        return {'type': ['number', 'null']}
+    return {'type': {dict: 'object', list: 'array', **_NAMES}[kind]}
+
+
+def text() -> str:
+    """Return the file."""
+    return json.dumps(schema(), indent=2, ensure_ascii=False) + '\n'
+
+
+if __name__ == '__main__':
+    SCHEMA.write_text(text(), encoding='utf-8')
