@@ -171,7 +171,16 @@ def _tags(image: Grey, pattern: Pattern, border: int) -> tuple[Index, Array]:
 
     border: cells around their code.
     """
-    dictionary, modern = dictionary_of(pattern), hasattr(_ARUCO, 'ArucoDetector')
+    return _detect(image, dictionary_of(pattern), border)
+
+
+def detect_markers(image: Grey, name: int, border: int) -> tuple[Index, Array]:
+    """Return ids (T,) and corners (T, 4, 2), px, of tags of one of OpenCV's dictionaries."""
+    return _detect(image, _ARUCO.getPredefinedDictionary(name), border)
+
+
+def _detect(image: Grey, dictionary: Any, border: int) -> tuple[Index, Array]:
+    modern = hasattr(_ARUCO, 'ArucoDetector')
     parameters = (_ARUCO.DetectorParameters if modern else _ARUCO.DetectorParameters_create)()
     parameters.markerBorderBits = border
     if modern:

@@ -1,6 +1,8 @@
-"""What is to be said of poses."""
+"""What is to be said of poses, and of maps of tags."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 
 def second_pose_note(frames: str, count: int) -> str:
@@ -17,3 +19,13 @@ def rig_reason(outliers: int, contradicted: bool) -> str:
     points = f'{outliers} outliers rejected' if outliers else ''
     rig = 'the relative poses of the cameras differ; calibrate the rig again'
     return '; '.join(filter(None, (points, rig if contradicted else '')))
+
+
+def missing_tags_note(ids: Sequence[int]) -> str:
+    """Say which tags a map lacks."""
+    names = ', '.join(map(str, ids))
+    one = 'tag is' if len(ids) == 1 else 'tags are'
+    return (
+        f'{len(ids)} {one} not in the map ({names}): no image shows them together with a mapped '
+        'tag; add such images'
+    )

@@ -1,0 +1,84 @@
+"""Loose tags in images: AprilTags 36h11 by id, wherever they hang."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.detect.finders import Grey, detect_markers
+from fisheye_svp_ros.detect.photographs import Photograph
+from fisheye_svp_ros.detect.points import eight_bit
+from fisheye_svp_ros.errors import ObservationError, ParameterError
+
+# libapriltag goes round a tag from its lower left, against the clock; OpenCV's print of a tag is
+# that of libapriltag turned by half.
+_ORDER = [1, 0, 3, 2]
+_WINDOW_SHARE, _MIN_WINDOW, _MAX_WINDOW = 0.06, 2, 8  # of a side; px around a corner
+_MIN_SIDE = 12.0  # px; the corners of a smaller tag run into its code
+_SPEC = re.compile(r'tags:(?:36h11:)?([0-9.]+) *(mm|cm|m)', re.IGNORECASE)
+_UNITS = {'mm': 1e-3, 'cm': 1e-2, 'm': 1.0}
+
+
+class TagViews(NamedTuple):
+    """Tags in F images: frames by name; rows (R,): which image, which id; uv (R, 4, 2), px."""
+
+    names: tuple[str, ...]
+    image: Index
+    ids: Index
+    uv: Array
+    size: tuple[int, int]
+
+
+def tag_size(spec: str) -> float:
+    """Return the side of loose tags, m, from `tags:36h11:160mm`; raise ParameterError."""
+    match = _SPEC.fullmatch(spec)
+    size = float(match[1]) * _UNITS[match[2].lower()] if match else 0.0
+    if not 0 < size < 10:
+        raise ParameterError(
+            f'board {spec!r}: loose tags are given as tags:36h11:160mm (side of the black square)'
+        )
+    return size
+
+
+def find_tags(image: Grey) -> tuple[Index, Array]:
+    """Return ids (T,) and corners (T, 4, 2), px, of the tags in a grey image, each id once."""
+    ids, corners = detect_markers(image, cv2.aruco.DICT_APRILTAG_36h11, 1)
+    side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).min(axis=1)
+    once = np.array([(ids == one).sum() == 1 for one in ids], dtype=bool)
+    keep = once & (side > _MIN_SIDE)
+    ids, corners, side = ids[keep], corners[keep][:, _ORDER], side[keep]
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
+    refined = corners.copy()
+    for i, length in enumerate(side):
+        half = int(np.clip(_WINDOW_SHARE * length, _MIN_WINDOW, _MAX_WINDOW))
+        start = corners[i].astype(np.float32).reshape(-1, 1, 2)
+        found = cv2.cornerSubPix(image, start, (half, half), (-1, -1), criteria)
+        refined[i] = found.reshape(-1, 2)
+    return ids, refined
+
+
+def find_tag_views(photographs: Iterable[Photograph]) -> TagViews:
+    """Search photographs for loose tags; raise ObservationError where none shows any."""
+    names, image, ids, uv, size = list[str](), list[int](), list[Index](), list[Array](), (0, 0)
+    for number, photograph in enumerate(photographs):
+        pixels = eight_bit(photograph.pixels())
+        size = pixels.shape[1], pixels.shape[0]
+        found, corners = find_tags(pixels)
+        names.append(photograph.name)
+        image += [number] * len(found)
+        ids.append(found)
+        uv.append(corners)
+    if not image:
+        raise ObservationError(f'no tag 36h11 in {len(names)} images; check family and sharpness')
+    return TagViews(
+        tuple(names),
+        np.array(image, dtype=np.int64),
+        np.concatenate(ids),
+        np.concatenate(uv),
+        size,
+    )

@@ -1,0 +1,137 @@
+"""Maps of tags: YAML with the id, size and pose of each; bundles of apriltag_ros are read, too.
+
+A tag's frame is that of apriltag_ros: the middle of the tag, x right, y up, z out of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.files import dump_yaml, read_yaml, write_text
+from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_quaternion
+from fisheye_svp_ros.scene.observations import Landmarks
+
+CORNERS = 4  # of a tag, landmark CORNERS * id + corner: from its lower left, against the clock
+CENTER_OFFSET = 100_000_000  # landmark of the middle of a tag, before its id
+_MAX_ID = 1_000_000
+_MAX_SIZE = 10.0  # m; a larger tag is a slip of the unit
+_PLACES = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
+
+
+class TagMap(NamedTuple):
+    """Tags (T,): id, side, m, pose in the frame of the map."""
+
+    ids: Index
+    sizes: Array
+    poses: Pose
+
+    @property
+    def corners(self) -> Array:
+        """The corners (T, CORNERS, 3), m."""
+        local = self.sizes[:, None, None] * _PLACES
+        turned = local @ np.swapaxes(self.poses.rotation, -1, -2)
+        return np.asarray(turned + self.poses.position[:, None])
+
+    def landmarks(self) -> Landmarks:
+        """Return corners and middles as landmarks."""
+        ids = (CORNERS * self.ids[:, None] + np.arange(CORNERS)).ravel()
+        points = self.corners.reshape(-1, 3)
+        return Landmarks(
+            np.concatenate([ids, CENTER_OFFSET + self.ids]),
+            np.concatenate([points, self.poses.position]),
+        )
+
+
+def map_of_size(ids: Index, size: float, poses: Pose) -> TagMap:
+    """Return a map of tags (T,) of one size, m."""
+    return TagMap(ids, np.full(len(ids), size), poses)
+
+
+def read_tag_map(path: str | Path) -> TagMap:
+    """Read a map of tags, or the bundles and standalone tags of a tags.yaml of apriltag_ros.
+
+    Raises ObservationError, naming file, tag and field.
+    """
+    document = read_yaml(path, ObservationError)
+    bundles = document.get('tag_bundles')
+    if isinstance(bundles, list):
+        entries = [
+            _from_bundle(one)
+            for bundle in bundles
+            if isinstance(bundle, Mapping)
+            for one in bundle.get('layout') or ()
+        ]
+    else:
+        entries = document.get('tags') or []
+    if not isinstance(entries, list) or not entries:
+        raise ObservationError(
+            f'{path}: it holds no tags; a list `tags` with id, size and pose, or tag_bundles of '
+            'apriltag_ros, is needed'
+        )
+    tags = [_read_tag(entry, f'{path}: tag {number}') for number, entry in enumerate(entries)]
+    ids = np.array([one[0] for one in tags], dtype=np.int64)
+    if len(np.unique(ids)) < len(ids):
+        twice = next(one for one in ids.tolist() if (ids == one).sum() > 1)
+        raise ObservationError(f'{path}: tag id {twice} is listed twice; remove one')
+    return TagMap(ids, np.array([one[1] for one in tags]), Pose.stack([one[2] for one in tags]))
+
+
+def write_tag_map(
+    tags: TagMap, path: str | Path, stderr: Array | None = None, about: str = ''
+) -> None:
+    """Write a map of tags; stderr (T,): of positions, m; about: a line of comment."""
+    entries = [
+        {
+            'id': int(tags.ids[i]),
+            'size': float(tags.sizes[i]),
+            'pose': {
+                'position': tags.poses.position[i].tolist(),
+                'quaternion': quaternion_from_rotation(tags.poses.rotation[i]).tolist(),
+            },
+            **({} if stderr is None else {'stderr_m': float(stderr[i])}),
+        }
+        for i in range(len(tags.ids))
+    ]
+    head = f'# {about}\n' if about else ''
+    write_text(path, head + dump_yaml({'tags': entries}))
+
+
+def _from_bundle(entry: Any) -> Any:
+    """Return a tag of a bundle, which has its pose as seven numbers, as one of a map."""
+    if not isinstance(entry, Mapping):
+        return entry
+    pose = {
+        'position': [entry.get(key, 0.0) for key in ('x', 'y', 'z')],
+        'quaternion': [entry.get(key, float(key == 'qw')) for key in ('qx', 'qy', 'qz', 'qw')],
+    }
+    return {'id': entry.get('id'), 'size': entry.get('size'), 'pose': pose}
+
+
+def _read_tag(entry: Any, where: str) -> tuple[int, float, Pose]:
+    if not isinstance(entry, Mapping):
+        raise ObservationError(f'{where} is {entry!r:.40}; id, size and pose are needed')
+    number, size, pose = (entry.get(key) for key in ('id', 'size', 'pose'))
+    if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < _MAX_ID:
+        raise ObservationError(f'{where}: id is {number!r:.40}; a whole number is needed')
+    where = f'{where} (id {number})'
+    if isinstance(size, bool) or not isinstance(size, int | float) or not 0 < size <= _MAX_SIZE:
+        raise ObservationError(
+            f'{where}: size is {size!r:.40}; meters above 0 and up to {_MAX_SIZE:g} are needed'
+        )
+    try:
+        position = np.array(dict(pose or {})['position'], dtype=np.float64)
+        quaternion = np.array(dict(pose or {})['quaternion'], dtype=np.float64)
+    except (TypeError, KeyError, ValueError) as cause:
+        raise ObservationError(f'{where}: pose needs position and quaternion') from cause
+    sound = position.shape == (3,) and quaternion.shape == (4,)
+    if not sound or not np.isfinite([*position, *quaternion]).all() or not quaternion.any():
+        raise ObservationError(
+            f'{where}: pose needs a position of 3 numbers, m, and a quaternion x, y, z, w'
+        )
+    return number, float(size), Pose(rotation_from_quaternion(quaternion), position)

@@ -1,0 +1,227 @@
+"""Tags and cameras together: a map of tags from images of a walk, the lens being known.
+
+Starts from the tag that most images show: images that show mapped tags are localized, and of a
+further tag, which alone has two poses in an image, the one is taken that all images agree on.
+Then one bundle adjustment of all poses with weights that fade for outliers (Cauchy).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.pose import Pose, cross_matrix, identity
+from fisheye_svp_ros.scene.observations import Views, views_of
+from fisheye_svp_ros.solve.localization import localize
+
+_CORNERS = 4
+_MAX_ITERATIONS, _TOLERANCE = 40, 1e-9
+_CAUCHY_PX = 1.5  # px of residual at which a corner's weight falls to half
+_OUTLIER_PX = 1e3  # px, in place of what is out of sight
+_MAX_CANDIDATES = 40  # poses of a new tag that are compared
+
+
+class TagMapping(NamedTuple):
+    """Tags (T,): id, pose in the frame of the first, standard error of position, m.
+
+    images (F,): numbers of those that could be posed; cameras (F,); rms_px over inlying corners;
+    missing: ids of tags that no image ties to the others.
+    """
+
+    ids: Index
+    poses: Pose
+    stderr: Array
+    images: Index
+    cameras: Pose
+    rms_px: float
+    missing: tuple[int, ...]
+
+
+class _Scene(NamedTuple):
+    """Corners uv (F, T, 4, 2), px, NaN = unseen, of tags whose corners are local (T, 4, 3), m."""
+
+    uv: Array
+    local: Array
+
+    def views(self, tags: Pose, chosen: Mask, images: Index) -> Views:
+        """Return what some images show of chosen tags (T,), these being where they are."""
+        points = self.local @ np.swapaxes(tags.rotation, -1, -2) + tags.position[:, None]
+        uv = np.where(chosen[:, None, None], self.uv[images], np.nan)
+        return views_of(points.reshape(-1, 3), uv.reshape(len(images), -1, 2))
+
+
+def map_tags(
+    model: ForwardModel,
+    image: Index,
+    ids: Index,
+    uv: Array,
+    size: float,
+    origin: int | None = None,
+) -> TagMapping:
+    """Map tags of one size, m, from corners uv (R, 4, 2), px, by image (R,) and id (R,).
+
+    origin: id of the tag whose frame is that of the map; None: the one that most images show.
+    Raises GeometryError where nothing ties two tags together.
+    """
+    known, slot = np.unique(ids, return_inverse=True)
+    numbers, row = np.unique(image, return_inverse=True)
+    corners = np.full((len(numbers), len(known), _CORNERS, 2), np.nan)
+    corners[row, slot] = uv
+    square = size / 2 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    scene = _Scene(corners, np.tile(square, (len(known), 1, 1)))
+    first = int(np.argmax(np.bincount(slot)))
+    if origin is not None:
+        if origin not in known:
+            raise GeometryError(f'no image shows tag {origin}; name another origin')
+        first = int(np.flatnonzero(known == origin)[0])
+    tags, mapped, cameras, posed = _grow_map(model, scene, first)
+    if mapped.sum() < 2:
+        raise GeometryError(
+            f'no image shows tag {known[first]} together with another; take images of two or more'
+        )
+    images = np.flatnonzero(posed)
+    kept = np.flatnonzero(mapped)
+    scene = _Scene(scene.uv[images][:, kept], scene.local[kept])
+    anchor = int(np.flatnonzero(kept == first)[0])
+    tags, cameras, stderr, rms = _adjust(
+        model, scene, tags.take(kept), cameras.take(images), anchor
+    )
+    return TagMapping(
+        known[kept],
+        tags,
+        stderr,
+        numbers[images],
+        cameras,
+        rms,
+        tuple(known[~mapped].tolist()),
+    )
+
+
+def _grow_map(model: ForwardModel, scene: _Scene, first: int) -> tuple[Pose, Mask, Pose, Mask]:
+    """Return tags (T,) and which are mapped, cameras (F,) and which are posed: a start."""
+    frames, count = scene.uv.shape[:2]
+    seen = np.isfinite(scene.uv[..., 0, 0])
+    tags, cameras = identity(count), identity(frames)
+    mapped, posed = np.zeros(count, dtype=bool), np.zeros(frames, dtype=bool)
+    mapped[first] = True
+    while True:
+        posed = np.asarray((seen & mapped).any(axis=1))
+        images = np.flatnonzero(posed)
+        found = localize(model, scene.views(tags, mapped, images))
+        # Of one tag alone a pose may be its mirror image: two tags, or none, tell.
+        sure = found.converged & (((seen[images] & mapped).sum(axis=1) > 1) | (found.gap > 20.0))
+        if mapped.sum() == 1:
+            sure = found.converged
+        posed[images] = sure
+        cameras.put(images, found.pose)
+        shared = np.where(mapped, 0, (seen & posed[:, None]).sum(axis=0))
+        if not shared.any():
+            return tags, mapped, cameras, posed
+        new = int(np.argmax(shared))
+        alternatives = found if mapped.sum() == 1 else None
+        start = _place_tag(model, scene, new, cameras, np.flatnonzero(posed & seen[:, new]))
+        if alternatives is not None:
+            other = Pose(cameras.rotation.copy(), cameras.position.copy())
+            other.put(images, alternatives.other)
+            second = _place_tag(model, scene, new, other, np.flatnonzero(posed & seen[:, new]))
+            start = min(start, second, key=lambda one: one[1])
+        tags.put([new], start[0].take(None))
+        mapped[new] = True
+
+
+def _place_tag(
+    model: ForwardModel, scene: _Scene, tag: int, cameras: Pose, images: Index
+) -> tuple[Pose, float]:
+    """Return the pose of a tag that images with known cameras agree on, and their misfit, px."""
+    views = views_of(scene.local[tag], scene.uv[images, tag])
+    alone = localize(model, views)
+    here = cameras.take(images)
+    candidates = Pose.concatenate(
+        [here.compose(one.inverse()) for one in (alone.pose, alone.other)]
+    )
+    finite = np.isfinite(candidates.position).all(axis=1)
+    step = max(1, int(finite.sum()) // _MAX_CANDIDATES)
+    best, least = candidates.take(0), np.inf
+    for number in np.flatnonzero(finite)[::step]:
+        one = candidates.take(number)
+        points = scene.local[tag] @ one.rotation.T + one.position
+        off = model.predict(here, views_of(np.tile(points, (len(images), 1, 1)))).uv - views.uv
+        length = np.nan_to_num(np.linalg.norm(off, axis=-1), nan=_OUTLIER_PX)
+        misfit = float(np.minimum(length, _OUTLIER_PX).mean())
+        if misfit < least:
+            best, least = one, misfit
+    return best, least
+
+
+def _adjust(
+    model: ForwardModel, scene: _Scene, tags: Pose, cameras: Pose, anchor: int
+) -> tuple[Pose, Pose, Array, float]:
+    """Adjust all poses but that of the anchor; return them, standard errors (T,), rms, px."""
+    frames, count = scene.uv.shape[:2]
+    free = np.delete(
+        np.arange(6 * (frames + count)), slice(6 * (frames + anchor), 6 * (frames + anchor + 1))
+    )
+    damping, (residual, jacobian) = 1e-4, _linearize(model, scene, tags, cameras)
+    cost = _cost(residual)
+    for _ in range(_MAX_ITERATIONS):
+        weight = 1 / (1 + (residual / _CAUCHY_PX) ** 2)
+        columns = jacobian[:, free]
+        weighted = columns * weight[:, None]
+        hessian, gradient = weighted.T @ columns, weighted.T @ residual
+        damped = hessian + damping * np.diag(np.diag(hessian)) + 1e-12 * np.eye(len(hessian))
+        step = np.zeros(6 * (frames + count))
+        step[free] = -np.linalg.solve(damped, gradient)
+        moves = step.reshape(-1, 6)
+        trial = Pose(*tags.retract(moves[frames:])), Pose(*cameras.retract(moves[:frames]))
+        fresh = _linearize(model, scene, *trial)
+        lower = _cost(fresh[0])
+        if lower <= cost:
+            done = cost - lower <= _TOLERANCE * cost
+            (tags, cameras), (residual, jacobian), cost = trial, fresh, lower
+            damping = max(damping / 5, 1e-12)
+            if done:
+                break
+        else:
+            damping *= 8
+    weight = 1 / (1 + (residual / _CAUCHY_PX) ** 2)
+    columns = jacobian[:, free]
+    variance = float((weight * residual**2).sum()) / max(len(residual) - len(free), 1)
+    covariance = variance * np.linalg.pinv((columns * weight[:, None]).T @ columns)
+    variances = np.zeros(6 * (frames + count))
+    variances[free] = np.diag(covariance)
+    stderr = np.sqrt(variances.reshape(-1, 6)[frames:, :3].max(axis=1))
+    inlying = np.abs(residual) < 5 * _CAUCHY_PX
+    rms = float(np.sqrt(2 * (residual[inlying] ** 2).mean()))
+    return tags, cameras, stderr, rms
+
+
+def _cost(residual: Array) -> float:
+    return float(_CAUCHY_PX**2 * np.log1p((residual / _CAUCHY_PX) ** 2).sum())
+
+
+def _linearize(
+    model: ForwardModel, scene: _Scene, tags: Pose, cameras: Pose
+) -> tuple[Array, Array]:
+    """Return residuals (M,), px, and their derivatives (M, 6 (F + T)) by cameras, then tags."""
+    frames, count = scene.uv.shape[:2]
+    views = scene.views(tags, np.ones(count, dtype=bool), np.arange(frames))
+    linear = model.linearise(cameras, views)
+    by_camera = model.d_pose(linear, views)
+    used = views.used & np.isfinite(linear.uv).all(axis=-1)
+    frame, point = np.nonzero(used)
+    by_camera = by_camera[frame, point]
+    tag = point // _CORNERS
+    arm = views.points[frame, point] - tags.position[tag]
+    # A point moves the image as the camera moves it the other way.
+    by_point = -by_camera[:, :, :3]
+    by_tag = np.concatenate([by_point, -by_point @ cross_matrix(arm)], axis=-1)
+    jacobian = np.zeros((len(frame), 2, frames + count, 6))
+    rows = np.arange(len(frame))
+    jacobian[rows, :, frame] = by_camera
+    jacobian[rows, :, frames + tag] = by_tag
+    residual = linear.uv[frame, point] - views.uv[frame, point]
+    return residual.ravel(), jacobian.reshape(2 * len(frame), -1)

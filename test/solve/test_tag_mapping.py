@@ -1,0 +1,79 @@
+"""Tags and cameras are solved together from the corners of tags alone."""
+
+import numpy as np
+import pytest
+
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.io.tag_maps import map_of_size
+from fisheye_svp_ros.optics.curves import KannalaBrandt
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.scene.observations import views_of
+from fisheye_svp_ros.solve.tag_mapping import map_tags
+
+KB = KannalaBrandt(0.03, -0.01, 0.002, -0.0005)
+MODEL = ForwardModel(Lens('made', 1280, 960, 330.0, 331.0, 640.5, 479.5, KB, 1.5))
+SIZE = 0.2
+
+
+def walk(noise, tags=6, frames=25, seed=0):
+    """Return image, id and corners of tags on a wall and a slanted one, and their true map."""
+    rng = np.random.default_rng(seed)
+    place = np.column_stack(
+        [0.7 * np.arange(tags) - 1.5, rng.uniform(-0.4, 0.4, tags), 0.3 * rng.normal(size=tags)]
+    )
+    turn = rotation_from_vector(0.3 * rng.normal(size=(tags, 3)))
+    true = map_of_size(10 + np.arange(tags), SIZE, Pose(turn, place))
+    position = np.column_stack([np.linspace(-1.5, 1.5, frames), rng.normal(0, 0.3, (frames, 1))])
+    position = np.column_stack([position, rng.uniform(1.2, 2.0, frames)])
+    facing = np.diag([1.0, -1.0, -1.0]) @ rotation_from_vector(0.2 * rng.normal(size=(frames, 3)))
+    points = np.tile(true.corners.reshape(-1, 3), (frames, 1, 1))
+    uv = MODEL.predict(Pose(facing, position), views_of(points)).uv
+    uv = uv + rng.normal(0, noise, uv.shape)
+    near = np.abs(position[:, None, 0] - place[None, :, 0]) < 1.0
+    image, slot = np.nonzero(near)
+    corners = uv.reshape(frames, tags, 4, 2)[image, slot]
+    return image, true.ids[slot], corners, true
+
+
+def map_errors(found, true):
+    """Return how far off each tag is, m, in the frame of the origin."""
+    origin = true.poses.take(np.flatnonzero(true.ids == 10)[0])
+    count = len(found.ids)
+    expected = origin.inverse().broadcast_to(count).compose(true.poses)
+    return np.linalg.norm(found.poses.position - expected.position, axis=1)
+
+
+def test_a_walk_gives_the_map():
+    image, ids, corners, true = walk(0.0)
+    found = map_tags(MODEL, image, ids, corners, SIZE, origin=10)
+    assert found.ids.tolist() == true.ids.tolist() and not found.missing
+    assert map_errors(found, true).max() < 1e-6 and found.rms_px < 1e-5
+
+
+def test_standard_errors_are_those_of_the_map():
+    image, ids, corners, true = walk(0.2)
+    found = map_tags(MODEL, image, ids, corners, SIZE, origin=10)
+    off = map_errors(found, true)
+    assert found.stderr[0] == 0 and (found.stderr[1:] > 0).all()
+    assert (off[1:] < 4 * found.stderr[1:]).all() and off.max() < 0.05
+    assert 0.15 < found.rms_px < 0.4
+
+
+def test_wrong_corners_cost_little():
+    image, ids, corners, true = walk(0.1)
+    corners[7] += [40.0, -25.0]
+    found = map_tags(MODEL, image, ids, corners, SIZE, origin=10)
+    assert map_errors(found, true).max() < 0.03
+
+
+def test_tags_that_nothing_ties_are_named():
+    image, ids, corners, _ = walk(0.0)
+    image = np.append(image, 100)
+    ids, corners = np.append(ids, 99), np.concatenate([corners, corners[:1]])
+    assert map_tags(MODEL, image, ids, corners, SIZE).missing == (99,)
+    with pytest.raises(GeometryError, match='together with another'):
+        map_tags(MODEL, image, ids, corners, SIZE, origin=99)
+    with pytest.raises(GeometryError, match='no image shows tag 5'):
+        map_tags(MODEL, image, ids, corners, SIZE, origin=5)
