@@ -6,7 +6,7 @@ covariance goes into an extended Kalman filter with the formulas of robot_locali
 twist, the pose as absolute measurement).  The truth then says how large errors are, and whether
 covariances are: the normalized squared error (NEES) of a pose has the mean of its dimension.
 
-python examples/where_is_my_robot.py out [--images 60]
+    python examples/where_is_my_robot.py [DIR] [--images 60]
 """
 
 from __future__ import annotations
@@ -24,10 +24,9 @@ from fisheye_svp_ros.effects.forward import ForwardModel, back_project, project
 from fisheye_svp_ros.io.files import write_json
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.tag_maps import TagMap, write_tag_map
-from fisheye_svp_ros.nodes.base_pose import carried_pose
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.pose import Pose, carried_pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.solve.tag_mapping import map_tags
 from fisheye_svp_ros.study.solutions import localize_sets
@@ -260,8 +259,8 @@ def draw(
 def main() -> None:
     """Drive, map, localize, filter; print and write what came of it."""
     parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
-    parser.add_argument('output', type=Path)
-    parser.add_argument('--images', type=int, default=60)
+    parser.add_argument('output', type=Path, nargs='?', default=Path('robot'))
+    parser.add_argument('--images', type=int, default=24)
     args = parser.parse_args()
     tags, base = room_tags(), drive(args.images)
     images = photographs(tags, base, args.output / 'walk')

@@ -215,3 +215,15 @@ def axis_angle_between(a: Pose, b: Pose) -> Array:
     cross = np.linalg.norm(np.cross(first, second), axis=-1)
     angle: Array = np.arctan2(cross, np.sum(first * second, axis=-1))
     return angle
+
+
+def carried_pose(pose: Pose, covariance: Array, mount: Pose) -> tuple[Pose, Array]:
+    """Return the pose of a frame that stands at `mount` in a body, and its covariance (6, 6).
+
+    Of the change in `Pose.retract`: a turn of the body about its origin moves the frame along
+    (the adjoint of SE(3), both changes in the axes of the world).
+    """
+    carried = pose.compose(mount)
+    adjoint = np.eye(6)
+    adjoint[:3, 3:] = -cross_matrix(carried.position - pose.position)
+    return carried, np.asarray(adjoint @ covariance @ adjoint.T)

@@ -23,6 +23,7 @@ EXAMPLES = ROOT / 'examples'
 SCRIPTS = {
     'svp_error_by_range': ('range [m]', ['svp_error_by_range.png']),
     'diagnose_observations': ('viewpoint_shift: p = ', ['extended.yaml']),
+    'where_is_my_robot': ('tags_mapped: 12', ['robot']),
     'stereo_depth_error': ('full lens: baseline 150.0', []),
 }
 NODE_SCRIPTS = {'publish_image_points', 'compose_nodes'}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections import deque
 
-import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.serialization import deserialize_message
 
@@ -17,7 +16,7 @@ from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.frame_tree import FrameTree
 from fisheye_svp_ros.nodes.quality import TRANSFORMS
 from fisheye_svp_ros.nodes.transforms import Transforms, message_class
-from fisheye_svp_ros.pose import Pose, cross_matrix
+from fisheye_svp_ros.pose import Pose, carried_pose
 from fisheye_svp_ros.study.settings import RobotSettings
 
 _MAX_WAITING = 30  # poses that wait for odometry of their time
@@ -96,15 +95,3 @@ class BasePose:
                 self._waiting.append((base, stamp, world))
             else:
                 self._transforms.publish(base.compose(there.inverse()), stamp, world, self._odom)
-
-
-def carried_pose(pose: Pose, covariance: Array, mount: Pose) -> tuple[Pose, Array]:
-    """Return the pose of a frame that stands at `mount` in a body, and its covariance (6, 6).
-
-    Of the change in `Pose.retract`: a turn of the body about its origin moves the frame along
-    (the adjoint of SE(3), both changes in the axes of the world).
-    """
-    carried = pose.compose(mount)
-    adjoint = np.eye(6)
-    adjoint[:3, 3:] = -cross_matrix(carried.position - pose.position)
-    return carried, np.asarray(adjoint @ covariance @ adjoint.T)

@@ -270,6 +270,10 @@ class LatchedLandmarks:
         if not self._is_series:
             self._read(unread)
 
+    def hold(self, landmarks: LandmarkSet) -> None:
+        """Take landmarks for all sets."""
+        self._latest = landmarks
+
     def _read(self, unread: Unread) -> None:
         try:
             self._latest = latest = unread.read()

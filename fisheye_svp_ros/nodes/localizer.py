@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,9 +13,11 @@ from visualization_msgs.msg import MarkerArray
 
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io import decoding
+from fisheye_svp_ros.io.tag_maps import read_tag_map
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base_pose import BasePose
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
+from fisheye_svp_ros.nodes.detections import detections_reader
 from fisheye_svp_ros.nodes.lenses import lens_of
 from fisheye_svp_ros.nodes.messages import camera_shape
 from fisheye_svp_ros.nodes.quality import LATCHED
@@ -62,6 +66,23 @@ class Localizer(SolverNode):
         self._misfits = 0  # sets up to the one before that fit badly, without outliers found
         self._errors: LensErrors | None = None  # of the latest lens
         self.start()
+
+    def collect_image_points(self, topic: str) -> None:
+        """Listen to the image points, or with a map of tags to detections of these."""
+        settings = self.settings
+        if not settings.tag_map:
+            super().collect_image_points(topic)
+            return
+        tags = read_tag_map(settings.tag_map)
+        self.hold_landmarks(decoding.LandmarkSet(tags.landmarks(), settings.map_frame))
+        kind, read = detections_reader(settings.detections)
+        use = functools.partial(self._add, topic)
+        self.collect(kind, topic, read, use, name='detections')
+
+    def needed_inputs(self) -> Sequence[Sequence[str]]:
+        """Return the topics without which nothing can be solved."""
+        needed = super().needed_inputs()
+        return [one for one in needed if not self.settings.tag_map or 'landmarks' not in one]
 
     def prepare(self, settings: Any) -> Any:
         """Refuse a lens that cannot be loaded, or does not know its errors where they count."""

@@ -129,7 +129,7 @@ class SolverNode(ManagedNode):
             self._collect(PoseStamped, topic, read_framed_pose)
         # Last, because a camera that sees this subscription counts on the others.
         for topic in self._image_points:
-            self._collect(PointCloud2, topic, self._read_image_points)
+            self.collect_image_points(topic)
         self.start_timer(0.1, self._work)
 
     def start(self) -> None:
@@ -137,6 +137,15 @@ class SolverNode(ManagedNode):
         # Last, because a recorder that sees this topic counts on having seen the others.
         self._result = self.announce(DiagnosticArray, '~/result', wait=True)
         super().start()
+
+    def collect_image_points(self, topic: str) -> None:
+        """Listen to the image points of a camera."""
+        self._collect(PointCloud2, topic, self._read_image_points)
+
+    def hold_landmarks(self, landmarks: LandmarkSet) -> None:
+        """Take landmarks for all sets, in place of a topic."""
+        self._latched_landmarks.hold(landmarks)
+        self._join.expect_no_more('landmarks')
 
     @property
     def cameras(self) -> tuple[str, ...]:

@@ -189,6 +189,21 @@ class LocalizerSettings(RobotSettings):
         fixed=True,
         frame=True,
     )
+    tag_map: str = parameter(
+        '',
+        'Map of tags (`fisheye-svp map`, or tags.yaml of apriltag_ros): tags on the topic '
+        '`detections` then stand for `image_points`, the map for `landmarks`. Empty: neither',
+        file=True,
+        fixed=True,
+    )
+    detections: str = parameter(
+        'apriltag_msgs',
+        'Type of `detections`: AprilTagDetectionArray (four corners a tag, in raw images), or '
+        'Detection2DArray of vision_msgs (the middle of a tag)',
+        choices=('apriltag_msgs', 'vision_msgs'),
+        fixed=True,
+    )
+    map_frame: str = parameter('map', 'Frame id of the tag map', fixed=True, frame=True)
     model_error: bool = parameter(
         False,
         'Include the errors of the lens in the covariance of the pose, besides `sigma_px`; '

@@ -77,10 +77,13 @@ def run(block: str, tmp_path: Path) -> None:
     """Run a block of a page in a folder; fail where it fails."""
     tools = tmp_path / 'bin'
     tools.mkdir()
+    (tmp_path / 'examples').symlink_to(ROOT / 'examples')
     for name, module in (('fisheye-svp', 'fisheye_svp_ros.cli'), ('dask', 'dask')):
         script = tools / name
         script.write_text(f'#!/bin/sh\nexec {sys.executable} -m {module} "$@"\n')
         script.chmod(0o755)
+    (tools / 'python3').write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    (tools / 'python3').chmod(0o755)
     env = os.environ | {
         'PATH': f'{tools}{os.pathsep}{os.environ["PATH"]}',
         'PYTHONPATH': os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')]),
