@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +22,31 @@ def read_sweep(path: Path) -> Plan:
     """Return the sweep of a parameter file; raise ParameterError, naming it, for any fault."""
     try:
         given = read_parameter_file(path)
+        space = namespace_of(given)
         for pattern, values in given.items():
-            _check_names(pattern, values)
-        plan = plan_sweep({node: parameters_of(f'/{node}', given) for node in TABLES})
+            _check_names(pattern, values, space)
+        plan = plan_sweep({node: parameters_of(f'{space}/{node}', given) for node in TABLES})
         # A pattern such as /** means those that there are; a name means that node.
-        for sentence in idle_solvers(plan, [node for node in TABLES if f'/{node}' in given]):
+        named = [node for node in TABLES if f'{space}/{node}' in given]
+        for sentence in idle_solvers(plan, named):
             say(f'{path}: {sentence}')
         return plan
     except FisheyeSvpError as error:
         text = ' '.join(str(error).split())
         raise ParameterError(text if str(path) in text else f'{path}: {text}') from error
+
+
+def namespace_of(given: Iterable[str]) -> str:
+    """Return the namespace of the nodes that a parameter file names; '' for none.
+
+    Raises ParameterError for several.
+    """
+    places = [name.rpartition('/') for name in given if '*' not in name]
+    spaces = {space for space, _, node in places if node in TABLES}
+    if len(spaces) > 1:
+        names = ', '.join(sorted(space or '/' for space in spaces))
+        raise ParameterError(f'nodes of the namespaces {names}; a sweep has those of one')
+    return spaces.pop() if spaces else ''
 
 
 def lens_folder(plan: Plan) -> str:
@@ -45,9 +60,9 @@ def lens_folder(plan: Plan) -> str:
     return os.path.commonpath(folders) if folders else ''
 
 
-def _check_names(pattern: str, values: Mapping[str, Any]) -> None:
+def _check_names(pattern: str, values: Mapping[str, Any], space: str) -> None:
     """Refuse what means nothing to any node; the nodes themselves would only warn."""
-    nodes = [node for node in TABLES if parameters_of(f'/{node}', {pattern: values})]
+    nodes = [node for node in TABLES if parameters_of(f'{space}/{node}', {pattern: values})]
     if values and not nodes:
         raise ParameterError(f'{pattern} is not a node of a sweep; known are {", ".join(TABLES)}')
     known = {row.name for node in nodes for row in rows(TABLES[node])}
@@ -135,9 +150,9 @@ def record_sweep(
 
     with Processes(logs) as processes:
         processes.start('recorder', ['record', '-o', str(bag)])
-        start_in_step(
-            processes, 'camera', solvers, ['--params-file', str(path)], folder=lens_folder(plan)
-        )
+        space = namespace_of(read_parameter_file(path))
+        common = ['--params-file', str(path), *(['-r', f'__ns:={space}'] if space else [])]
+        start_in_step(processes, 'camera', solvers, common, folder=lens_folder(plan))
         processes.wait(['camera'], math.inf, look)
         processes.stop('recorder')
         for node in solvers:

@@ -81,7 +81,7 @@ def _print(bag: str, columns: Columns) -> None:
             '',
             list(block),
             zip(*block.values(), strict=True),
-            words=[name for name in block if name.endswith('.note')],
+            words=[name for name in block if name.endswith(('.note', '.warning'))],
         )
 
 

@@ -16,6 +16,7 @@ import yaml
 
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import LARGEST_YAML, compose_yaml, read_text
+from fisheye_svp_ros.io.share import expand_path
 
 SWEEP = 'sweep.'
 
@@ -110,13 +111,21 @@ def rows(table: Any) -> list[Row]:
 def with_values(table: S, values: Mapping[str, Any]) -> S:
     """Return the table with some values changed; names that are no row are ignored.
 
+    Paths of files may begin with package://, file:// or ~.
     Raises ParameterError for a value that is not allowed.
     """
     given = {
-        row.name: row.check(values[row.name]) if row.name in values else getattr(table, row.name)
+        row.name: _checked(row, values[row.name])
+        if row.name in values
+        else getattr(table, row.name)
         for row in rows(table)
     }
     return type(table)(**given)
+
+
+def _checked(row: Row, value: Any) -> Any:
+    checked = row.check(value)
+    return expand_path(checked) if row.file and isinstance(checked, str) else checked
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ Residuals come with their scenarios, landmarks and image points are joined by st
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -34,6 +35,9 @@ Columns = dict[str, list[Any]]
 _CLOUD = 'sensor_msgs/msg/PointCloud2'
 _IMAGES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 _NAMES = ('landmarks', 'image_points')
+_FRAME = re.compile(r'^frame \d+ ')
+_NUMBER = re.compile(r'\d[\d.]*(e[-+]?\d+)?(?<!\.)')
+_LIST = re.compile(r'# \(# px\)(, # \(# px\))*|#(, #)+(, \.\.\.)?')
 
 
 class ResidualSet(NamedTuple):
@@ -66,9 +70,10 @@ def tabulate(records: Iterable[Any]) -> Columns:
         if name == 'scenario':
             tags[base, stamp] = values
         else:
-            note = '; '.join(status.text for status in told)
-            bad = any(status.level for status in told)
-            results.append((base, stamp, {**values, **({'note': note} if bad else {})}))
+            text = '; '.join(status.text for status in told)
+            if any(status.level for status in told):
+                values |= _warning(text) if values else {'note': note_of_set(text)}
+            results.append((base, stamp, values))
     bases = {base for base, _ in tags}
     rows = {key: dict(values) for key, values in tags.items()}
     for node, stamp, values in results:
@@ -82,6 +87,21 @@ def tabulate(records: Iterable[Any]) -> Columns:
         row = rows.setdefault((base, stamp), {})
         row.update({f'{prefix}.{key}': value for key, value in values.items()})
     return _columns(rows)
+
+
+def note_of_set(reason: str) -> str:
+    """Return why a set has no solution, the same for every set that lacks one for that reason."""
+    return _FRAME.sub('the set ', reason)
+
+
+def _warning(text: str) -> dict[str, str]:
+    """Return why a solution should not be relied on: in few distinct words, and its first number.
+
+    The number is a factor on sigma, or the first landmark that was left out.
+    """
+    number = _NUMBER.search(text)
+    words = _LIST.sub('#', _NUMBER.sub('#', text))
+    return {'warning': words, **({'warning_number': number[0]} if number else {})}
 
 
 def _columns(rows: Mapping[tuple[str, int], Mapping[str, str]]) -> Columns:

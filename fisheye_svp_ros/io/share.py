@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from urllib.parse import unquote
 
 from fisheye_svp_ros.errors import FisheyeSvpError, LensError, ParameterError
+
+_PACKAGE = 'fisheye_svp_ros'
 
 
 @cache
@@ -24,6 +27,33 @@ def config_path(name: str) -> Path:
     return share_directory() / 'config' / name
 
 
+def expand_path(name: str) -> str:
+    """Return a path that begins with package://PACKAGE/, file:// or ~ as one of this machine.
+
+    Raises ParameterError for a package that is not here; anything else is returned as it is.
+    """
+    if name.startswith('file://'):
+        return unquote(name.removeprefix('file://'))
+    if name.startswith('~'):
+        try:
+            return str(Path(name).expanduser())
+        except RuntimeError as cause:
+            raise ParameterError(f'{name!r}: {cause}') from cause
+    if not name.startswith('package://'):
+        return name
+    package, _, path = unquote(name.removeprefix('package://')).partition('/')
+    if package == _PACKAGE:
+        return str(share_directory() / path)
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        return str(Path(get_package_share_directory(package)) / path)
+    except (ImportError, LookupError, ValueError) as cause:
+        raise ParameterError(
+            f'{name!r}: package {package!r} is not found; source its workspace, or give a path'
+        ) from cause
+
+
 def lens_path(name: str) -> Path:
     """Return a lens file as given, or by its name in config/; raise LensError for neither."""
     return _given_or_named(name, 'lenses', LensError)
@@ -34,6 +64,7 @@ def typed_lens_path(name: str) -> Path:
 
     A lens of this package comes before a folder of its name.
     """
+    name = expand_path(name)
     try:
         return lens_path(name)
     except LensError:

@@ -15,6 +15,7 @@ from rclpy.node import Node
 
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io.parameters import rows, with_values
+from fisheye_svp_ros.io.share import expand_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.complaints import Complaints
 from fisheye_svp_ros.nodes.declaration import (
@@ -111,6 +112,19 @@ class BaseNode(Node):  # type: ignore[misc]
 
     def configure(self, prepared: Any) -> None:
         """Take new settings into use; nothing in it may fail."""
+
+    def set_parameters_atomically(self, parameter_list: list[Any]) -> Any:
+        """Set all parameters or none; say of one that is fixed how to change it."""
+        result = super().set_parameters_atomically(parameter_list)
+        if not result.successful and 'read-only' in result.reason:
+            result.reason = (
+                f'{result.reason} It is read at the start: restart the node with -p NAME:=VALUE'
+            )
+        return result
+
+    def set_parameters(self, parameter_list: list[Any]) -> list[Any]:
+        """Set parameters one by one."""
+        return [self.set_parameters_atomically([one]) for one in parameter_list]
 
     def guard_callback(self, callback: Callable[..., T]) -> Callable[..., T | None]:
         """Return a callback that what goes wrong in it does not get out of.
@@ -256,7 +270,8 @@ class BaseNode(Node):  # type: ignore[misc]
                 return SetParametersResult(successful=True)  # of ROS itself, such as a QoS
             for row in rows(self.SETTINGS):
                 if row.file and isinstance(values.get(row.name), str):
-                    check_access(values[row.name], self.settings.folder, row.name)
+                    path = expand_path(values[row.name])
+                    check_access(path, self.settings.folder, row.name)
             settings = with_values(self.settings, values)
             self._candidate = settings, self.prepare(settings)
         except FisheyeSvpError as error:

@@ -345,6 +345,7 @@ def test_what_is_fixed_at_the_start_cannot_be_changed_by_others(
     for name, value in (('output', '/tmp/yours.yaml'), ('folder', '/'), ('stereo', True)):
         result = set_parameter(node, name, value)
         assert not result.successful and 'read-only' in result.reason
+        assert 'restart the node with -p NAME:=VALUE' in result.reason
     assert node.settings.output == f'{tmp_path}/mine.yaml'
 
 

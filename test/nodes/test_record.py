@@ -86,6 +86,32 @@ def test_results_without_scenarios_and_of_two_nodes_are_rows_as_well(tmp_path: P
     assert columns['localizer.rms_px'] == [None, None, 1.0]
 
 
+def test_why_a_set_has_no_solution_and_what_is_doubtful_are_columns_apart(tmp_path: Path) -> None:
+    texts = {
+        1: 'frame 1 has 3 usable points in it; 4 are needed',
+        2: 'frame 2 has 3 usable points in it; 4 are needed',
+        3: 'the residuals are 5.25 times what sigma allows (60 degrees of freedom)',
+        4: 'the residuals are 7 times what sigma allows (58 degrees of freedom)',
+        5: 'outliers rejected: landmarks 3 (5.2 px), 5 (2 px)',
+    }
+    with BagWriter(tmp_path / 'bag') as bag:
+        for stamp, text in texts.items():
+            values = {'rms_px': 1.0} if stamp > 2 else {}
+            message = messages.key_values_message('n', values, stamp, text, b'\x01')
+            bag.write('/localizer/result', DIAGNOSTICS, serialize_message(message))
+    columns = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
+    assert columns['localizer.note'] == [
+        *['the set has 3 usable points in it; 4 are needed'] * 2,
+        *[None] * 3,
+    ]
+    assert columns['localizer.warning'] == [
+        *[None] * 2,
+        *['the residuals are # times what sigma allows (# degrees of freedom)'] * 2,
+        'outliers rejected: landmarks #',
+    ]
+    assert columns['localizer.warning_number'] == [None, None, 5.25, 7.0, 3.0]
+
+
 def test_a_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -615,3 +615,19 @@ def test_a_damaged_part_is_named(tmp_path: Path) -> None:
         (tmp_path / 'parts' / '000000001.json').write_text(damaged)
         with pytest.raises(OutputError, match=r'000000001.json: a part of the table is damaged'):
             parts.join(tmp_path / 'whole')
+
+
+def test_nodes_of_one_namespace_are_those_of_the_sweep(tmp_path: Path) -> None:
+    path = tmp_path / 'robot.yaml'
+    text = (
+        '/robot/synthetic_camera: {ros__parameters: {sweep.radius: [1.0, 2.0], noise_px: 0.2}}\n'
+        '/robot/localizer: {ros__parameters: {sigma_px: 0.2}}\n'
+        '/**: {ros__parameters: {baseline: 0.3}}\n'
+    )
+    path.write_text(text)
+    plan = read_sweep(path)
+    assert plan.base.noise_px == plan.solvers['localizer'].sigma_px == 0.2
+    assert plan.base.baseline == 0.3 and len(plan.sweep) == 2
+    path.write_text(text.replace('/robot/localizer', '/other/localizer'))
+    with pytest.raises(ParameterError, match='nodes of the namespaces /other, /robot'):
+        read_sweep(path)
