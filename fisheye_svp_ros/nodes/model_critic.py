@@ -70,7 +70,9 @@ class ModelCriticSettings(RigSettings):
         100, 'Largest number of frames to diagnose: the latest', span=(5, 100_000)
     )
     output: str = parameter(
-        'extended_lens.yaml', 'File that the service write_extended_lens writes', fixed=True
+        'extended_lens.yaml',
+        'File that the services save and write_extended_lens write',
+        fixed=True,
     )
 
 
@@ -115,9 +117,12 @@ class ModelCritic(SolverNode):
         self._judged = False
         self._running: _Running | None = None
         self._verdict: Diagnosis | None = None
-        self.create_service(
-            Trigger, '~/write_extended_lens', self.guard_callback(self._write_extended_lens)
-        )
+        for name, answer in (
+            ('~/write_extended_lens', self._write_extended_lens),
+            ('~/save', self._write_extended_lens),
+            ('~/reset', self._reset),
+        ):
+            self.create_service(Trigger, name, self.guard_callback(answer))
         self.start_timer(0.2, self._tick)
         self.start()
 
@@ -168,6 +173,13 @@ class ModelCritic(SolverNode):
         self._frames[stamp] = seen
         for old in list(self._frames)[: -self.settings.max_frames]:
             del self._frames[old]
+
+    def _reset(self, _: Any, response: Any) -> Any:
+        """Forget all frames and the verdict: the next frame is the first."""
+        response.success, response.message = True, f'{len(self._frames)} frames forgotten'
+        self._frames, self._new, self._repeated = {}, 0, 0
+        self._restart()
+        return response
 
     def _restart(self) -> None:
         self._question += 1

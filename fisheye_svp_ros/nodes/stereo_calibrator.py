@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from geometry_msgs.msg import TransformStamped, Vector3Stamped
+from std_srvs.srv import Trigger
 
+from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io import decoding
+from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.set_collection import CollectedSet, make_set, scenario_of, table_of
@@ -37,7 +42,27 @@ class StereoCalibrator(SolverNode):
         self._transforms = Transforms(self, self.settings.publish_tf, static=True)
         self._scenario: frozenset[tuple[str, str]] = frozenset()
         self._window: list[CollectedSet] = []
+        self._found: SetSolutions[StereoCalibration] | None = None  # the latest
+        for name, answer in (('~/save', self._save), ('~/reset', self._reset)):
+            self.create_service(Trigger, name, self.guard_callback(answer))
         self.start()
+
+    def prepare(self, settings: Any) -> Any:
+        """Refuse a file that is none."""
+        if Path(settings.output).is_dir():
+            raise ParameterError(f'output is {settings.output!r}, a folder; name a file')
+        return super().prepare(settings)
+
+    def report(self) -> tuple[Mapping[str, object], str]:
+        """Return how far the calibration is, too."""
+        counts, trouble = super().report()
+        progress: dict[str, object] = {
+            'calibration: views': len(self._window),
+            'calibration: views missing': self.settings.views - len(self._window),
+        }
+        if self._found is not None:
+            progress['calibration: rms_px'] = float(self._found.metrics['rms_px'][0])
+        return {**counts, **progress}, trouble
 
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Calibrate with one more set; raise GeometryError where the views fix no rig."""
@@ -55,8 +80,31 @@ class StereoCalibrator(SolverNode):
             self.settings.gate
         )
         # Only now: a set that cannot be used must not spoil those to come.
-        self._window, self._scenario = window, scenario
+        self._window, self._scenario, self._found = window, scenario, found
         self._publish(stamp, items, found)
+
+    def _save(self, _: Any, response: Any) -> Any:
+        """Write the latest rig to `output`."""
+        path = Path(self.settings.output).absolute()
+        try:
+            if self._found is None:
+                raise ObservationError('no rig yet: no set has been solved')
+            save_rig(self._found.solution.rig.take(0), path)
+        except FisheyeSvpError as error:
+            response.success, response.message = False, str(error)
+            return response
+        missing = self.settings.views - len(self._window)
+        response.success = True
+        response.message = f'{path}: {len(self._window)} views' + (
+            f', {missing} fewer than the parameter views' if missing else ''
+        )
+        return response
+
+    def _reset(self, _: Any, response: Any) -> Any:
+        """Forget all views: the next set is the first."""
+        response.success, response.message = True, f'{len(self._window)} views forgotten'
+        self._window, self._found = [], None
+        return response
 
     def _publish(self, stamp: int, items: Items, found: SetSolutions[StereoCalibration]) -> None:
         rig, true = found.solution.rig.take(0), true_rig(items)

@@ -13,6 +13,7 @@ from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.quality import LATCHED, TRANSFORMS
 from fisheye_svp_ros.pose import Pose
 
+_MIN_CHANGE = 1e-6  # m, and of a quaternion, of a static transform
 _MAX_SENT = 100  # transforms by which those that come back may be late
 
 
@@ -24,7 +25,7 @@ class Transforms:
     """
 
     def __init__(self, node: BaseNode, wanted: bool, static: bool = False) -> None:
-        self._node = node
+        self._node, self._static = node, static
         self._publisher = None
         self._sent: deque[Any] = deque(maxlen=_MAX_SENT)
         self._children: set[str] = set()
@@ -48,9 +49,20 @@ class Transforms:
             self._node.warn(f'no transform: frame_id {frame!r} cannot be the parent of {child!r}')
             return
         transform = messages.transform_message(pose, stamp, frame, child)
+        if self._static and not self._has_changed(transform):
+            return
         self._sent.append(transform)
         self._children.add(child)
         self._publisher.publish(self._kind(transforms=[transform]))
+
+    def _has_changed(self, transform: Any) -> bool:
+        """Say whether a transform is another than the latest of its child: by 1e-6 m or so."""
+        child = transform.child_frame_id
+        last = next((one for one in reversed(self._sent) if one.child_frame_id == child), None)
+        if last is None or last.header.frame_id != transform.header.frame_id:
+            return True
+        before, after = (_numbers(one.transform) for one in (last, transform))
+        return any(abs(a - b) > _MIN_CHANGE for a, b in zip(before, after, strict=True))
 
     def _compare(self, data: bytes) -> None:
         """Warn of what others tell of the frames of this node."""
@@ -64,6 +76,11 @@ class Transforms:
                     f'{transform.header.frame_id!r}; set another camera_frame in one of them, or '
                     'publish_tf:=false'
                 )
+
+
+def _numbers(transform: Any) -> list[float]:
+    place, turn = transform.translation, transform.rotation
+    return [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]
 
 
 def message_class(parameter: str) -> Any:

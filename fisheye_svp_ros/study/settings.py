@@ -228,6 +228,7 @@ class StereoCalibratorSettings(GateSettings, RigSettings):
         'are no more',
         span=(1, 1000),
     )
+    output: str = parameter('rig.yaml', 'File that the service save writes', fixed=True)
 
 
 @dataclass(frozen=True)
