@@ -26,7 +26,7 @@ SCRIPTS = {
     'where_is_my_robot': ('tags_mapped: 12', ['robot']),
     'stereo_depth_error': ('full lens: baseline 150.0', []),
 }
-NODE_SCRIPTS = {'publish_image_points', 'compose_nodes'}
+NODE_SCRIPTS = {'publish_image_points', 'compose_nodes', 'localizer_launch_test'}
 NOTEBOOKS = ('viewpoint_shift', 'diagnosis', 'paper_result', 'real_data')
 
 

@@ -6,11 +6,12 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from helpers.nodes import ROOT, TIMEOUT, NodeProcess
+from helpers.nodes import ROOT, TIMEOUT, NodeProcess, hears_sigint
 
 pytest.importorskip('launch_ros')
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
@@ -386,3 +387,15 @@ def test_a_camera_is_localized_with_its_camera_info(
         assert 0.0 < float(metrics['rms_px']) < 3.0 and float(metrics['points']) == 30
     finally:
         camera.finish(signal.SIGINT)
+
+
+def test_the_example_of_a_launch_test_passes(ros_domain: int) -> None:
+    pytest.importorskip('launch_testing')
+    example = ROOT / 'examples' / 'localizer_launch_test.py'
+    done = subprocess.run(
+        [sys.executable, '-m', 'launch_testing.launch_test', str(example)],
+        capture_output=True,
+        text=True,
+        preexec_fn=hears_sigint,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
