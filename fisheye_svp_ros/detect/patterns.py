@@ -20,6 +20,7 @@ _UNITS = {'mm': 1e-3, 'cm': 1e-2, 'm': 1.0}
 _LENGTH = re.compile(r'([0-9.]+(?:e-?[0-9]+)?) *(mm|cm|m)', re.IGNORECASE)
 _SIZE = re.compile(r'([0-9]{1,9})x([0-9]{1,9})', re.IGNORECASE)
 _MAX_POINTS = 10_000  # points
+LOOSE_TAGS = 'tags'  # the kind of tags that hang where a map says
 _APRILTAGS = 'DICT_APRILTAG_36H11'
 # Markers of OpenCV's dictionaries, whose names are as good in capitals
 _MARKERS = {

@@ -18,7 +18,7 @@ from fisheye_svp_ros.detect.finders import (
     Grey,
     explain_failure,
 )
-from fisheye_svp_ros.detect.patterns import Found, Pattern, local_axes
+from fisheye_svp_ros.detect.patterns import LOOSE_TAGS, Found, Pattern, local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.detect.tag_grids import GridReading
 from fisheye_svp_ros.detect.windows import halve_image
@@ -139,6 +139,10 @@ def _measure(
 def search(task: tuple[Pixels, Pattern, str, Array | None]) -> Points | str | Exception:
     """Do what `find_points` does for its arguments; return what it raises."""
     try:
+        if task[1].kind == LOOSE_TAGS:
+            from fisheye_svp_ros.detect.tags import find_tag_points  # which needs this module
+
+            return find_tag_points(task[0])
         return find_points(*task)
     except Exception as error:
         return error

@@ -11,9 +11,12 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.finders import Grey, detect_markers
-from fisheye_svp_ros.detect.photographs import Photograph
-from fisheye_svp_ros.detect.points import eight_bit
+from fisheye_svp_ros.detect.patterns import LOOSE_TAGS, Pattern
+from fisheye_svp_ros.detect.photographs import Photograph, Pixels
+from fisheye_svp_ros.detect.points import Points, eight_bit
 from fisheye_svp_ros.errors import ObservationError, ParameterError
+from fisheye_svp_ros.io.tag_maps import CORNERS
+from fisheye_svp_ros.scene.observations import Landmarks
 
 # libapriltag goes round a tag from its lower left, against the clock; OpenCV's print of a tag is
 # that of libapriltag turned by half.
@@ -60,6 +63,24 @@ def find_tags(image: Grey) -> tuple[Index, Array]:
         found = cv2.cornerSubPix(image, start, (half, half), (-1, -1), criteria)
         refined[i] = found.reshape(-1, 2)
     return ids, refined
+
+
+def tag_pattern(spec: str, landmarks: Landmarks) -> Pattern:
+    """Return what a detector looks for where loose tags hang as a map says."""
+    count = len(landmarks.ids)
+    none = np.zeros((count, 2))
+    return Pattern(LOOSE_TAGS, spec, 0, 0, landmarks.points, 0.0, none, none[:, 0], 0.0)
+
+
+def find_tag_points(pixels: Pixels) -> Points | str:
+    """Return the corners of loose tags as points, or why there are none."""
+    ids, corners = find_tags(eight_bit(pixels))
+    if not len(ids):
+        return 'no tag found'
+    side = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=-1)
+    numbers = (CORNERS * ids[:, None] + np.arange(CORNERS)).ravel()
+    unknown = np.full(len(numbers), np.nan)
+    return Points(numbers, corners.reshape(-1, 2), unknown, np.nan, np.repeat(side / 8, CORNERS))
 
 
 def find_tag_views(photographs: Iterable[Photograph]) -> TagViews:

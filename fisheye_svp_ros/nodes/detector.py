@@ -14,12 +14,14 @@ from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.finders import default_detector
-from fisheye_svp_ros.detect.patterns import Pattern, check_of_board, parse_pattern
+from fisheye_svp_ros.detect.patterns import LOOSE_TAGS, Pattern, check_of_board, parse_pattern
 from fisheye_svp_ros.detect.photographs import Pixels, message_pixels
 from fisheye_svp_ros.detect.points import Points, search
+from fisheye_svp_ros.detect.tags import tag_pattern
 from fisheye_svp_ros.detect.workers import BoundedCalls, TimedOut
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.parameters import parameter
+from fisheye_svp_ros.io.tag_maps import read_tag_map
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.camera_info import (
@@ -52,7 +54,8 @@ class DetectorSettings(Settings):
     board: str = parameter(
         'chessboard:9x6:25mm',
         'The board: chessboard:COLUMNSxROWS:SIZE (inner corners), '
-        'charuco:..., aprilgrid:FILE, circles:..., squares:..., as for `fisheye-svp detect`',
+        'charuco:..., aprilgrid:FILE, circles:..., squares:..., as for `fisheye-svp detect`; '
+        'tags:FILE: loose tags of a tag map, whose corners are the landmarks',
     )
     board_frame: str = parameter('board', 'Frame id of the landmarks', frame=True)
     longest_search: float = parameter(
@@ -180,6 +183,12 @@ class Detector(BaseNode):
             raise ParameterError('board cannot be changed while the guide runs')
         if settings.near >= settings.far:
             raise ParameterError('near must be below far')
+        if kind == LOOSE_TAGS:
+            if settings.guide:
+                raise ParameterError('guide needs a board; it cannot be used with loose tags')
+            if settings is not self.settings:
+                check_access(file, self.settings.folder, 'board')
+            return tag_pattern(settings.board, read_tag_map(file).landmarks())
         return parse_pattern(settings.board)
 
     def configure(self, pattern: Pattern) -> None:
@@ -187,6 +196,8 @@ class Detector(BaseNode):
         self._pattern, self._near, self._size = pattern, None, None
         self._failures_at_first = 0
         board = Landmarks(np.arange(len(pattern.points)), pattern.points)
+        if pattern.kind == LOOSE_TAGS:
+            board = read_tag_map(pattern.spec.partition(':')[2]).landmarks()
         self._landmarks.publish(messages.landmarks_message(board, 0, self.settings.board_frame))
 
     def report(self) -> tuple[dict[str, object], str]:
@@ -223,6 +234,8 @@ class Detector(BaseNode):
 
     @property
     def _detector(self) -> str:
+        if self._pattern.kind == LOOSE_TAGS:
+            return ''
         name = default_detector(self._pattern)
         return _LIVE_DETECTORS.get(name, name)
 
