@@ -105,9 +105,12 @@ class Advice:
 
 
 def advise(
-    evaluation: Evaluation, causes: Sequence[Cause], parts: Sequence[Component]
+    evaluation: Evaluation, causes: Sequence[Cause], parts: Sequence[Component], held_back: bool
 ) -> list[Advice]:
-    """Return what to do, what brings most first; parts: the random components that are there."""
+    """Return what to do, what brings most first; parts: the random components that are there.
+
+    held_back: whether a large effect is; no frame is to be taken again for what it leaves.
+    """
     selection, gains = evaluation.selection, evaluation.gains
     advice = _use_causes(evaluation, causes)
     if any(part.stage == 'target' for part in parts):
@@ -116,7 +119,7 @@ def advise(
         advice += _support_boards(evaluation)
     if evaluation.offsets.views is not None:
         advice.append(Advice(Action.VARY_VIEWS, value=evaluation.offsets.views.lasting))
-    advice += _retake_frames(evaluation)
+    advice += [] if held_back else _retake_frames(evaluation)
     advice += _check_photographs(
         selection.null.linear.data.observations, selection.revision.outliers
     )

@@ -205,9 +205,8 @@ class Evaluation:
         state = valid_state(state, test.data, self.null.linear.data, test.another_target)
         if offsets is not None and test.another_target:
             offsets = offsets.of_image
-        return predict_other_data(
-            test.data, replace(state, pose=test.pose, rig=selection.state.rig), offsets
-        )
+        # Each model with its own rig: that of another one counts as an error of its lenses.
+        return predict_other_data(test.data, replace(state, pose=test.pose), offsets)
 
     @cached_property
     def counted_frames(self) -> Mask:

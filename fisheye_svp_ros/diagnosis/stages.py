@@ -179,10 +179,9 @@ def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
     observations = evaluated.evaluation.selection.problem.inputs.observations
     inputs, views = replace(inputs, observations=observations), evaluated.turned
     # Beside a large effect that is held back, offsets of landmarks are no sign of another order.
-    held_back = any(one.reason is Reason.IMPLAUSIBLE for one in evaluated.candidates)
     turned = (
         []
-        if inputs.poses is not None or held_back
+        if inputs.poses is not None or _holds_back(evaluated.candidates)
         else find_turned_frames(evaluated.evaluation.null, evaluated.evaluation.fitted)
     )
     if any(one.corrected for one, _ in turned):
@@ -249,7 +248,7 @@ def _conclude(
             replace(one, averaged=likeliest) if one.effect == 'viewpoint_shift' else one
             for one in candidates
         ]
-    advice = advise(evaluation, causes, significant)
+    advice = advise(evaluation, causes, significant, _holds_back(candidates))
     conclusion = conclude(
         evaluation,
         causes,
@@ -396,6 +395,11 @@ def find_confounder(
             if not tests.held_out_gain(beside, columns, effect).sufficient:
                 return Reason.NO_GAIN_BESIDE_RIVAL, rival
     return None, None
+
+
+def _holds_back(candidates: Sequence[Finding]) -> bool:
+    """Say whether an effect is held back for its size: frames scatter by what it leaves."""
+    return any(one.reason is Reason.IMPLAUSIBLE for one in candidates)
 
 
 def _is_implausible(effect: Effect, values: Array) -> bool:

@@ -567,5 +567,8 @@ def test_photographs_of_before_are_told(
     ]
     assert cli.main([*command, '2']) == cli.main([*command, '2']) == 0
     assert capsys.readouterr().err == ''
-    assert cli.main([*command, '1']) == 0
+    assert cli.main([*command, '1']) == 2  # its corners would be written over those of two
+    assert 'observations.csv: another file is there' in capsys.readouterr().err
+    shutil.copy(tmp_path / 'out' / '000.png', tmp_path / 'out' / 'mine.png')
+    assert cli.main([*command, '2']) == 0
     assert 'out: 1 other photographs are in it too' in capsys.readouterr().err

@@ -1,10 +1,12 @@
-"""While a large effect is held back, no frame is put into another order."""
+"""While a large effect is held back, no frame is renumbered, and none is to be taken again."""
 
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 
-from fisheye_svp_ros.diagnosis import stages
+from fisheye_svp_ros.diagnosis import conclusion, stages
+from fisheye_svp_ros.diagnosis.conclusion import Action, Advice
 from fisheye_svp_ros.diagnosis.findings import Reason
 
 
@@ -28,3 +30,15 @@ def test_no_frame_is_renumbered_beside_an_implausible_shift(reason, monkeypatch)
     monkeypatch.setattr(stages, '_conclude', lambda *_: SimpleNamespace(advice=[], record=record))
     stages._run_stages(SimpleNamespace(poses=None), lambda *_: None)
     assert bool(asked) == (reason is not Reason.IMPLAUSIBLE)
+
+
+@pytest.mark.parametrize('held_back', [True, False])
+def test_no_frame_is_taken_again_for_what_a_held_back_effect_leaves(held_back, monkeypatch):
+    again = Advice(Action.RETAKE, frames=[3])
+    monkeypatch.setattr(conclusion, '_retake_frames', lambda _: [again])
+    for name in ('_use_causes', '_check_photographs', '_check_held_out'):
+        monkeypatch.setattr(conclusion, name, lambda *_: [])
+    evaluation = MagicMock(medium=None)
+    evaluation.offsets.views = None
+    advice = conclusion.advise(evaluation, [], [], held_back)
+    assert advice == ([] if held_back else [again])

@@ -32,11 +32,11 @@ from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.reporting.external_text import sections
 from fisheye_svp_ros.reporting.first_screen import first_screen
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
-from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.initial_rig import initial_state, localize_frames
 from fisheye_svp_ros.solve.measured_poses import posable_observations
 from fisheye_svp_ros.solve.outliers import FRAME, find_outliers
 from fisheye_svp_ros.solve.rig_checks import rig_is_inconsistent
-from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame, rms_px
 from fisheye_svp_ros.study.trust import known_errors
 
 pytestmark = pytest.mark.usefixtures('undrawn')
@@ -318,6 +318,15 @@ def test_reversed_frames_among_those_held_out_are_named(longer):
     assert torn_frames(found, 'held out: ') == shared
     assert found.figures.named.heldout_rms_px < 0.16
     assert f'(frames {shared[0]} and {shared[1]})' in verdict_sentences(found)[2]
+
+
+def test_lenses_before_predict_held_out_frames_with_their_own_rig(longer):
+    """With that of the extended lenses they did worse than `localize` with the same files."""
+    train, test = halves(longer)
+    found = diagnose(train, longer.lenses, held_out=test, options=DiagnosisOptions(quick=True))
+    data = found.evaluation.held_out.data
+    posed = Linearization(data, localize_frames(data, found.simulation.state), ())
+    assert found.figures.base.heldout_rms_px == pytest.approx(rms_px(posed), rel=1e-3)
 
 
 def test_held_out_frames_in_which_the_rig_stands_elsewhere_are_posed_view_by_view(longer):

@@ -190,7 +190,9 @@ def test_every_finding_has_a_short_reason(reason: Reason) -> None:
 
 def test_a_finding_names_its_size_and_its_rival() -> None:
     far = Finding('viewpoint_shift', Reason.IMPLAUSIBLE, 0.0, 0.0, parameters=ANGLE)
-    assert finding_reason(far) == 'a shift of 30 mm is larger than in any real lens'
+    assert finding_reason(far) == (
+        'a shift of 30 mm is larger than in any real lens: are lengths in m?'
+    )
     rival = Rival('session_step', 'focal_drift')
     needless = Finding('sensor_tilt', Reason.NEEDLESS_BESIDE_RIVAL, 0.0, 0.0, rival=rival)
     assert finding_reason(needless) == 'not significant if session_step replaces focal_drift'

@@ -40,6 +40,6 @@ def finding_reason(finding: Finding) -> str:
     """Return why, as a clause that begins in lower case and ends without a stop."""
     if finding.reason is Reason.IMPLAUSIBLE:
         size = next(abs(entry['value']) for entry in finding.parameters.values())
-        return f'a shift of {1e3 * size:.0f} mm is larger than in any real lens'
+        return f'a shift of {1e3 * size:.0f} mm is larger than in any real lens: are lengths in m?'
     rival = finding.rival._asdict() if finding.rival else {}
     return _REASONS[finding.reason].format(**rival)
