@@ -51,6 +51,7 @@ from fisheye_svp_ros.diagnosis.written_lens import AveragedModel, WrittenField
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
+from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, is_shared, rms_px
 
 MAX_RMS_RATIO = 1.01  # a rise by less is none: noise that grows with the angle has weights
@@ -227,6 +228,20 @@ class Evaluation:
         return predict_other_data(
             self.held_out.data, replace(self.medium.air.state, pose=self.held_out.pose)
         )
+
+    @cached_property
+    def as_given_px(self) -> float | None:
+        """Rms of held-out frames by the lenses as written, px; only their rig is fitted.
+
+        None without such frames, or where the figure before is that of the lenses as written.
+        """
+        test, problem = self.held_out, self.selection.problem
+        if test is None or self.medium is not None or not self.free:
+            return None
+        data, lenses = problem.data, tuple(problem.inputs.lenses.values())
+        state = adjust(data, initial_state(data, lenses[0], lenses[1:]), ())
+        state = valid_state(state, test.data, data, test.another_target)
+        return predict_other_data(test.data, replace(state, pose=test.pose)).rms
 
     @cached_property
     def _cause_predictions(self) -> list[HeldOut]:

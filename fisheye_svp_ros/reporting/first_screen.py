@@ -211,8 +211,10 @@ def _facts(d: Diagnosis, source: str) -> str:
             for side in ('given', 'extended')
         )
         near = f'; ray error {before:.2g} → {after:.2g} mrad at {asked:g} m'
+    given = d.evaluation.as_given_px
+    of_file = '' if given is None else f'{given:.3g} px as given, with intrinsics refitted '
     return (
-        f'{source}: {d.observations} points in {count_frames(d)}; held-out error '
+        f'{source}: {d.observations} points in {count_frames(d)}; held-out error {of_file}'
         f'{base:.3g} → {named:.3g} px ({extended:.3g} px with local offsets), '
         f'noise {d.noise_px:.2g} px{near}'
     )

@@ -327,6 +327,12 @@ def test_lenses_before_predict_held_out_frames_with_their_own_rig(longer):
     data = found.evaluation.held_out.data
     posed = Linearization(data, localize_frames(data, found.simulation.state), ())
     assert found.figures.base.heldout_rms_px == pytest.approx(rms_px(posed), rel=1e-3)
+    trained, (left, right) = found.simulation.data, longer.lenses.values()
+    written = adjust(trained, initial_state(trained, left, [right]), ())
+    posed = Linearization(data, localize_frames(data, written), ())
+    assert found.evaluation.as_given_px == pytest.approx(rms_px(posed), rel=1e-3)
+    said = f'held-out error {rms_px(posed):.3g} px as given, with intrinsics refitted '
+    assert said in first_screen(found, 'table').facts
 
 
 def test_held_out_frames_in_which_the_rig_stands_elsewhere_are_posed_view_by_view(longer):
