@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -14,12 +15,13 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
 _START = 60.0  # s a process may take to start
+_PARENT_INTERVAL = 1.0  # s
 # bytes; arrays come and go, and memory that glibc gave back would be cleared again, page by page
 _MALLOC_LIMITS = {'MALLOC_MMAP_THRESHOLD_': str(2**25), 'MALLOC_TRIM_THRESHOLD_': str(2**27)}
 # No process of multiprocessing, which would run a caller's script anew from its first line.
 _PROGRAM = (
-    'import sys; sys.path[:] = sys.argv[2:]; '
-    'from fisheye_svp_ros.detect.workers import serve; serve(int(sys.argv[1]))'
+    'import sys; sys.path[:] = sys.argv[3:]; '
+    'from fisheye_svp_ros.detect.workers import serve; serve(*map(int, sys.argv[1:3]))'
 )
 
 
@@ -37,8 +39,9 @@ class _Worker:
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             with theirs:
+                numbers = theirs.fileno(), os.getpid()
                 self.process = subprocess.Popen(
-                    [sys.executable, '-c', _PROGRAM, str(theirs.fileno()), *sys.path],
+                    [sys.executable, '-c', _PROGRAM, *map(str, numbers), *sys.path],
                     env=_MALLOC_LIMITS | os.environ,
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
@@ -148,11 +151,22 @@ class BoundedCalls:
         self._busy = True
 
 
-def serve(number: int) -> None:
-    """Do in this process what comes by the connection with that file number, until it ends."""
+def _end_with(parent: int) -> None:
+    """End this process once its parent is gone: one that was killed bounds no item in time."""
+    while os.getppid() == parent:
+        time.sleep(_PARENT_INTERVAL)
+    os._exit(1)
+
+
+def serve(number: int, parent: int) -> None:
+    """Do in this process what comes by the connection with that file number, until it ends.
+
+    parent: the process that waits for it.
+    """
     import cv2
 
     cv2.setNumThreads(1)  # the processes share the cores
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     pipe = Connection(number)
     try:
         function = pipe.recv()

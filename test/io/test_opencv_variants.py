@@ -145,3 +145,44 @@ def test_what_is_written_says_that_it_is_of_a_fisheye(
     storage = cv2.FileStorage(str(out), cv2.FILE_STORAGE_READ)
     assert storage.getNode('fisheye_model').real() == 1
     check(out)
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        f'camera_matrix: {K.tolist()}\ndist_coeff: [{D.tolist()}]\nimg_size: [1280, 960]\n',
+        f'K:\n- {K[0].tolist()}\n- {K[1].tolist()}\n- {K[2].tolist()}\nD: {D.tolist()}\n'
+        'image_size: [1280, 960]\n',
+        f'{{"K": {K.tolist()}, "D": {D[:, None].tolist()}, "image_size": [1280, 960]}}',
+        f'{{\n "mtx": {K.tolist()},\n "dist": {D.tolist()},\n "width": 1280, "height": 960\n}}',
+    ],
+)
+def test_lists_of_a_script(text: str, tmp_path: Path) -> None:
+    """As `yaml.dump` and `json.dump` of `.tolist()` write them."""
+    (tmp_path / 'camera.txt').write_text(text)
+    check(tmp_path / 'camera.txt')
+
+
+def test_fisheye_by_its_short_name_is_no_assumption(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / 'o.yaml'
+    entries = f'{matrix("K", K)}{matrix("D", D[None])}image_size: [1280, 960]\n'
+    for more, notes in (('', 1), ('fisheye: 1\n', 0)):
+        path.write_text(f'%YAML:1.0\n{entries}{more}')
+        assert cli.main(['lens', str(path)]) == 0
+        assert capsys.readouterr().err.count('4 coefficients') == notes
+
+
+def test_a_baseline_in_millimeters_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / 'stereo.yaml'
+    for size, told in ((0.12, False), (120.0, True)):
+        path.write_text(
+            '%YAML:1.0\nimage_size: [1280, 960]\n'
+            + ''.join(matrix(f'K{i}', K) + matrix(f'D{i}', D[None]) for i in (1, 2))
+            + matrix('R', np.eye(3)) + matrix('T', np.array([[-size], [0.0], [0.0]]))
+        )  # fmt: skip
+        assert cli.main(['lens', str(path)]) == 0
+        assert ('120 m apart; translations must be in m' in capsys.readouterr().err) == told

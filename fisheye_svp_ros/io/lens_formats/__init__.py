@@ -46,6 +46,7 @@ READERS_TO_90_DEG = {
     'colmap': 'COLMAP',
 }
 RIG_WRITABLE = ('kalibr', 'basalt')  # cameras with the transforms between them
+_FAR_CAMERAS = 15.0  # m: between two neighbors; a baseline of 15 mm is the smallest in mm
 _GRID = 100  # image points along each axis
 READABLE = (
     'ROS camera_info, Kalibr, OpenCV, Basalt, mrcal, EuRoC, COLMAP, ORB-SLAM3, CamOdoCal, '
@@ -92,6 +93,14 @@ class Foreign(NamedTuple):
         lenses = {camera: lens for camera, (lens, _) in found.items()}
         return cls(form, lenses, tuple(rigs), {camera: px for camera, (_, px) in found.items()})
 
+    def with_unit_note(self) -> Foreign:
+        """Return it with a note where the cameras stand further apart than those of any rig."""
+        far = max((float(np.linalg.norm(rig.position)) for rig in self.rigs), default=0.0)
+        if far < _FAR_CAMERAS:
+            return self
+        note = f'cameras are {far:.3g} m apart; translations must be in m, not in mm'
+        return self._replace(notes=(*self.notes, note))
+
     def deviation_px(self, lens: Lens) -> float:
         """Return how far a lens of the file is from what the file says, px."""
         return next(
@@ -110,7 +119,7 @@ def read_foreign(path: str | Path, text: str) -> Foreign | None:
         module = import_module(f'{__name__}.{name}')
         if module.recognises(text):
             read: Callable[[str, str], Foreign] = module.read
-            return read(text, str(path))
+            return read(text, str(path)).with_unit_note()
     for name, mark in UNREADABLE_FORMATS.items():
         if re.search(mark, text, re.MULTILINE):
             raise LensError(f'{path}: {name} cannot be read; readable are {READABLE}')

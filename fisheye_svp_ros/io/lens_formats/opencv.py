@@ -1,4 +1,4 @@
-"""OpenCV FileStorage (YAML, XML, JSON): a matrix and coefficients, or two cameras.
+"""OpenCV FileStorage (YAML, XML, JSON), or its arrays as lists: one camera or two.
 
 Those of cv2.fisheye are read as they stand, of cv2.omnidir and cv2.calibrateCamera by a fit.
 
@@ -37,7 +37,19 @@ _ROTATION, _TRANSLATION = ('r', 'rotation', 'rotationmatrix'), ('t', 'translatio
 _WIDTH, _HEIGHT = ('imagewidth', 'imgwidth', 'width'), ('imageheight', 'imgheight', 'height')
 _SIZE = ('imagesize', 'imgsize', 'size', 'framesize', 'resolution')
 _XI, _OF_FISHEYE = 'xi', 4
-_IS_FISHEYE = 'fisheye_model'  # 0 or 1, of OpenCV's own calibration program
+_IS_FISHEYE = ('fisheyemodel', 'fisheye')  # 0 or 1; the first of OpenCV's own program
+# Entries that tell lists of other programs, as words and as single letters
+_LISTS = tuple(
+    re.compile(
+        rf'(?:^|[{{,])[ \t]*["\']?(?:(?i:{words})|{letter})_?(?:[012lrLR]|left|right)?["\']?'
+        r'[ \t]*:',
+        re.MULTILINE,
+    )
+    for words, letter in (
+        ('camera_?matrix|intrinsic_?matrix|mtx', 'K'),
+        ('dist(?:ortion)?(?:_?coeff(?:icient)?s?)?', 'D'),
+    )
+)
 _COUNTS = [shape for n in (4, 5, 8, 12, 14) for shape in ((1, n), (n, 1))]
 _FISHEYE_NOTE = (
     '4 coefficients are read as those of cv2.fisheye; add `fisheye_model: 0` for those of '
@@ -53,6 +65,7 @@ def recognises(text: str) -> bool:
         or '<opencv_storage>' in text
         or '!!opencv-' in text
         or (start.startswith('{') and '"opencv-' in text)
+        or all(entry.search(text) for entry in _LISTS)
     )
 
 
@@ -71,7 +84,7 @@ def read(text: str, where: str) -> Foreign:
     def lens(name: str, side: str) -> tuple[Lens, float]:
         k = _matrix(_value(named, _sided(_MATRIX, side), where), ((3, 3),), where)
         coefficients = _matrix(_value(named, _sided(_COEFFICIENTS, side), where), _COUNTS, where)
-        distortion = _distortion(coefficients, document, where)
+        distortion = _distortion(coefficients, named, where)
         return models.nearest_lens(
             name, _image_size(named, where), (k[0], k[4], k[2], k[5], k[1]), distortion, where
         )
@@ -91,7 +104,7 @@ def read(text: str, where: str) -> Foreign:
         place = _matrix(_value(named, _TRANSLATION, where), ((3, 1), (1, 3)), where)
         rigs = (fields.pose(place, turn, f'{where}: R, T'),)
     given = Foreign.from_lenses('OpenCV', found, rigs)
-    assumed = _XI not in document and _IS_FISHEYE not in document
+    assumed = not {_XI, *_IS_FISHEYE} & {*named}
     return given._replace(notes=(_FISHEYE_NOTE,) * (assumed and _has_four(named)))
 
 
@@ -140,17 +153,17 @@ def _image_size(named: Mapping[str, Any], where: str) -> list[float]:
     return fields.numbers({'size': pair}, 'size', 2, where)
 
 
-def _distortion(d: Sequence[float], document: Mapping[str, Any], where: str) -> models.Distortion:
+def _distortion(d: Sequence[float], named: Mapping[str, Any], where: str) -> models.Distortion:
     """Four coefficients are those of cv2.fisheye, with xi of cv2.omnidir; more, of a pinhole."""
-    if _XI in document:
-        given = document[_XI]
+    if _XI in named:
+        given = named[_XI]
         xi = (
             _matrix(given, ((1, 1),), where)[0]
             if isinstance(given, dict)
-            else (fields.values(document, (_XI,), where)[0])
+            else (fields.values(named, (_XI,), where)[0])
         )
         return models.opencv_distortion(d, models.omnidirectional(xi))
-    if len(d) == _OF_FISHEYE and document.get(_IS_FISHEYE, 1):
+    if len(d) == _OF_FISHEYE and all(named.get(name, 1) for name in _IS_FISHEYE):
         return models.Distortion(models.EQUIDISTANT, d)
     if any(d[len(models.OPENCV) :]):
         raise LensError(
@@ -220,7 +233,7 @@ def write(lens: Lens) -> str:
     storage.write('image_width', near.width)
     storage.write('image_height', near.height)
     storage.write('camera_matrix', models.camera_matrix(near))
-    storage.write(_IS_FISHEYE, 1)
+    storage.write('fisheye_model', 1)
     storage.write('distortion_coefficients', np.array([models.coefficients(near)]))
     text: str = storage.releaseAndGetString()
     return text
