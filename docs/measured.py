@@ -40,11 +40,11 @@ class Claim(NamedTuple):
 
 CLAIMS = (
     Claim(
-        'The extended lens is closer to the truth than a calibration that neglects its causes',
+        'The extended lens is closer to the truth than least squares',
         'ray_coverage',
         r'\| all \| (\d+) \|.*\| (0\.\d+) \|\n',
         'ray error x {1} on {0} simulated cameras (geometric mean)',
-        '`calibrate` alone',
+        '`calibrate --plain`',
         'make study NAME=ray_coverage',
         first=True,
     ),
