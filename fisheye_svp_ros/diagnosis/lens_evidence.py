@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import isclose
+from pathlib import Path
 
 import numpy as np
 
@@ -28,6 +30,7 @@ from fisheye_svp_ros.diagnosis.written_lens import OpenShifts
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.mixed_model import project_out, pseudo_inverse, solve_lower
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.ray_errors import (
     RANGES,
     RayError,
@@ -46,6 +49,7 @@ _FLOOR = 0.1  # of the noise: what an angle may differ by without a reason
 _LINEARITY = 0.05  # of a change: beyond it, its columns are no measure
 _DIRECTIONS = 64  # more than a lens has parameters
 _NEGLIGIBLE = 1e-8  # of a variance
+_SAME_RMS = 1e-3  # relative
 _ROUNDING = 1e-10  # of the variance of an angle: below it, a covariance has no root
 _BOUND_QUANTILE = 0.95
 _NEAR_RANGE = 1  # of ray_errors.RANGES: 1 m
@@ -212,10 +216,28 @@ def find_lens_rays(
             more = _difference(wider, points_on_rays(given, uv[near], wider.ranges))
             errors[name]['given'].append(wider.errors(more)[-1])
             errors[name]['extended'].append(wider.errors()[-1])
+        if _is_of_these_data(evaluation, given):
+            continue  # a fresh calibration is this one
         fitted = _difference(model, points_on_rays(before[name], uv[there]))
         one = _offset(model, (off, off - fitted), given, uv[there], evaluation.noise_px)
         offsets.append(one._replace(camera=name if len(lenses) > 1 else ''))
     return errors, least_likely_offset(offsets)
+
+
+def _is_of_these_data(evaluation: Evaluation, lens: Lens) -> bool:
+    """Whether a lens was calibrated on the table that is diagnosed, by its name and size.
+
+    Generalized least squares keeps away from the fit without causes, and is not off for it.
+    """
+    block, table = lens.calibration or {}, evaluation.selection.problem.observations
+    if block.get('frames') != len(table.frames):
+        return False
+    name = Path(str(block.get('source', ''))).name
+    if name != Path(Observations.source).name:
+        return name == Path(table.source).name
+    # Arrays have no name of their own: least squares leaves the same of the same data.
+    left = block.get('least_squares_rms_px', block.get('rms_px'))
+    return bool(left and isclose(left, evaluation.figures.base.rms_px, rel_tol=_SAME_RMS))
 
 
 def _written_rays(

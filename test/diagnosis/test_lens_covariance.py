@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 from functools import reduce
+from types import SimpleNamespace
 
 import numpy as np
 from helpers.scenes import lens, observe, scene
 
 from benchmark.study import ray_error
-from fisheye_svp_ros.diagnosis import NullModel
+from fisheye_svp_ros.diagnosis import NullModel, lens_evidence
 from fisheye_svp_ros.diagnosis.lens_evidence import _distances
 from fisheye_svp_ros.diagnosis.problem import extended_lenses
 from fisheye_svp_ros.diagnosis.uncertainty import LensCovariance, likely_models, total_errors
@@ -70,3 +71,22 @@ def test_without_noise_a_lens_is_as_far_off_as_its_parameters_say():
     distance, drawn = _distances(3e-3 * columns[..., 0], 1e-3 * samples, 1e-12)
     assert 2 < distance < 4
     assert 1.5 < np.sqrt(np.mean(drawn**2)) < 2.5
+
+
+def test_a_lens_of_the_same_table_is_not_to_be_calibrated_again():
+    """Generalized least squares keeps away from the fit without causes, and is not off for it."""
+    rng = np.random.default_rng(0)
+    table = replace(observe(lens(), (), *scene(rng), SIGMA, rng), source='a/corners.csv')
+    frames = len(table.frames)
+
+    def is_same(source, frames=frames, rms_px=0.2):
+        evaluation = SimpleNamespace(
+            selection=SimpleNamespace(problem=SimpleNamespace(observations=table)),
+            figures=SimpleNamespace(base=SimpleNamespace(rms_px=0.2)),
+        )
+        block = {'source': source, 'frames': frames, 'rms_px': rms_px}
+        return lens_evidence._is_of_these_data(evaluation, replace(lens(), calibration=block))
+
+    assert is_same('b/corners.csv') and not is_same('b/corners.csv', frames + 1)
+    assert not is_same('other.csv') and is_same('observations')
+    assert not is_same('observations', rms_px=0.21)
