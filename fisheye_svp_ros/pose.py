@@ -52,7 +52,9 @@ class Pose(_Pose, Batch):
                 f'and {place.shape}'
             )
         gram = turn @ np.swapaxes(turn, -1, -2)
-        if (np.abs(gram - _IDENTITY) > _ORTHONORMAL).any() or (np.linalg.det(turn) < 0).any():
+        with np.errstate(invalid='ignore'):  # of unknown poses
+            turned = np.linalg.det(turn) < 0
+        if (np.abs(gram - _IDENTITY) > _ORTHONORMAL).any() or turned.any():
             raise GeometryError(
                 'a pose has a matrix that is no rotation; R RT = 1 and det R = 1 are needed'
             )

@@ -1,5 +1,7 @@
 """Rigid transforms, against scipy's rotations and by their own laws."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -124,3 +126,9 @@ def test_cross_matrix_and_paper_frame():
     # Gazing along -z with y up: the optical z, x and y axes are -z, x and -y of the world.
     np.testing.assert_array_equal(PAPER_FROM_OPTICAL.T, [[1, 0, 0], [0, -1, 0], [0, 0, -1]])
     assert np.linalg.det(PAPER_FROM_OPTICAL) == 1.0
+
+
+def test_an_unknown_pose_is_no_warning() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        assert np.isnan(Pose(np.full((2, 3, 3), np.nan), np.zeros((2, 3))).rotation).all()
