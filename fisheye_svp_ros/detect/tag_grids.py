@@ -12,9 +12,6 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 
@@ -126,6 +123,8 @@ def _pair_tags(corners: Array, gap: float) -> tuple[Index, Array]:
 
     For each quarter turn: steps along the axes of tags so turned, by the mean of both.
     """
+    from scipy.spatial import cKDTree  # half a second that no help waits for
+
     center = corners.mean(axis=1)
     near = min(_NEIGHBORS + 1, len(center))
     others = np.asarray(cKDTree(center).query(center, near)[1]).reshape(len(center), near)[:, 1:]
@@ -177,6 +176,9 @@ def _one_grid(
     ids: Index, pairs: Index, size: GridSize, layout: TagLayout | None
 ) -> tuple[Index, int]:
     """Return which tags (K,) are of one grid, and how many are of another one."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     joined = coo_array((np.ones(len(pairs)), pairs.T), (len(ids), len(ids)))
     label = connected_components(joined, directed=False)[1]
     first = layout.first if layout else 0

@@ -346,6 +346,7 @@ class TestCalibrate:
             'reached_deg': pytest.approx(
                 np.degrees(back_project(LENS, table.uv).theta.max()), 0.01
             ),
+            'least_squares_rms_px': pytest.approx(0.1 * np.sqrt(2), rel=0.1),
         }
         document = json.loads(out.with_suffix('.calibrate.json').read_text())
         assert document['sigma_px'] == pytest.approx(0.1, rel=0.1)
@@ -539,7 +540,6 @@ class TestCommandLine:
         assert set(cli.COMMANDS) <= modules
 
     def test_bad_command(self, capsys):
-        assert 'COMMAND' in refused(capsys)
         assert "'fly'" in refused(capsys, 'fly')
         assert '--fast' in refused(capsys, 'localize', 'x', '--lens', 'y', '--fast')
 
@@ -625,10 +625,11 @@ def test_measured_data(tmp_path):
         )
         == 0
     )
-    assert load_lens(lens).calibration['rms_px'] <= 0.482
+    figures = load_lens(lens).calibration
+    assert figures['least_squares_rms_px'] <= 0.482 < figures['rms_px'] < 0.56
     test = str(OV_PLANE / 'test.csv')
     assert cli.main(['localize', test, '--lens', str(lens), '-o', str(tmp_path)]) == 0
-    assert json.loads((tmp_path / 'localize.json').read_text())['rms_px'] <= 0.475
+    assert json.loads((tmp_path / 'localize.json').read_text())['rms_px'] < 0.56
 
 
 @pytest.mark.parametrize(
