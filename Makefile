@@ -73,8 +73,9 @@ hardening: $(VENV)/ready
 	$(BIN)/python -m benchmark.hardening.$(NAME) $(ARGS)
 
 # The same corners through other tools, into docs/results/: make peers NAME=compare ARGS=DATA,
-# rectification, rigs or hand_eye; a minute to half an hour.
+# travel, rectification, rigs or hand_eye; a minute to half an hour.
 PEERS_compare := .venv-compare
+PEERS_travel := $(VENV)
 PEERS_rectification := .venv-compare
 PEERS_rigs := $(VENV)
 PEERS_hand_eye := .venv-hand-eye

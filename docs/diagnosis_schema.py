@@ -94,6 +94,7 @@ FIELDS: Fields = {
     'intrinsics': dict[str, Intrinsic],
     'uncertainty': dict,
     'trace': list[StepEntry],
+    'travel': Optional(given_px=float, extended_px=float),
     'external': NotRequired[dict],
     'turned': list[TurnedFrame],
     'hand_eye': Optional(

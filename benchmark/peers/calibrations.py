@@ -37,7 +37,8 @@ class Fitted:
 
     project: how it projects; places: where it believes the landmarks (N, 3) of a table to be;
     before: degrees, the incidence angle at which its model ends; intrinsics: fx, fy, cx, cy, px;
-    errors: their standard errors (4,) as the tool states them, by kind.
+    errors: their standard errors (4,) as the tool states them, by kind; curve: its coefficients
+    (4,), of a Kannala-Brandt curve.
     """
 
     project: Project
@@ -46,6 +47,7 @@ class Fitted:
     before: float = 180.0
     intrinsics: Array = field(default_factory=lambda: np.full(4, np.nan))
     errors: dict[str, Array] = field(default_factory=dict)
+    curve: Array = field(default_factory=lambda: np.full(4, np.nan))
 
 
 Fit = Callable[[Set, Grid, float], list[Fitted]]
@@ -97,7 +99,13 @@ def opencv_fisheye(data: Set, grid: Grid, focal: float) -> list[Fitted]:
             flags=flags,
             criteria=_TERMS,
         )
-        return Fitted(fisheye_projection(matrix, curve), nominal_places, before=PLANE_LIMIT)
+        return Fitted(
+            fisheye_projection(matrix, curve),
+            nominal_places,
+            before=PLANE_LIMIT,
+            intrinsics=matrix[[0, 1, 0, 1], [0, 1, 2, 2]],
+            curve=curve.ravel(),
+        )
 
     return fit_within(fit, ANGLES)
 

@@ -201,7 +201,7 @@ def _row(name: str, data: Set, fair: Mask, start: Localized, focal: float) -> Ro
 
 
 def _scored(name: str, fitted: Fitted, test: Observations, fair: Mask, start: Localized) -> Row:
-    near = _incidence(test, start) < fitted.before
+    near = incidence_degrees(test, start) < fitted.before
     apart = residuals(
         fitted.project, test.frame[near], fitted.places(test)[near], test.uv[near], start.pose
     )
@@ -217,7 +217,7 @@ def _scored(name: str, fitted: Fitted, test: Observations, fair: Mask, start: Lo
     )
 
 
-def _incidence(test: Observations, start: Localized) -> Array:
+def incidence_degrees(test: Observations, start: Localized) -> Array:
     """Return incidence angles (N,), degrees."""
     angle = np.empty(len(test))
     for i, number in enumerate(start.frame):

@@ -15,6 +15,7 @@ Other rooms import what stands here, and nothing else.
 
 from fisheye_svp_ros.diagnosis.adequacy import Adequacy
 from fisheye_svp_ros.diagnosis.causes import CONFOUNDED_P, Cause
+from fisheye_svp_ros.diagnosis.checks.travel import Travel, predict_board
 from fisheye_svp_ros.diagnosis.checks.two_cameras import Transfer, TwoCameras, deviations
 from fisheye_svp_ros.diagnosis.checks.two_datasets import TwoDatasets
 from fisheye_svp_ros.diagnosis.conclusion import (
@@ -97,6 +98,7 @@ __all__ = [
     'TargetFacts',
     'TargetReason',
     'Transfer',
+    'Travel',
     'TwoCameras',
     'TwoDatasets',
     'can_be_included',
@@ -107,6 +109,7 @@ __all__ = [
     'frames_of',
     'pose_maps',
     'pose_summary',
+    'predict_board',
     'predict_other_data',
     'stage_shares',
     'standard_errors',

@@ -22,6 +22,7 @@ from fisheye_svp_ros.diagnosis.causes import (
     table_causes,
 )
 from fisheye_svp_ros.diagnosis.checks.medium import Medium, behind_port, find_medium
+from fisheye_svp_ros.diagnosis.checks.travel import measure_travel
 from fisheye_svp_ros.diagnosis.checks.turned_boards import (
     TurnedFrame,
     find_turned_frames,
@@ -59,6 +60,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.table_checks import ROUNDING, check_distinct, dither
+from fisheye_svp_ros.solve.measured_poses import rig_lenses
 
 _FAR_SHIFT = 0.025  # m: no lens of a machine is known to move its viewpoint by more
 
@@ -110,7 +112,7 @@ def diagnose_against(
     """Diagnose a data set, and ask another one of the same camera whether the lens's causes hold.
 
     other: its target may be another one; the rest as in `diagnose`.  Causes of the lens that the
-    other set refutes are given up.
+    other set refutes are given up; what both lenses predict of it is measured.
     Raises ObservationError for data sets of several cameras, and what `diagnose` raises.
     """
     for table in (observations, other):
@@ -155,6 +157,9 @@ def diagnose_against(
             **settings,
         )
         datasets = replace(datasets, withdrawn=gone)
+    given = next(iter(rig_lenses(observations, lens).values()))
+    travel = measure_travel(second.evaluation.null.linear.data, given, found.lens)
+    datasets = replace(datasets, travel=travel)
     return replace(found, record=found.record._replace(against=datasets))
 
 

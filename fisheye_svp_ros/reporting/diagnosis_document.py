@@ -224,4 +224,8 @@ def _external(d: Diagnosis) -> dict[str, Any]:
         external['cameras'] = [pair.to_dict() for pair in d.cameras]
     if d.against is not None:
         external['sets'] = d.against.to_dict()
-    return {'external': external} if external else {}
+    travel = d.against and d.against.travel
+    return {
+        **({'travel': travel._asdict()} if travel else {}),
+        **({'external': external} if external else {}),
+    }

@@ -49,6 +49,7 @@ from fisheye_svp_ros.reporting.wording.adequacy import (
 )
 from fisheye_svp_ros.reporting.wording.decisions import bound_place, decision_reason
 from fisheye_svp_ros.reporting.wording.findings import belief, chance, finding_reason
+from fisheye_svp_ros.reporting.wording.travel import travel_sentence
 from fisheye_svp_ros.scene.observations import photograph_names
 
 _MAX_NAMES = 4  # photographs, and candidates, by name
@@ -114,7 +115,10 @@ class Action(NamedTuple):
 
 
 class Screen(NamedTuple):
-    """What is read first; warning: '' unless an error rises with the causes in the model."""
+    """What is read first; warning: '' unless an error rises with the causes in the model.
+
+    travel: '' unless there is another set.
+    """
 
     headline: str
     facts: str
@@ -125,6 +129,7 @@ class Screen(NamedTuple):
     bound: str
     truth: str
     causes_title: str = 'Causes'
+    travel: str = ''
 
 
 def first_screen(
@@ -167,6 +172,7 @@ def first_screen(
             for name, before, after, _ in known_rows(d, known or {})
         ),
         f'Causes ({NOT_CERTAIN})' if d.adequacy.is_misfit else 'Causes',
+        '' if d.against is None else travel_sentence(d.against),
     )
 
 
@@ -181,8 +187,8 @@ def _reason(decision: Decision, d: Diagnosis) -> str:
 
 
 def terminal_lines(screen: Screen, command: str) -> list[str]:
-    """Return the screen as at most ten lines."""
-    lines = [screen.headline, screen.facts]
+    """Return the screen as at most ten lines, one more where there is another set."""
+    lines = [*filter(None, [screen.travel]), screen.headline, screen.facts]
     lines += [f'Warning: {screen.warning}'] if screen.warning else []
     for one in screen.actions:
         names = ', '.join(photo.name for photo in one.photographs)

@@ -15,15 +15,21 @@ from fisheye_svp_ros.diagnosis import (
     TwoDatasets,
     diagnose,
     diagnose_against,
+    predict_board,
 )
+from fisheye_svp_ros.diagnosis.checks.travel import measure_travel
 from fisheye_svp_ros.diagnosis.checks.two_datasets import SharedParameter
 from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, gain_and_confidence, rms_reduction
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import write_observations
+from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
 from fisheye_svp_ros.reporting.external_text import sections
+from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
+from fisheye_svp_ros.reporting.wording.travel import travel_sentence
+from fisheye_svp_ros.solve.rig_state import group_by_frame
 
 SHIFT, SKEW = CATALOGUE['viewpoint_shift'](), CATALOGUE['skew']()
 QUICK = DiagnosisOptions(quick=True)
@@ -56,7 +62,13 @@ def test_what_moves_with_the_lens_holds_in_the_other_set():
     e0 = said.parameters['viewpoint_shift.e0']
     assert abs(e0.standardized_difference) < 3 and e0.value == pytest.approx(0.02, abs=0.003)
     assert 'hold in both sets' in sections(found)[0].sentence
-    assert diagnosis_document(found)['external']['sets']['against'] == 'set 32'
+    document = diagnosis_document(found)
+    assert document['external']['sets']['against'] == 'set 32'
+    # The shift moves with the lens; bent boards count for neither lens.
+    assert document['travel'] == said.travel._asdict()
+    assert said.travel.extended_px < 0.97 * said.travel.given_px < 0.17
+    first = terminal_lines(first_screen(found, 'a.csv'), '')[0]
+    assert first.startswith(f'{said.travel.given_px:.3g} px as given, ') and 'set 32' in first
 
 
 def test_nothing_of_the_target_is_predicted_of_another_one():
@@ -133,6 +145,21 @@ def test_the_intervals_of_predictions_hold_95_percent():
     )
 
 
+def test_a_bent_board_is_no_error_of_the_lens_that_predicts_it():
+    flat, bent = (predict_board(group_by_frame(table(37, bend=b)), lens()) for b in (0.0, 0.004))
+    assert bent.rms == pytest.approx(flat.rms, rel=0.02) and flat.rms < 0.19
+
+
+def test_a_lens_that_does_not_image_all_points_has_no_figure():
+    data = group_by_frame(table(37))
+    # The farthest image height of an orthographic lens is its focal length.
+    blind = replace(lens(), fx=1.0, fy=1.0, image_height=IMAGE_HEIGHTS['orthographic']())
+    travel = measure_travel(data, lens(), blind)
+    assert travel.given_px < 0.19 and np.isnan(travel.extended_px)
+    said = travel_sentence(TwoDatasets('b.csv', (None, None), {}, travel=travel))
+    assert 'some points out of sight extended' in said
+
+
 def test_command(tmp_path, capsys):
     for name, seed in (('a', 35), ('b', 36)):
         write_observations(tmp_path / f'{name}.csv', table(seed, (SKEW, np.array([0.003]))))
@@ -152,6 +179,7 @@ def test_command(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert 'The causes in the lens hold in both sets' in printed
     assert 'Another data set of this camera' in printed
+    assert 'px as given, ' in printed.splitlines()[0] and 'b.csv' in printed.splitlines()[0]
 
 
 def test_rigs_are_refused():

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fisheye_svp_ros.diagnosis.checks.travel import Travel
 from fisheye_svp_ros.diagnosis.checks.two_cameras import (
     Transfer,
     displace_target,
@@ -75,13 +76,15 @@ class TwoDatasets:
     """What two data sets of one camera say of each other.
 
     tried: of this set on the other, and of the other on this; parameters: of the lens, by both,
-    fitted with the causes of both; withdrawn: causes given up because the other set refutes them.
+    fitted with the causes of both; withdrawn: causes given up because the other set refutes them;
+    travel: what the lenses of this set predict of the other.
     """
 
     source: str
     tried: tuple[TransferredCauses | None, TransferredCauses | None]
     parameters: dict[str, SharedParameter]
     withdrawn: tuple[str, ...] = ()
+    travel: Travel | None = None
 
     @property
     def refuted_causes(self) -> list[str]:

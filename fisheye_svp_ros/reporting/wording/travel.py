@@ -1,0 +1,23 @@
+"""What lenses predict of another board, the measure of a lens."""
+
+from __future__ import annotations
+
+from math import isfinite
+from pathlib import Path
+
+from fisheye_svp_ros.diagnosis import TwoDatasets
+
+
+def travel_sentence(against: TwoDatasets) -> str:
+    """Return how both lenses predict the other set; '' where it was not measured."""
+    if against.travel is None:
+        return ''
+    given, extended = map(_error, against.travel)
+    return (
+        f'{given} as given, {extended} extended: errors of the lenses on '
+        f'{Path(against.source).name}, its poses and landmark offsets fitted anew'
+    )
+
+
+def _error(px: float) -> str:
+    return f'{px:.3g} px' if isfinite(px) else 'some points out of sight'
