@@ -49,6 +49,16 @@ CLAIMS = (
         first=True,
     ),
     Claim(
+        'A lens predicts another board, poses and landmarks fitted anew',
+        'travel',
+        r'extended\s+lens\s+of\s+`diagnose`\s+is\s+off\s+by\s+([\d.]+)\s+and\s+([\d.]+)\s+px,'
+        r'.*?OpenCV\s+by\s+([\d.]+)\s+and\s+([\d.]+)\s+px',
+        'extended lens off by {0} and {1} px, not {2} and {3} px',
+        '`cv2.fisheye`',
+        'make peers NAME=travel',
+        first=True,
+    ),
+    Claim(
         'Stated ray errors hold',
         'ray_coverage',
         r'\| all \| \d+ \| \d+ % \| (\d+) % \|.*?\| \d+ % \| (\d+) % \| \d+ % \| 0\.\d+ \| 0',
