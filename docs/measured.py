@@ -106,7 +106,14 @@ CLAIMS = (
         '{1} of {0}',
         'the truth',
         'make study NAME=poses',
-        first=True,
+    ),
+    Claim(
+        'Covariances of poses hold where geometry is weak (a frontal board at 1.5 m)',
+        'pose_covariance',
+        r'frontal, 1\.5 m \| [\d.]+ / ([\d.]+) \|.*?\| [\d.]+ / ([\d.]+) \| [\d.]+ /',
+        '{0} % within the 99.9 % ellipsoid, not {1} %',
+        '`cv2.solvePnP` and its Jacobian',
+        "make study NAME=weak_geometry ARGS='--poses 500'",
     ),
     Claim(
         'Photographs that determine a viewpoint shift',
