@@ -136,11 +136,13 @@ def test_the_table_and_the_pictures_are_there(demo: Any) -> None:
 
 
 def test_the_nodes_have_nothing_to_complain_of(demo: Any) -> None:
+    """But of one another's slow start, and of a camera that ended before other nodes."""
     folder, _ = demo
     for log in (folder / 'logs').glob('*.log'):
-        # A camera that has published its sets ends, some seconds before those of other nodes.
         text = '\n'.join(
-            line for line in log.read_text().splitlines() if 'its publisher is gone' not in line
+            line
+            for line in log.read_text().splitlines()
+            if not re.search('no message on|nothing is published yet', line)
         )
         assert 'Traceback' not in text and 'WARN' not in text and 'dropped' not in text, log
 
