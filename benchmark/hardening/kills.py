@@ -53,6 +53,16 @@ COMMANDS = {
     'example': ('example', '-o', '{out}'),
     'lens': ('lens', '{lens}', '--format', 'opencv', '-o', '{out}/opencv.yaml'),
     'localize': ('localize', '{obs}', '--lens', '{lens}', '-o', '{out}'),
+    'map': (
+        'map',
+        '{room}/walk',
+        '--board',
+        'tags:36h11:300mm',
+        '--lens',
+        '{room}/lens.yaml',
+        '-o',
+        '{out}/tags.yaml',
+    ),
     'paper': ('paper', '-o', '{out}'),
     'plan': (
         'plan',
@@ -87,6 +97,7 @@ NODES = {
             'stereo_calibrator',
             'stereo_depth',
             'model_critic',
+            'rig_localizer',
         )
     },
     'run measured_camera': ('run', 'measured_camera', '--ros-args', '-p', 'observations:={obs}'),
@@ -168,7 +179,9 @@ def left_running(session: int) -> list[int]:
 
 def prepare(folder: Path) -> dict[str, Path]:
     """Make the inputs of the commands."""
-    given = {name: folder / name for name in ('photographs', 'swept', 'recording')}
+    given = {name: folder / name for name in ('photographs', 'swept', 'recording', 'room')}
+    walk = Path(__file__).parents[2] / 'examples' / 'where_is_my_robot.py'
+    subprocess.run([sys.executable, walk, given['room']], check=True, stdout=subprocess.DEVNULL)
     given |= {
         'obs': folder / 'obs.csv',
         'lens': folder / 'lens.yaml',

@@ -195,9 +195,9 @@ class LensFacts(NamedTuple):
 
     @property
     def has_better_rays(self) -> bool:
-        """Whether the expected error of the rays halves, and held-out frames do not refute it."""
+        """Whether the expected error of the rays halves, and held-out frames agree."""
         given, extended = self.rays
-        return extended > 0 and given >= _RAY_RATIO * extended and self.file.high > 0
+        return extended > 0 and given >= _RAY_RATIO * extended and self.file.gain > 0
 
     @property
     def wrong_intrinsics(self) -> list[str]:

@@ -486,7 +486,7 @@ FIXED = (
     'sensor_tilt',
     'focal_drift',
     'board_pose',
-    'rolling_shutter',
+    'decentering',
     'wrong_ids',
 )
 

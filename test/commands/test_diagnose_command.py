@@ -349,7 +349,8 @@ class TestTerminal:
             )
             == 0
         )
-        assert 'Keep the lens' in capsys.readouterr().out
+        out = capsys.readouterr().out
+        assert 'Do not use the lens as given' not in out and 'Use extended_lens.yaml' in out
 
     def test_a_frame_that_is_there_twice_counts_once(self, scene, capsys, tmp_path):
         table = read_observations(scene / 'clean.csv')
