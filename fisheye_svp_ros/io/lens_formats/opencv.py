@@ -79,7 +79,7 @@ def read(text: str, where: str) -> Foreign:
         document = _from_xml(text, where)
     else:
         document = fields.yaml(text, where)
-    named = {re.sub('[^a-z0-9]', '', name.lower()): value for name, value in document.items()}
+    named = {re.sub('[^a-z0-9]', '', str(name).lower()): value for name, value in document.items()}
 
     def lens(name: str, side: str) -> tuple[Lens, float]:
         k = _matrix(_value(named, _sided(_MATRIX, side), where), ((3, 3),), where)
