@@ -14,7 +14,9 @@ import pytest
 from helpers.graph import Graph
 from helpers.nodes import ROOT
 
+from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.nodes import NODES
+from fisheye_svp_ros.scene.rigs import rig
 
 OBSERVATIONS = 'frame,landmark,u,v,x,y,z,camera\n' + ''.join(
     f'0,{i},{100 + 7 * i},{200 - 3 * i},{0.1 * i},{0.01 * i * i},1,{camera}\n'
@@ -29,6 +31,7 @@ def graph(ros_domain: int, tmp_path: Path) -> Iterator[Graph]:
     """Return a graph in which every node has what it needs, and answers to wait for."""
     path = tmp_path / 'observations.csv'
     path.write_text(OBSERVATIONS)
+    save_rig(rig('parallel'), tmp_path / 'rig.yaml')
     solvers = [word for name in SOLVERS for word in ('-p', f'{name}:lens:=camera_info')]
     one = Graph(
         '-p',
@@ -46,6 +49,8 @@ def graph(ros_domain: int, tmp_path: Path) -> Iterator[Graph]:
         f'guide_output:={tmp_path / "guided"}',
         '-p',
         'detector:lens:=camera_info',
+        '-p',
+        f'rig_localizer:rig:={tmp_path}/rig.yaml',
     )
     yield one
     one.close()
