@@ -560,7 +560,7 @@ def test_a_frame_of_a_rig_from_another_moment_is_named():
     found = diagnose(replace(table, uv=uv).take(kept), lenses)
     assert not found.causes
     assert {row['frame'] for row in found.gross} == {4}
-    assert [one.frames for one in found.advice if one.action is Action.CHECK_VIEWS] == [[4]]
+    assert [one.frames for one in found.advice if one.action is Action.CHECK_FRAMES] == [[4]]
 
 
 def test_a_rig_needs_a_lens_for_each_camera():
