@@ -41,7 +41,7 @@ class Pose(_Pose, Batch):
     __slots__ = ()
 
     def __new__(cls, rotation: ArrayLike, position: ArrayLike) -> Self:
-        """Check the arrays; raise GeometryError for other shapes, and for no rotation.
+        """Check the arrays; raise GeometryError for other shapes, and for one that is no rotation.
 
         NaN stands for a pose that is not known.  Poses made of poses, `_make`, are not checked.
         """
@@ -51,6 +51,8 @@ class Pose(_Pose, Batch):
                 f'a pose has a rotation (..., 3, 3) and a position (..., 3), not {turn.shape} '
                 f'and {place.shape}'
             )
+        if turn.ndim > 2:  # solvers begin batches anywhere, and refuse what comes of it
+            return super().__new__(cls, turn, place)
         gram = turn @ np.swapaxes(turn, -1, -2)
         with np.errstate(invalid='ignore'):  # of unknown poses
             turned = np.linalg.det(turn) < 0

@@ -8,9 +8,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rosbags.rosbag1 import Reader
-from rosbags.typesys import Stores, get_typestore
-
 from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.mcap import RawMessage
 
@@ -20,6 +17,8 @@ _REMEDY = 'copy it again, or run `rosbag reindex`'
 @cache
 def ros1_types() -> Any:
     """Return the types of ROS 1 Noetic."""
+    from rosbags.typesys import Stores, get_typestore
+
     return get_typestore(Stores.ROS1_NOETIC)
 
 
@@ -52,7 +51,9 @@ def bag_messages(
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Reader]:
+def _opened(path: Path) -> Iterator[Any]:
+    from rosbags.rosbag1 import Reader  # where a bag is read alone
+
     reader = Reader(path)
     try:
         reader.open()

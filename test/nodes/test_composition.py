@@ -22,9 +22,11 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402  # isort: skip
 
 from fisheye_svp_ros.cli import main  # noqa: E402
 from fisheye_svp_ros.io.decoding import read_key_values  # noqa: E402
+from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.nodes import NODES, executables  # noqa: E402
 from fisheye_svp_ros.nodes.localizer import Localizer  # noqa: E402
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera  # noqa: E402
+from fisheye_svp_ros.scene.rigs import rig
 
 
 @pytest.fixture
@@ -92,6 +94,9 @@ def test_every_node_takes_what_rclpy_nodes_take(
     )
     given = {'wait_for_subscribers': 3}
     given |= {'observations': str(table)} if name == 'measured_camera' else {}
+    if name == 'rig_localizer':
+        save_rig(rig('parallel'), tmp_path / 'rig.yaml')
+        given |= {'rig': str(tmp_path / 'rig.yaml')}
     node = kind(
         'mine',
         namespace='robot',

@@ -179,6 +179,8 @@ def test_hardly_anything_is_loaded_before_signals_end_a_node_quietly() -> None:
     )
     assert done.stdout.split() == [
         'fisheye_svp_ros',
+        'fisheye_svp_ros.io',
+        'fisheye_svp_ros.io.streams',
         'fisheye_svp_ros.nodes',
         'fisheye_svp_ros.nodes.executables',
         'fisheye_svp_ros.threads',

@@ -13,7 +13,9 @@ from helpers.graph import Graph, set_parameter
 
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io.parameters import Row, rows, sweep_of, with_values
+from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.nodes import NODES
+from fisheye_svp_ros.scene.rigs import rig
 from fisheye_svp_ros.simulate.scenario import Scenario
 from fisheye_svp_ros.study.settings import SolverSettings
 
@@ -40,9 +42,16 @@ def start(ros_domain: int, tmp_path: Path) -> Iterator[Callable[..., Any]]:
     graphs = []
     measured = tmp_path / 'observations.csv'
     measured.write_text(OBSERVATIONS)
+    save_rig(rig('parallel'), tmp_path / 'rig.yaml')
 
     def run(name: str, *arguments: str) -> Any:
-        graph = Graph('-p', f'measured_camera:observations:={measured}', *arguments)
+        graph = Graph(
+            '-p',
+            f'measured_camera:observations:={measured}',
+            '-p',
+            f'rig_localizer:rig:={tmp_path}/rig.yaml',
+            *arguments,
+        )
         graphs.append(graph)
         return graph.start(node_class(name))
 

@@ -393,7 +393,7 @@ def test_without_the_truth_there_are_no_errors_but_a_pose(graph: Callable[..., G
     sets.tell_landmarks(0, 2.0)
     sets.tell_points(3, 2.0)
     result = sets.result(3)
-    assert tuple(result) == ('points', 'rms_px', 'mean_residual_px')
+    assert tuple(result) == ('points', 'rms_px', 'mean_residual_px', 'odds', 'ambiguous')
     sets.graph.until(lambda: sets.poses)
     assert abs(sets.poses[0].pose.pose.position.z) < 1e-9
 
