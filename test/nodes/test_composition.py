@@ -22,11 +22,11 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402  # isort: skip
 
 from fisheye_svp_ros.cli import main  # noqa: E402
 from fisheye_svp_ros.io.decoding import read_key_values  # noqa: E402
-from fisheye_svp_ros.io.rig_files import save_rig
+from fisheye_svp_ros.io.rig_files import save_rig  # noqa: E402
 from fisheye_svp_ros.nodes import NODES, executables  # noqa: E402
 from fisheye_svp_ros.nodes.localizer import Localizer  # noqa: E402
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera  # noqa: E402
-from fisheye_svp_ros.scene.rigs import rig
+from fisheye_svp_ros.scene.rigs import rig  # noqa: E402
 
 
 @pytest.fixture
