@@ -113,10 +113,14 @@ def hour(
     return Hour(graph, capfd)
 
 
-def image_points(stamp: int = 7, ids: Any = None) -> Any:
+ZOOMED = ('lens:=fish214', 'svp:=true', 'patience:=0.1', 'sigma_px:=0.1')
+
+
+def image_points(stamp: int = 7, ids: Any = None, zoom: float = 1.0) -> Any:
     seen = simulate_scenario(Scenario(shift_scale=0.0)).observations
+    middle = seen.uv.mean(axis=0)
     return messages.image_points_message(
-        seen.landmark if ids is None else ids, seen.uv, stamp, 'camera'
+        seen.landmark if ids is None else ids, middle + zoom * (seen.uv - middle), stamp, 'camera'
     )
 
 
@@ -380,14 +384,14 @@ def refused_map(hour: Hour, pattern: str) -> None:
 
 @tries('Doubtful poses: lens, unit or image size are others')
 def another_lens(hour: Hour, pattern: str) -> None:
-    _, points = framed_sets(hour, 'lens:=fish180', 'patience:=0.1', 'sigma_px:=0.1')
-    hour.says(pattern, lambda: points.publish(image_points()))
+    _, points = framed_sets(hour, *ZOOMED)
+    hour.says(pattern, lambda: points.publish(image_points(zoom=1.02)))
 
 
 @tries('No poses: the residuals are above the gate')
 def gated(hour: Hour, pattern: str) -> None:
-    _, points = framed_sets(hour, 'lens:=fish180', 'patience:=0.1', 'sigma_px:=0.1', 'gate:=3.0')
-    hour.says(pattern, lambda: points.publish(image_points()))
+    _, points = framed_sets(hour, *ZOOMED, 'gate:=3.0')
+    hour.says(pattern, lambda: points.publish(image_points(zoom=1.02)))
 
 
 @tries('Doubtful rig: left and right are exchanged')

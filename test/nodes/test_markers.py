@@ -24,6 +24,9 @@ from fisheye_svp_ros.scene.rigs import rig
 _PIXEL = 0.08 / 1536  # m, on the base of a camera
 
 
+FRAMES = 'right_camera_optical_frame', 'left_camera_optical_frame'
+
+
 @pytest.mark.parametrize(
     ('words', 'frame'),
     [
@@ -50,7 +53,7 @@ def test_epipolar_curves_run_through_the_image_points(
     markers = g.hear(MarkerArray, 'stereo_depth/markers', LATCHED)
     g.start(StereoDepth)
     known = g.tell(TransformStamped, 'rig', LATCHED)
-    known.publish(messages.transform_message(rig('vergent'), 1, 'right', 'left'))
+    known.publish(messages.transform_message(rig('vergent'), 1, *FRAMES))
     g.start(SyntheticCamera)
     g.until(lambda: markers)
     g.close()

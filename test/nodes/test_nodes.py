@@ -695,7 +695,8 @@ def test_depth_with_a_rig_from_a_topic(graph: Callable[..., Graph]) -> None:
     g.until(lambda: results)
     assert 'no rig' in results[0].status[0].message
     off = Pose(rotation_from_vector(np.zeros(3)), np.array([-0.15, 0.0, 0.01]))
-    rig.publish(messages.transform_message(off, 1, 'right', 'left'))
+    frames = 'right_camera_optical_frame', 'left_camera_optical_frame'
+    rig.publish(messages.transform_message(off, 1, *frames))
     g.until(lambda: values(results[-1]))
     assert float(values(results[-1])['error3_m']) > 1e-3
 
