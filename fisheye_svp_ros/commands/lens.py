@@ -75,7 +75,8 @@ def run(args: argparse.Namespace) -> None:
             save_rig(foreign.rigs, args.output, foreign.cameras or STEREO)
         return
     lens = load_with_notes(path)
-    several, steps = cameras_in(path), rigs_of_lenses(path)
+    several = cameras_in(path)
+    steps = rigs_of_lenses(path) if several else ()
     chain = load_cameras(path)[0] if steps else ()
     whole = args.format in RIG_WRITABLE and len(chain) > 1 and sorted(chain) == sorted(several)
     if several:

@@ -15,7 +15,6 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.parameters import SWEEP, Sweep, rows, sweep_of, with_values
-from fisheye_svp_ros.io.recording import note_of_set
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views, views_of
@@ -81,6 +80,8 @@ class Outcome:
             found = solve(index)
         except GeometryError as error:
             if len(index) == 1:
+                from fisheye_svp_ros.io.recording import note_of_set  # with rosbags, seldom
+
                 self.note[index] = note_of_set(str(error))
                 return
             for half in np.array_split(index, 2):
