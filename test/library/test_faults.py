@@ -62,7 +62,6 @@ def test_a_lens_is_a_key() -> None:
         (np.diag([1.0, 1.0, -1.0]), np.zeros(3)),
         (2 * np.eye(3), np.zeros(3)),
         (np.eye(4)[:3], np.zeros(3)),
-        (np.stack([np.eye(3), np.zeros((3, 3))]), np.zeros((2, 3))),
     ],
 )
 def test_a_pose_is_a_rotation_and_a_position(rotation: Any, position: Any) -> None:

@@ -583,7 +583,7 @@ def test_measured_camera_and_localizer_agree_with_the_command(
         'measured_camera',
         '--ros-args',
         '-p',
-        f'observations:={DATA / "test.csv"}',
+        f'observations:={OV_PLANE / "test.csv"}',
         '-p',
         'wait_for_subscribers:=2',
         '-p',
