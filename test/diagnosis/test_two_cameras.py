@@ -136,7 +136,10 @@ def test_a_calibrated_rig_leaves_out_frames_that_contradict_it(tmp_path, capsys)
     words = ['calibrate', str(tmp_path / 'rig.csv'), '--image-size']
     assert cli.main([*words, 'left=1280x960']) == 2
     text = capsys.readouterr().err
-    assert 'points reach 102' in text and 'add --image-size right=WIDTHxHEIGHT' in text
+    assert (
+        'points reach 795 px to the right' in text
+        and 'add --image-size right=WIDTHxHEIGHT' in text
+    )
     assert cli.main([*words, 'left=1280x960,right=1024x768', '-o', str(tmp_path / 'rig')]) == 0
     said = capsys.readouterr().err
     assert f'frames {one} and {other}: its cameras contradict each other' in said
@@ -227,7 +230,8 @@ def test_views_of_cameras_without_a_rig_are_counted_as_views():
     )
     said = 'in 8 views of 4 frames (each view with its own pose)'
     assert said in first_screen(found, 'table').facts
-    assert found.decision['photographs'].why.startswith('8 views')
+    why = diagnosis_document(found)['decision']['photographs']['why']
+    assert why.startswith('8 views')
 
 
 def test_a_center_that_the_rig_absorbs_is_no_gain_of_the_extended_lens():
