@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import math
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.commands.processes import prepare_ros
 from fisheye_svp_ros.nodes.executables import ending_quietly
+from fisheye_svp_ros.reporting.wording.metrics import metric_text
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from fisheye_svp_ros.nodes.watcher import Watcher
 
-_UNITS = {'m': ('mm', 1000.0), 'rad': ('deg', math.degrees(1.0))}
 _MIN_COLUMNS = 64  # columns: three numbers, and some of the names, which are broken into lines
 
 
@@ -44,14 +43,6 @@ def run(args: argparse.Namespace) -> None:
         watcher.destroy_node()
 
 
-def _display_unit(name: str) -> tuple[str, float]:
-    """Return the name of a metric with the unit that people read, and the factor to it."""
-    for unit, (shown, scale) in _UNITS.items():
-        if name.endswith(f'_{unit}'):
-            return f'{name.removesuffix(unit)}{shown}', scale
-    return name, 1.0
-
-
 def _result_table(watcher: Watcher, width: int) -> RenderableType:
     from rich import box
     from rich.table import Table
@@ -67,7 +58,8 @@ def _result_table(watcher: Watcher, width: int) -> RenderableType:
         lost = f', {results.lost} not solved ({results.note})' if results.lost else ''
         table.add_row(node, f'{results.sets} sets{lost}')
         for name, metric in results.metrics.items():
-            shown, scale = _display_unit(name)
+            text = metric_text(name)
             values = metric.latest, metric.total / metric.count, metric.largest
-            table.add_row('', shown, *(f'{scale * value:.6g}' for value in values))
+            shown = '_'.join(filter(None, text[:2]))
+            table.add_row('', shown, *(f'{text.factor * value:.6g}' for value in values))
     return table

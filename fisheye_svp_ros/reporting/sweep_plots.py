@@ -13,8 +13,11 @@ from matplotlib.ticker import LogLocator
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.decoding import Points
+from fisheye_svp_ros.io.parameters import rows
 from fisheye_svp_ros.io.recording import STAMP
 from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, legend_below, picture
+from fisheye_svp_ros.reporting.wording.metrics import metric_text
+from fisheye_svp_ros.simulate.scenario import Scenario
 from fisheye_svp_ros.study.dependence import (
     SweptTable,
     curves,
@@ -24,23 +27,20 @@ from fisheye_svp_ros.study.dependence import (
     swept_parameters,
     value_text,
 )
+from fisheye_svp_ros.study.solutions import DRAWN_METRICS
+from fisheye_svp_ros.study.sweep import SOLVERS
 
 _COLOURS = 'viridis'
 _HUES, _LINES = 4, ('-', '--')  # what can be told apart in one picture
 _COLUMNS = 4  # axes beside each other
 _TICKS, _LABELS = 12, 6
 _CLOUD = 20_000  # points in a scatter plot
-_UNITS = {'radius': 'm', 'baseline': 'm', 'vergence': 'rad', 'noise_px': 'px'}
+_UNITS = {row.name: row.unit for row in rows(Scenario)}
 _NAMES = {
     'radius': 'range of the landmarks',
     'shift_scale': 'viewpoint shift, relative',
     'noise_px': 'noise',
     'vergence': 'inward turn of the left camera',
-}
-_OF_RUNS = {
-    'position_error_m': (1e3, 'position error / mm'),
-    'axis_error_rad': (180 / np.pi, 'axis error / deg'),
-    'rms_px': (1.0, 'rms residual / px'),
 }
 
 
@@ -52,23 +52,22 @@ class PlottedMetric(NamedTuple):
     factor: float
 
 
-_METRICS = (
-    PlottedMetric('localizer.position_error_m', 'Localization: position error, mm', 1e3),
-    PlottedMetric('localizer.axis_error_rad', 'Localization: axis error, deg', np.degrees(1.0)),
-    PlottedMetric('localizer.rms_px', 'Localization: rms residual, px', 1.0),
-    PlottedMetric('stereo_calibrator.position_error_m', 'Calibration: position error, mm', 1e3),
-    PlottedMetric(
-        'stereo_calibrator.axis_error_rad', 'Calibration: axis error, deg', np.degrees(1.0)
-    ),
-    PlottedMetric('stereo_depth.error3_m', 'Depth: mean error in space (Error3), mm', 1e3),
-    PlottedMetric('stereo_depth.error2_px', 'Depth: distance to epipolar curve (Error2), px', 1.0),
-)
+def _plotted_metrics(table: SweptTable) -> list[PlottedMetric]:
+    """Return those of the solvers of a sweep that a table has."""
+    return [
+        PlottedMetric(
+            column, f'{node.replace("_", " ").capitalize()}: {text.title()}', text.factor
+        )
+        for node in SOLVERS
+        for name in DRAWN_METRICS
+        if (column := f'{node}.{name}') in table and (text := metric_text(name))
+    ]
 
 
 def draw_table(table: SweptTable, folder: Path) -> list[Path]:
     """Draw whatever a table is good for; return the files."""
     files = []
-    metrics = [metric for metric in _METRICS if metric.column in table]
+    metrics = _plotted_metrics(table)
     swept = swept_parameters(table)
     numbers = [name for name in swept if is_number(table, name)]
     for x in numbers if metrics else ():
@@ -208,7 +207,7 @@ def _draw_spreads(table: SweptTable, by: str | None, path: Path) -> None:
 
 
 def draw_residuals(clouds: Sequence[Points], lenses: Sequence[str], path: Path) -> None:
-    """Draw residuals (clouds.RESIDUALS) against the incidence angle and the range.
+    """Draw residuals (io.decoding.RESIDUALS) against the incidence angle and the range.
 
     lenses: of each cloud, told apart by colour; '' where it is not known.
     """
@@ -270,8 +269,7 @@ def _scale(axis: Any, x: Sequence[float], y: Array) -> None:
 
 
 def _label(name: str) -> str:
-    unit = _UNITS.get(name)
-    return _NAMES.get(name, name) + (f', {unit}' if unit else '')
+    return ', '.join(filter(None, (_NAMES.get(name, name), _UNITS.get(name))))
 
 
 def draw_runs(columns: Mapping[str, Sequence[Any]], path: Path) -> list[Path]:
@@ -283,7 +281,7 @@ def draw_runs(columns: Mapping[str, Sequence[Any]], path: Path) -> list[Path]:
     localizers = [name for name in posed if f'{name}.views' not in columns]  # no calibrator
     runs = {
         name: found
-        for name in _OF_RUNS
+        for name in DRAWN_METRICS
         if len(found := [c for n in localizers if (c := f'{n}.{name}') in columns]) > 1
     }
     if not runs or STAMP not in columns:
@@ -292,9 +290,9 @@ def draw_runs(columns: Mapping[str, Sequence[Any]], path: Path) -> list[Path]:
     with picture(path, 9.2, 0.8 + 2.1 * len(runs)) as figure:
         axes = figure.subplots(len(runs), 1, sharex=True, squeeze=False)[:, 0]
         for axis, (name, nodes) in zip(axes, runs.items(), strict=True):
-            factor, label = _OF_RUNS[name]
+            text = metric_text(name)
             for node in nodes:
-                values = factor * np.array(columns[node], dtype=float)
+                values = text.factor * np.array(columns[node], dtype=float)
                 mean = float(np.nanmean(values))
                 axis.plot(
                     stamp - stamp.min(),
@@ -304,7 +302,7 @@ def draw_runs(columns: Mapping[str, Sequence[Any]], path: Path) -> list[Path]:
                     lw=1,
                     label=f'{node.rpartition(".")[0]}, mean {mean:.3g}',
                 )
-            axis.set(ylabel=label, ylim=(0, None))
+            axis.set(ylabel=text.title(' / '), ylim=(0, None))
             axis.legend(loc='lower right', bbox_to_anchor=(1, 1), ncols=len(nodes), fontsize=8)
         axes[-1].set_xlabel('time / s')
     return [path]

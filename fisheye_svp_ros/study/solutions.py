@@ -50,6 +50,8 @@ STEREO_DEPTH_METRICS = (
     'error3_m',
     'error3_max_m',
 )
+# Those that pictures of sweeps and recordings show, in this order; tables hold all.
+DRAWN_METRICS = ('position_error_m', 'axis_error_rad', 'rms_px', 'error3_m', 'error2_px')
 
 
 class Measurement(NamedTuple):

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +17,8 @@ from fisheye_svp_ros.io.columns import arrow, write_columns
 from fisheye_svp_ros.io.decoding import RESIDUALS, structured_array
 from fisheye_svp_ros.reporting.sweep_plots import draw_residuals, draw_table
 from fisheye_svp_ros.study.dependence import curves, grid, noise_spreads, swept_parameters
-from fisheye_svp_ros.study.sweep import plan_sweep, sweep_rows
+from fisheye_svp_ros.study.solutions import DRAWN_METRICS
+from fisheye_svp_ros.study.sweep import SOLVERS, plan_sweep, sweep_rows
 
 TABLE = {
     'radius': [1.0, 1.0, 2.0, 2.0, 1.0, 2.0],
@@ -40,18 +40,24 @@ def test_curves_are_medians_over_the_rest() -> None:
     assert one.low[0] == pytest.approx(1.1) and one.high[0] == pytest.approx(2.9)
 
 
-def test_a_picture_shows_no_more_curves_than_can_be_told_apart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn: list[Any] = []
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Return the figures that a test draws, in their order; no file is written."""
+    drawn: list[Figure] = []
 
     @contextmanager
-    def kept(path: Path, width: float, height: float) -> Iterator[Any]:
+    def kept(path: Path, width: float, height: float) -> Iterator[Figure]:
         drawn.append(Figure())
         yield drawn[-1]
 
     monkeypatch.setattr('fisheye_svp_ros.reporting.sweep_plots.picture', kept)
     monkeypatch.setattr('fisheye_svp_ros.reporting.sweep_plots.legend_below', lambda *_: None)
+    return drawn
+
+
+def test_a_picture_shows_no_more_curves_than_can_be_told_apart(
+    tmp_path: Path, figures: list[Figure]
+) -> None:
     rows = list(product([1.0, 2.0], range(7), 'abc'))
     radius, scale, environment = (list(column) for column in zip(*rows, strict=True))
     draw_table(
@@ -63,7 +69,7 @@ def test_a_picture_shows_no_more_curves_than_can_be_told_apart(
         },
         tmp_path,
     )
-    figure = next(one for one in drawn if one.axes[0].get_xlabel().startswith('range'))
+    figure = next(one for one in figures if one.axes[0].get_xlabel().startswith('range'))
     labels = [line.get_label() for line in figure.axes[0].lines]
     assert labels == [
         f'shift_scale {i}, environment {name}' for i in (0, 2, 4, 6) for name in 'ac'
@@ -134,6 +140,15 @@ def test_a_rig_is_drawn(tmp_path: Path) -> None:
     plan = plan_sweep({'synthetic_camera': {'style': 'parallel', 'sweep.baseline': [0.1, 0.2]}})
     files = draw_table(sweep_rows(plan, range(2)), tmp_path)
     assert [p.name for p in files] == ['error_against_baseline.png']
+
+
+def test_every_metric_that_is_to_be_drawn_has_its_curve(figures: list[Figure]) -> None:
+    columns = [f'{node}.{name}' for node, solver in SOLVERS.items() for name in solver.metrics]
+    draw_table({'radius': [1.0, 2.0], **{name: [1.0, 2.0] for name in columns}}, Path())
+    titles = [axis.get_title('left') for axis in figures[0].axes]
+    drawn = [name for name in columns if name.partition('.')[2] in DRAWN_METRICS]
+    assert len(titles) == len(drawn) and {*DRAWN_METRICS} <= {n.partition('.')[2] for n in drawn}
+    assert 'Stereo depth: error2, px' in titles and 'Localizer: position error, mm' in titles
 
 
 def test_residuals_are_drawn_against_angle_and_range(tmp_path: Path) -> None:

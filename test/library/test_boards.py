@@ -12,7 +12,6 @@ from helpers.photographs import BOARD, LENS, photograph, poses, true_corners, wr
 import fisheye_svp_ros as fsvp
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands import notes
-from fisheye_svp_ros.commands.watch import _display_unit
 from fisheye_svp_ros.library.results import Budgeted
 
 
@@ -119,13 +118,6 @@ def test_lenses_of_a_rig_do_not_go_into_a_folder_called_yaml(
     )
     assert 'left, right and their rig are written to a folder' in capsys.readouterr().err
     assert not (tmp_path / 'lens.yaml').exists()
-
-
-def test_people_read_mm_and_degrees() -> None:
-    assert _display_unit('position_error_m') == ('position_error_mm', 1000.0)
-    name, scale = _display_unit('rotation_error_rad')
-    assert (name, round(scale, 3)) == ('rotation_error_deg', 57.296)
-    assert _display_unit('rms_px') == ('rms_px', 1.0)
 
 
 def test_the_note_on_formats_comes_once_a_day(

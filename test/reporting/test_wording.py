@@ -27,6 +27,7 @@ from fisheye_svp_ros.diagnosis.decision import EffectBound, Figure, FileFigure, 
 from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason, target_error
 from fisheye_svp_ros.reporting.wording.findings import finding_reason
+from fisheye_svp_ros.reporting.wording.metrics import metric_text
 
 LENS = LensFacts(
     lens_causes=['sensor_tilt'],
@@ -219,3 +220,11 @@ def test_what_separates_a_cause_counts_what_it_imitates() -> None:
     text = separation(dome)
     assert text.startswith(CAUSE.effect_class.to_separate)
     assert text.endswith('; if it is a dome_port, a ray error of 1.2 mrad remains')
+
+
+def test_people_read_mm_and_degrees() -> None:
+    assert metric_text('position_error_m') == ('position_error', 'mm', 1e3)
+    quantity, unit, factor = metric_text('rotation_error_rad')
+    assert (quantity, unit, round(factor, 3)) == ('rotation_error', 'deg', 57.296)
+    assert metric_text('rms_px').title() == 'rms, px'
+    assert metric_text('ambiguous').title() == 'ambiguous'
