@@ -78,8 +78,19 @@ class Cause:
 
     @property
     def status(self) -> Status:
-        """Confirmed where it predicts better, or moves no prediction, and is probable enough."""
-        return status_of(self.probability, isnan(self.heldout_rms_px) or self.gain > 0)
+        """Confirmed where it predicts better, or moves no prediction, and is probable enough.
+
+        Not where nothing of it is larger than its error.
+        """
+        helps = isnan(self.heldout_rms_px) or self.gain > 0
+        return status_of(self.probability, helps and not self.is_within_error)
+
+    @property
+    def is_within_error(self) -> bool:
+        """Whether all of its parameters may as well be zero, by their standard errors."""
+        return bool(self.parameters) and all(
+            abs(one['value']) < one['stderr'] for one in self.parameters.values()
+        )
 
     @property
     def effect_class(self) -> type[Effect]:

@@ -31,10 +31,12 @@ from fisheye_svp_ros.diagnosis.decision import (
 )
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
-from fisheye_svp_ros.diagnosis.findings import Finding, Status
+from fisheye_svp_ros.diagnosis.findings import LIKELY_PROBABILITY, Finding, Status
 from fisheye_svp_ros.diagnosis.lens_evidence import compare_lens_files, find_bounds, find_lens_rays
 from fisheye_svp_ros.diagnosis.random_effects import SAG
 from fisheye_svp_ros.diagnosis.variance_budget import Component
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.effects.target_map import board_maps
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations, frame_names
@@ -354,6 +356,7 @@ def conclude(
     """Return what to do; contradicted: whether the cameras of a rig disagree about the target."""
     ray_errors, offset = find_lens_rays(evaluation, evaluation.selection.problem.inputs.lenses)
     file, gain = compare_lens_files(evaluation), evaluation.gains['named']
+    open_effects = _open_effects(evaluation, candidates)
     lens = decide_lens(
         LensFacts(
             lens_causes=[c.effect for c in causes if c.stage == 'lens'],
@@ -361,13 +364,14 @@ def conclude(
             named_gain=(gain.value, gain.low),
             file=file,
             offset=offset if evaluation.free else None,
-            bounds=find_bounds(evaluation.null),
+            bounds=find_bounds(evaluation.null, open_effects),
             noise_px=evaluation.noise_px,
             falling=evaluation.falling,
             frames=evaluation.frames,
             refuted=[one.effect for one in candidates if one.status is Status.REFUTED],
             rays=_worst_rays(ray_errors),
             written=_unnamed_parts(evaluation),
+            open=open_effects,
         )
     )
     scatter = np.hypot.reduce(
@@ -437,6 +441,18 @@ def _unnamed_parts(evaluation: Evaluation) -> list[str]:
         'image_field': field is not None and bool(field.fields),
     }
     return [name for name, there in parts.items() if there]
+
+
+def _open_effects(evaluation: Evaluation, candidates: Sequence[Finding]) -> list[str]:
+    """Return effects of the lens that are likely, and not confirmed."""
+    likely = {
+        one.effect
+        for one in candidates
+        if one.status is Status.LIKELY and CATALOGUE[one.effect].budget_stage() == 'lens'
+    }
+    if any(one.weight > LIKELY_PROBABILITY for one in evaluation.averaged_model.shifts):
+        likely.add(ViewpointShiftEffect.name)
+    return sorted(likely)
 
 
 def _target_facts(

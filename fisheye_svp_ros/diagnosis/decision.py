@@ -172,7 +172,8 @@ class LensFacts(NamedTuple):
     not fitted; falling: whether no error rises with the causes on the fitted frames; frames: how
     many; refuted: effects that held-out data, or their size, refute;
     rays: expected errors, mrad, of the lens as given and the extended one, over all ranges,
-    zeros where unknown; written: what the extended lens has without a confirmed cause.
+    zeros where unknown; written: what the extended lens has without a confirmed cause;
+    open: effects of the lens that are likely, and not confirmed.
     """
 
     lens_causes: Sequence[str]
@@ -187,6 +188,7 @@ class LensFacts(NamedTuple):
     refuted: Sequence[str] = ()
     rays: tuple[float, float] = (0.0, 0.0)
     written: Sequence[str] = ()
+    open: Sequence[str] = ()
 
     @property
     def is_better_held_out(self) -> bool:
@@ -210,7 +212,9 @@ class LensFacts(NamedTuple):
         likely = (
             one
             for one in self.bounds
-            if one.z > _HINT and one.edge_px > self.noise_px and one.effect not in self.refuted
+            if (one.z > _HINT or one.effect in self.open)
+            and one.edge_px > self.noise_px
+            and one.effect not in self.refuted
         )
         return sorted(likely, key=lambda bound: -bound.edge_px)
 

@@ -14,7 +14,7 @@ from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras
 from fisheye_svp_ros.diagnosis.checks.two_datasets import TwoDatasets
 from fisheye_svp_ros.diagnosis.conclusion import Advice, Conclusion
-from fisheye_svp_ros.diagnosis.decision import Decision, FileFigure
+from fisheye_svp_ros.diagnosis.decision import Decision, FileFigure, LensFacts, LensReason
 from fisheye_svp_ros.diagnosis.evaluation import (
     MAX_RMS_RATIO,
     Evaluation,
@@ -87,7 +87,16 @@ class Diagnosis:
         rest = {one.variable for one in self.remaining} - {'landmark'}
         # Nothing confirms what one frame shows.
         open_effects = self.frames < 2 and self.candidates
-        return 'unexplained' if rest or open_effects else 'adequate'
+        return 'unexplained' if rest or open_effects or self.likely_effects else 'adequate'
+
+    @property
+    def likely_effects(self) -> list[str]:
+        """Effects for which, likely and not confirmed, the lens is undecided."""
+        facts = self.decision['lens'].facts
+        undecided = self.decision['lens'].reason is LensReason.EFFECT_LIKELY
+        if not (undecided and isinstance(facts, LensFacts)):
+            return []
+        return [one.effect for one in facts.likely_effects]
 
     @property
     def decision(self) -> dict[str, Decision]:

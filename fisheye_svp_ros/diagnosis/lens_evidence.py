@@ -123,8 +123,11 @@ def _shared_values(evaluation: Evaluation) -> tuple[Array, Array]:
     return now, given
 
 
-def find_bounds(null: NullModel) -> list[EffectBound]:
-    """Return how large effects that are not in the model may be, the target free as well."""
+def find_bounds(null: NullModel, more: Sequence[str] = ()) -> list[EffectBound]:
+    """Return how large effects that are not in the model may be, the target free as well.
+
+    more: effects beside those that are always bounded.
+    """
     columns, prior = [null.included_columns], [np.zeros(null.column_count)]
     smallest: dict[str, tuple[Effect, Index]] = {}
     for form, effect in enumerate(null.fixed.forms.effects):
@@ -133,7 +136,7 @@ def find_bounds(null: NullModel) -> list[EffectBound]:
             columns.append(mine)
             prior.append(null.prior_precision(mine, effect))
         elif (
-            effect.name in _BOUNDED_EFFECTS
+            effect.name in (*_BOUNDED_EFFECTS, *more)
             and not null.effect_kinds & set(effect.kinds)
             and (effect.name not in smallest or len(mine) < len(smallest[effect.name][1]))
         ):

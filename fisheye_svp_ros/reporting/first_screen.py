@@ -347,6 +347,8 @@ def verdict_words(d: Diagnosis) -> str:
         return 'Unexplained: outliers; nothing else is wrong'
     if d.verdict == 'adequate' and d.offers_extended:
         return f'Adequate: {NO_CONFIRMED_ERROR}'
+    if d.verdict == 'unexplained' and d.likely_effects:
+        return f'Unexplained: {likely_effects(d)}'
     if not d.causes and d.decision['lens'].say == 'recalibrate':
         rest = '; some of the residual error is unexplained' if d.remaining else ''
         return f'{_VERDICTS[d.verdict].partition(":")[0]}: the lens as given is off{rest}'
@@ -379,6 +381,8 @@ def largest_cause(d: Diagnosis) -> str:
         return 'Errors show in one frame, which does not tell their cause'
     if d.decision['lens'].say == 'recalibrate':
         return _capital(decision_reason(d.decision['lens']))
+    if d.likely_effects:
+        return _capital(likely_effects(d))
     if only_gross(d):
         count = len(d.gross)
         return (
@@ -398,6 +402,12 @@ def largest_cause(d: Diagnosis) -> str:
             else 'No model error shows in these data'
         )
     return 'No effect of the catalog explains the residual error'
+
+
+def likely_effects(d: Diagnosis) -> str:
+    """Return what is likely and not confirmed, as a clause."""
+    names = d.likely_effects
+    return f'{" or ".join(names)} is likely, not confirmed'
 
 
 def _displaced_landmarks(d: Diagnosis) -> str:

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from helpers.contradictions import check
 from helpers.flawed_sets import flawed
 
 from fisheye_svp_ros.commands.lenses import load_with_notes
@@ -53,6 +54,7 @@ def test_nothing_reassures_on_inadequate_data(name):
     assert 'keep' not in answers.values()
     assert answers['photographs'] == ('retake' if found.adequacy.is_misfit else 'more')
     assert not any(one.bound or one.confidence is not None for one in found.decision.values())
+    check(found)
     text = screen(found)
     assert 'Keep' not in text and 'Enough' not in text and '% sure' not in text
     if found.adequacy.is_misfit:
@@ -62,6 +64,7 @@ def test_nothing_reassures_on_inadequate_data(name):
 @once('sound')
 def test_sound_data_are_adequate():
     found = diagnosed('sound')
+    check(found)
     assert not found.adequacy.flaws
     assert [one.say for one in found.decision.values()] == ['keep', 'keep', 'enough']
 

@@ -222,3 +222,12 @@ def test_the_largest_error_of_the_target(
     largest = _largest_error(None, [smaller, cause])  # type: ignore[arg-type]
     size, stretched = expected
     assert largest == TargetError(effect, size, stretched=stretched)
+
+
+def test_a_lens_is_not_kept_beside_a_likely_effect_that_costs_more_than_noise() -> None:
+    """Kept beside a shift of probability .87 that may cost more than the noise."""
+    likely = EffectBound('viewpoint_shift', 0.021, 'm', 1.9, 0.24, 0.6)
+    facts = SOUND._replace(bounds=[likely], noise_px=0.2)
+    assert decide_lens(facts).say == 'keep'
+    assert decide_lens(facts._replace(open=['viewpoint_shift'])).say == 'undecided'
+    assert decide_lens(facts._replace(open=['viewpoint_shift'], noise_px=0.3)).say == 'keep'
