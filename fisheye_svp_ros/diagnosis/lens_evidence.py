@@ -261,7 +261,8 @@ def _written_rays(
         lens = evaluation.extended_lenses(linear.state.retract(linear.free, frames, shared))[name]
         return lens if written is None else written.add_to(lens, camera)
 
-    model, there = ray_model(extend_lens, known.covariance[np.ix_(of_lens, of_lens)], uv, ranges)
+    covariance = known.covariance[np.ix_(of_lens, of_lens)]
+    model, there = ray_model(extend_lens, covariance, uv, ranges, known.others[of_lens])
     field = None if written is None else written.fields.get(camera)
     if field is None:
         return model, there

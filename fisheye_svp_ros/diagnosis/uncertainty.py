@@ -20,9 +20,11 @@ from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.written_lens import AveragedModel, CameraField
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.mixed_model import Score, pseudo_inverse
+from fisheye_svp_ros.solve.ray_errors import SAMPLES
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, with_effect
 
 _MAX_MODELS = 40
+_SEED = 0
 _MIN_FRAMES = 3
 _MIN_WEIGHT = 0.01  # probability of an effect below which it moves no ray worth counting
 _ODDS_WINDOW = 6.0  # of the criterion: odds of 20, beyond which a model counts for nothing
@@ -139,12 +141,15 @@ def model_uncertainty(null: NullModel, models: Sequence[OtherModel]) -> Array:
     return np.asarray(np.sqrt(added) / null.scale[:own])
 
 
-def model_covariance(null: NullModel, models: Sequence[OtherModel], into: Array) -> Array:
-    """Return what other likely models add to the covariance (N, N) of a richer model's parameters.
+def draw_models(
+    null: NullModel, models: Sequence[OtherModel], into: Array, rng: np.random.Generator
+) -> Array:
+    """Return by what likely models differ from the chosen one: (N, SAMPLES), each by its weight.
 
-    into (N, X): makes them of the coefficients of all columns, normalised.  Unlike in
-    `model_uncertainty` every parameter counts, with what others do in its place: together they say
-    how far a prediction is off.
+    into (N, X): makes a richer model's parameters of the coefficients of all columns, normalised.
+    Most samples are none where the chosen model is much the likeliest: a covariance would have all
+    of them a little off.  Unlike in `model_uncertainty` every parameter counts, with what others
+    do in its place: together they say how far a prediction is off.
     """
     reported, own = np.eye(len(null.scale)), null.included_columns
     prior = _prior_information(null)
@@ -155,16 +160,17 @@ def model_covariance(null: NullModel, models: Sequence[OtherModel], into: Array)
     into = into / size[:, None]
     estimate, covariance, _ = _estimate(null.information, own, reported)
     base, known = into[:, own] @ estimate, into[:, own] @ covariance @ into[:, own].T
-    added = np.zeros_like(known)
-    for weight, one in zip(model_weights(models), models, strict=True):
+    drawn = []
+    for count, one in zip(rng.multinomial(SAMPLES, model_weights(models)), models, strict=True):
+        if not count:
+            continue
         values, wider = _fit_other_model(null, one, reported, prior)
         step = into[:, one.included]
         sizes, vectors = np.linalg.eigh(step @ wider @ step.T - known)
+        root = vectors * np.sqrt(np.maximum(sizes, 0.0))
         change = step @ values - base
-        added += weight * (
-            (vectors * np.maximum(sizes, 0.0)) @ vectors.T + np.outer(change, change)
-        )
-    return np.asarray(added * np.outer(size, size))
+        drawn.append(change[:, None] + root @ rng.standard_normal((len(root), count)))
+    return np.asarray(np.concatenate(drawn, axis=1) * size[:, None])
 
 
 def model_weights(models: Sequence[OtherModel]) -> Array:
@@ -270,12 +276,14 @@ class LensCovariance:
     """Parameters of the written lens, and of effects of a lens that other likely models have.
 
     linear: the written model, with these effects at zero after its own; covariance (N, N) of all
-    that it shares; ratios (K,): by how much standard errors are larger than by the chosen model,
-    as frames left out say; place (K,): where what that model shares stands among the N.
+    that it shares, by the chosen model; others (N, SAMPLES): by what they are off where another
+    model is true, drawn; ratios (K,): by how much standard errors are larger than by the chosen
+    model, as frames left out say; place (K,): where what that model shares stands among the N.
     """
 
     linear: Linearization
     covariance: Array
+    others: Array
     ratios: Array
     place: Index
 
@@ -292,15 +300,16 @@ class LensCovariance:
             errors = np.hypot(errors, field_uncertainty(null))
         larger = np.nan_to_num(errors) / np.maximum(known, 1e-300)
         ratios = np.where(known > 0, np.maximum(larger, 1.0), 0.0)
-        alone = cls(
-            averaged.linear,
-            averaged.widen(least * np.outer(ratios, ratios)),
-            ratios,
-            averaged.place,
-        )
-        return alone if models is None else alone.with_other_models(null, models)
+        rng = np.random.default_rng(_SEED)
+        others = averaged.draw_shifts(rng, SAMPLES)
+        covariance = np.zeros((len(others), len(others)))
+        covariance[np.ix_(averaged.place, averaged.place)] = least * np.outer(ratios, ratios)
+        alone = cls(averaged.linear, covariance, others, ratios, averaged.place)
+        return alone if models is None else alone.with_other_models(null, models, rng)
 
-    def with_other_models(self, null: NullModel, models: list[OtherModel]) -> LensCovariance:
+    def with_other_models(
+        self, null: NullModel, models: list[OtherModel], rng: np.random.Generator
+    ) -> LensCovariance:
         """Add what other likely models say, those whose effects of the lens can be added."""
         state = self.linear.state
         for form in _likely_forms(null, models):
@@ -322,9 +331,11 @@ class LensCovariance:
             elif _is_of_lens(effect):
                 missing.update(columns.tolist())
         models = [one for one in models if missing.isdisjoint(one.included.tolist())]
-        covariance = model_covariance(null, models, into)
-        covariance[np.ix_(first, first)] += self.covariance
-        return replace(self, linear=linear, covariance=covariance, place=place)
+        covariance = np.zeros((len(names), len(names)))
+        covariance[np.ix_(first, first)] = self.covariance
+        others = rng.permutation(draw_models(null, models, into, rng), axis=1)
+        others[first] += self.others
+        return replace(self, linear=linear, covariance=covariance, others=others, place=place)
 
     def with_field(self, known: CameraField) -> tuple[Array, Array]:
         """Return the covariance (2 Q, 2 Q), px^2, of a field; with what is shared (N, 2 Q)."""

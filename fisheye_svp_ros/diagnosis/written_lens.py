@@ -48,6 +48,7 @@ from fisheye_svp_ros.optics.image_field import MAX_NODES, MIN_NODES, ImageField
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.rig_state import Linearization, with_effect
 
+Rng = np.random.Generator
 SHIFT_SIGMA = 4e-3  # m: of e0 before the data; small lenses that were measured have 1 to 6 mm
 PRIOR_ODDS = 0.3  # of a shift, before the data
 MIN_WEIGHT = PRIOR_ODDS / (1 + PRIOR_ODDS)  # below it the data are evidence against a shift
@@ -217,6 +218,20 @@ class AveragedModel:
         wider = self.root @ self.root.T
         wider[np.ix_(self.place, self.place)] += covariance
         return np.asarray(wider)
+
+    def draw_shifts(self, rng: Rng, samples: int) -> Array:
+        """Return by what the shifts, there or not, put off all that is shared: (N, samples).
+
+        Each is there in its share of the samples: either none, or one beside its estimate.
+        """
+        off = np.zeros((len(self.shifts), samples))
+        for i, one in enumerate(self.shifts):
+            estimate = one.e0 / one.weight
+            within = one.stderr**2 / one.weight - (1 - one.weight) * estimate**2
+            there = rng.random(samples) < one.weight
+            drawn = estimate + np.sqrt(max(within, 0.0)) * rng.standard_normal(samples)
+            off[i] = (np.where(there, drawn, 0.0) - one.e0) / one.stderr
+        return np.asarray(self.root @ off)
 
     def errors(self, errors: ModelErrors) -> ModelErrors:
         """Return what is known of the errors with the shifts, from that without."""

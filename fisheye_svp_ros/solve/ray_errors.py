@@ -16,13 +16,16 @@ from fisheye_svp_ros.optics.lens import Lens
 
 RANGES = (0.3, 1.0, 5.0)  # m
 _STEP = 1e-3  # of a standard error
-_SAMPLES = 1000
+SAMPLES = 1000
 _POINTS = 300  # image points that stand for all
 _STEP_PX = 0.01
 
 
 class RayError(NamedTuple):
-    """Expected rms of the angles, rad, over image points at one range, and its 95 % interval."""
+    """Expected rms of the angles, rad, over image points at one range, and its 95 % interval.
+
+    value: the mean over what the errors may be.
+    """
 
     range_m: float
     value: float
@@ -44,13 +47,15 @@ class RayModel(NamedTuple):
 
     points (R, G, 3), m: of G image points at the ranges (R,); columns (R, G, 3, K): what each
     parameter moves them by over the range, rad, without what a motion of the camera frame does;
-    covariance (K, K) of the parameters; ranges (R,), m.
+    covariance (K, K) of the parameters; ranges (R,), m; others (K, SAMPLES): by what they may be
+    off beside that, drawn, where this is not normal.
     """
 
     points: Array
     columns: Array
     covariance: Array
     ranges: tuple[float, ...] = RANGES
+    others: Array | None = None
 
     @property
     def sd(self) -> Array:
@@ -67,14 +72,14 @@ class RayModel(NamedTuple):
         columns = self.columns.reshape(ranges, 3 * points, count)
         if difference is not None:
             columns = np.concatenate([columns, difference.reshape(ranges, -1, 1)], axis=-1)
-            draws = np.concatenate([draws, np.ones((1, _SAMPLES))])
+            draws = np.concatenate([draws, np.ones((1, SAMPLES))])
         # The mean square over the points is a quadratic form of the parameters.
         form = np.swapaxes(columns, -1, -2) @ columns / points
         rms = np.sqrt(np.maximum((draws * (form @ draws)).sum(axis=1), 0.0))
         return [
             RayError(
                 range_m,
-                float(np.sqrt((one**2).mean())),
+                float(one.mean()),
                 *np.quantile(one, (0.025, 0.975)).tolist(),
             )
             for range_m, one in zip(self.ranges, rms, strict=True)
@@ -115,9 +120,10 @@ class RayModel(NamedTuple):
     def _draw_parameters(self, seed: int) -> Array:
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        return np.asarray(
-            root @ np.random.default_rng(seed).standard_normal((len(root), _SAMPLES))
-        )
+        draws = root @ np.random.default_rng(seed).standard_normal((len(root), SAMPLES))
+        if self.others is not None:
+            draws[: len(self.others)] += self.others
+        return np.asarray(draws)
 
 
 def typical_points(uv: Array) -> Array:
@@ -131,17 +137,21 @@ def ray_model(
     covariance: Array,
     uv: Array,
     ranges: tuple[float, ...] = RANGES,
+    others: Array | None = None,
 ) -> tuple[RayModel, Mask]:
     """Return how parameters move the rays of image points, and which points (G,) have rays.
 
     lens_of: makes a lens of changes (K,) of its parameters; covariance (K, K) of these; uv (G, 2),
-    px; ranges: m.
+    px; ranges: m; others: as in `RayModel`.
     """
     count = len(covariance)
     base = points_on_rays(lens_of(np.zeros(count)), uv, ranges)
     there = np.isfinite(base).all(axis=(0, 2))
     sides = []
-    for k, error in enumerate(np.sqrt(np.maximum(np.diag(covariance), 0.0))):
+    variance = np.maximum(np.diag(covariance), 0.0)
+    if others is not None:
+        variance = variance + (others**2).mean(axis=1)
+    for k, error in enumerate(np.sqrt(variance)):
         step = np.zeros(count)
         step[k] = _STEP * error
         if not step.any():
@@ -156,7 +166,8 @@ def ray_model(
         if sides
         else (np.zeros((*points.shape, 0)))
     )
-    return RayModel(points, without_motion(points, moves), covariance, ranges), np.asarray(there)
+    model = RayModel(points, without_motion(points, moves), covariance, ranges, others)
+    return model, np.asarray(there)
 
 
 def points_on_rays(lens: Lens, uv: Array, ranges: Sequence[float] = RANGES) -> Array:

@@ -15,7 +15,7 @@ from fisheye_svp_ros.diagnosis.uncertainty import LensCovariance, likely_models,
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.ray_errors import ray_model, typical_points
+from fisheye_svp_ros.solve.ray_errors import SAMPLES, ray_model, typical_points
 from fisheye_svp_ros.solve.rig_state import group_by_frame
 
 SIGMA = 0.01
@@ -30,7 +30,7 @@ def stated_mrad(known, given, table, uv):
         state = known.linear.state.retract(known.linear.free, frames, step)
         return extended_lenses({'': given}, state, table)['']
 
-    model, _ = ray_model(extend_lens, known.covariance, uv)
+    model, _ = ray_model(extend_lens, known.covariance, uv, others=known.others)
     return 1e3 * model.errors()[1].value
 
 
@@ -54,10 +54,14 @@ def test_effects_that_hide_each_other_move_rays_less_than_parameters():
 
     errors = total_errors(null)
     parameters_alone = LensCovariance(
-        null.linear, np.diag(errors**2), np.ones(columns), np.arange(columns)
+        null.linear,
+        np.diag(errors**2),
+        np.zeros((columns, SAMPLES)),
+        np.ones(columns),
+        np.arange(columns),
     )
     known = replace(parameters_alone, covariance=np.zeros((columns, columns)))
-    known = known.with_other_models(null, likely_models(null))
+    known = known.with_other_models(null, likely_models(null), rng)
     stated = stated_mrad(known, lens(), table, uv)
     assert off / 3 < stated < 3 * off
     assert stated_mrad(parameters_alone, lens(), table, uv) > 3 * stated

@@ -12,6 +12,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import rotation_from_vector
 from fisheye_svp_ros.solve.ray_errors import (
     RANGES,
+    SAMPLES,
     points_on_rays,
     ray_model,
     without_motion,
@@ -67,12 +68,25 @@ def test_a_focal_length_off_by_one_percent_costs_a_radial_angle() -> None:
     # A motion along the axis takes up most of it at the nearest range, a thirteenth at 5 m.
     np.testing.assert_allclose(model.sd[-1], 0.01 * theta, rtol=0.09)
     error = model.errors()[-1]
-    expected = np.sqrt(np.mean((0.01 * theta) ** 2))
-    assert error.value == pytest.approx(expected, rel=0.1)
+    rms = np.sqrt(np.mean((0.01 * theta) ** 2))
+    assert error.value == pytest.approx(np.sqrt(2 / np.pi) * rms, rel=0.1)
     assert error.low < error.value < error.high
     off = without_motion(model.points, points_on_rays(focal(np.array([8.0])), UV) - model.points)
     both = model.errors(off)[-1]
-    assert both.value == pytest.approx(5**0.5 * error.value, rel=0.05)
+    # Of two standard deviations and a normal deviate: the mean of |2 + z| over that of |z|.
+    assert both.value == pytest.approx(2.017 * np.sqrt(np.pi / 2) * error.value, rel=0.07)
+
+
+def test_what_another_model_says_is_far_off_in_its_share_of_the_draws() -> None:
+    """One in twenty, not all of them a little: the interval of the others stays narrow."""
+    others = np.where(np.arange(SAMPLES) % 20 == 0, 40.0, 0.0)[None]
+    model, _ = ray_model(focal, np.array([[1.0]]), UV, others=others)
+    alone, _ = ray_model(focal, np.array([[1.0]]), UV)
+    mixed, plain = model.errors()[-1], alone.errors()[-1]
+    assert mixed.high > 10 * plain.high and mixed.low < 2 * plain.low
+    assert mixed.value == pytest.approx(
+        0.95 * plain.value + 0.05 * 40 / 0.8 * plain.value, rel=0.1
+    )
 
 
 def test_a_viewpoint_shift_costs_more_the_nearer_the_landmark_is() -> None:
