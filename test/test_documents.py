@@ -14,6 +14,7 @@ from helpers.nodes import ROOT
 
 import fisheye_svp_ros as fsvp
 from fisheye_svp_ros.cli import COMMANDS
+from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
 
 PAGES = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').rglob('*.md')])
 _CODE = re.compile(r'^```.*?^```|`[^`\n]*`', re.DOTALL | re.MULTILINE)
@@ -74,6 +75,12 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     commands = (tmp_path / 'reference' / 'commands.html').read_text(encoding='utf-8')
     for name in COMMANDS:
         assert f'id="{name}"' in commands, name
+
+
+def test_the_lens_files_name_every_curve() -> None:
+    page = (ROOT / 'docs' / 'reference' / 'lens_files.md').read_text(encoding='utf-8')
+    for name in (*IMAGE_HEIGHTS, *VIEWPOINT_SHIFTS):
+        assert f'`{name}`' in page, name
 
 
 def test_a_diagnosis_is_what_its_schema_says() -> None:

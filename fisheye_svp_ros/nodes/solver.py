@@ -395,7 +395,7 @@ class SolverNode(ManagedNode):
         landmarks = self._latched_landmarks.find_for_set(
             read.get('landmarks'), self._join.distance('landmarks', one.stamp)
         )
-        items, self._left_out = self._validation.check(read, landmarks, self.settings.strict)
+        items, self._left_out = self._validation.check(read, landmarks, self.settings)
         for text in self._left_out:
             self.warn(text)
         return items, landmarks

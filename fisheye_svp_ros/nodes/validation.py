@@ -13,6 +13,7 @@ from fisheye_svp_ros.io.decoding import FramedPose, ImagePoints, LandmarkSet, fr
 from fisheye_svp_ros.nodes.join import NeighborPair
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.wording import inputs as wording
+from fisheye_svp_ros.study.settings import SolverSettings
 
 Items = Mapping[str, Any]
 
@@ -63,17 +64,17 @@ class SetValidation:
         return items
 
     def check(
-        self, items: dict[str, Any], landmarks: LandmarkSet, strict: bool
+        self, items: dict[str, Any], landmarks: LandmarkSet, settings: SolverSettings
     ) -> tuple[dict[str, Any], list[str]]:
         """Return what is to be solved, and what was left out of it, as sentences.
 
-        strict: refuse a set with a point of an unknown landmark.  Raises ObservationError for
-        image points of another camera, and where no landmark is known.
+        Raises ObservationError for image points of another camera, where no landmark is known,
+        and, with the setting `strict`, where one is not.
         """
         checked, texts = dict(items), []
         for topic in self._image_points:
             self._check_camera(topic, items[topic].frame)
-            checked[topic], reasons = self._known_points(topic, items[topic], landmarks, strict)
+            checked[topic], reasons = self._known_points(topic, items[topic], landmarks, settings)
             texts += reasons
         for topic in self._true_poses:
             if topic not in items:
@@ -86,7 +87,7 @@ class SetValidation:
         return checked, texts
 
     def _known_points(
-        self, topic: str, seen: ImagePoints, landmarks: LandmarkSet, strict: bool
+        self, topic: str, seen: ImagePoints, landmarks: LandmarkSet, settings: SolverSettings
     ) -> tuple[KnownPoints, list[str]]:
         points, known = landmarks.landmarks.lookup(seen.landmark)
         texts = []
@@ -97,7 +98,7 @@ class SetValidation:
         if known.all():
             return KnownPoints(seen.landmark, seen.uv, points, seen.frame), texts
         unknown = seen.landmark[~known]
-        if strict or not known.any():
+        if settings.strict or not known.any():
             raise ObservationError(wording.unknown_landmark(topic, int(unknown[0])))
         self.rejected[f'{topic}: points of unknown landmarks'] += len(unknown)
         texts.append(wording.unknown_landmarks(topic, unknown.tolist(), len(known)))

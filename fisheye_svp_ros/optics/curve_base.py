@@ -60,8 +60,9 @@ class HeightChange(Protocol):
 class ImageHeight(Curve):
     """An image-height curve for unit focal length; monotone from 0 up to `limit`.
 
-    A new curve gives its `limit` and either `formula` or `value_and_slope`; `columns` where its
-    coefficients are to be fitted.
+    A new curve gives its `limit` (the height is finite there, or the curve has an `angle` of its
+    own) and either `formula` or `value_and_slope`; `columns` where its coefficients are to be
+    fitted.
     """
 
     formula: ClassVar[Formula]

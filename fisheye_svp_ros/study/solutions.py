@@ -31,8 +31,8 @@ _NO_RIG = 'image_points: they do not determine a rig'
 _NO_PAIR = 'image_points: no landmark is in both images'
 Metrics = dict[str, Array]
 
-_FIT_METRICS = ('points', 'rms_px', 'mean_residual_px')
-_POSE = (
+FIT_METRICS = ('points', 'rms_px', 'mean_residual_px')
+_POSE_ERRORS = (
     'position_error_m',
     'position_error_x_m',
     'position_error_y_m',
@@ -40,8 +40,8 @@ _POSE = (
     'rotation_error_rad',
     'axis_error_rad',
 )
-LOCALIZATION_METRICS = (*_FIT_METRICS, *_POSE, 'odds', 'ambiguous')
-STEREO_CALIBRATION_METRICS = ('views', *_FIT_METRICS, *_POSE)
+LOCALIZATION_METRICS = (*FIT_METRICS, *_POSE_ERRORS, 'odds', 'ambiguous')
+STEREO_CALIBRATION_METRICS = ('views', *FIT_METRICS, *_POSE_ERRORS)
 STEREO_DEPTH_METRICS = (
     'points',
     'error2_px',

@@ -47,6 +47,7 @@ from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve import reliability
 from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.study.solutions import FIT_METRICS
 from fisheye_svp_ros.study.trust import localize_with_errors
 
 
@@ -393,7 +394,7 @@ def test_without_the_truth_there_are_no_errors_but_a_pose(graph: Callable[..., G
     sets.tell_landmarks(0, 2.0)
     sets.tell_points(3, 2.0)
     result = sets.result(3)
-    assert tuple(result) == ('points', 'rms_px', 'mean_residual_px', 'odds', 'ambiguous')
+    assert tuple(result) == (*FIT_METRICS, 'odds', 'ambiguous')
     sets.graph.until(lambda: sets.poses)
     assert abs(sets.poses[0].pose.pose.position.z) < 1e-9
 

@@ -13,6 +13,7 @@ from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
 from fisheye_svp_ros.simulate.simulation import simulate_stereo
 from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
 from fisheye_svp_ros.study.solutions import (
+    FIT_METRICS,
     LOCALIZATION_METRICS,
     STEREO_CALIBRATION_METRICS,
     STEREO_DEPTH_METRICS,
@@ -47,7 +48,7 @@ def test_localization_metrics_by_hand():
 
 def test_without_the_truth_there_are_no_errors():
     metrics = localization_metrics(paper_pose(2), RESIDUAL)
-    assert tuple(metrics) == ('points', 'rms_px', 'mean_residual_px')
+    assert tuple(metrics) == FIT_METRICS
     one = np.array([[0.5, 0.25]])
     metrics = stereo_depth_metrics(one, -one, np.ones((1, 2, 3)))
     assert tuple(metrics) == ('points', 'error2_px', 'error2_vertical_px', 'error2_max_px')
