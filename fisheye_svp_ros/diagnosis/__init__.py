@@ -48,7 +48,14 @@ from fisheye_svp_ros.diagnosis.decision import (
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import MAX_RMS_RATIO
-from fisheye_svp_ros.diagnosis.findings import Finding, Reason, Rival, Status, status_of
+from fisheye_svp_ros.diagnosis.findings import (
+    CONFIRMED_PROBABILITY,
+    Finding,
+    Reason,
+    Rival,
+    Status,
+    status_of,
+)
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
 from fisheye_svp_ros.diagnosis.flaws import Flaw, FlawKind
 from fisheye_svp_ros.diagnosis.model_errors import ErrorParts, LensErrors, pose_maps, pose_summary
@@ -60,6 +67,7 @@ from fisheye_svp_ros.diagnosis.uncertainty import standard_errors, total_errors
 from fisheye_svp_ros.diagnosis.variance_budget import stage_shares
 
 __all__ = [
+    'CONFIRMED_PROBABILITY',
     'CONFOUNDED_P',
     'MAX_RMS_RATIO',
     'MIN_FRAMES',

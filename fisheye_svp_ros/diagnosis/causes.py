@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isnan
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index, flat_rows
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
-from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
+from fisheye_svp_ros.diagnosis.effect_tests import RARITY_ODDS, SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.findings import Status, probability_of, status_of
 from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
 from fisheye_svp_ros.diagnosis.variance_budget import NoiseGrowth
@@ -52,7 +53,8 @@ class Cause:
     left out; heldout_rms_px: of held-out frames once it is in the model, after those before it;
     gain: of what held-out frames lose without it; imitations: effects
     that are not tested and that it may stand for; refuted_by_frames: first and last frame of
-    contiguous thirds that are predicted worse with it.
+    contiguous thirds that are predicted worse with it; odds: of each of the confounded set, of
+    which this is the first, where one of them is there; {} of a cause alone.
     """
 
     form: str
@@ -65,6 +67,7 @@ class Cause:
     indistinguishable_from: list[str] = field(default_factory=list)
     imitations: tuple[Imitation, ...] = ()
     refuted_by_frames: tuple[tuple[int, int], ...] = ()
+    odds: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def effect(self) -> str:
@@ -73,7 +76,7 @@ class Cause:
 
     @property
     def probability(self) -> float:
-        """How probable the cause is."""
+        """How probable the cause is, or one of its confounded set."""
         return probability_of(self.p_value)
 
     @property
@@ -119,7 +122,8 @@ def selected_causes(
     causes = []
     for (effect, columns, values), (rms, gain) in zip(found, held_out, strict=True):
         name = effect.name
-        alike = confounded_effects(tests, name, columns)
+        odds = confounded_odds(tests, name, columns)
+        alike = [one for one in odds if one != name]
         score = tests.test_removal(tests.null.included_columns, columns, effect)
         causes.append(
             Cause(
@@ -131,6 +135,7 @@ def selected_causes(
                 heldout_rms_px=rms,
                 gain=gain,
                 indistinguishable_from=alike,
+                odds=odds,
                 imitations=_imitations(tests, alike, columns),
             )
         )
@@ -217,29 +222,40 @@ def _survives(tests: EffectTests, effect: Effect, columns: Index) -> bool:
 
 def confounded_effects(tests: EffectTests, name: str, columns: Index) -> list[str]:
     """Return the effects with which in the model this one would no longer be needed."""
+    return [one for one in confounded_odds(tests, name, columns) if one != name]
+
+
+def confounded_odds(tests: EffectTests, name: str, columns: Index) -> dict[str, float]:
+    """Return how probable each of a confounded set is, one of them being there; {} for one alone.
+
+    The effect is the first; the others are those with which in the model it would no longer be
+    needed.  By the score of each in its place (`EffectTests.log_odds`); what is rarer, or only
+    tested where the user states it, is less likely before the data.
+    """
     if CATALOGUE[name].asked_last:
-        return []
+        return {}
     null = tests.null
     rest = np.setdiff1d(null.included_columns, columns)
-    strength = tests.score_beside(rest, columns).statistic
+    score = tests.score_beside(rest, columns)
     others = [
-        (one.effect, null.form_columns(one.form), one.score.statistic)
-        for one in tests.candidates(rest)
+        (one.effect, null.form_columns(one.form), one.score) for one in tests.candidates(rest)
     ]
     if CATALOGUE[name].budget_stage() == 'lens':
-        others += [
-            (effect, at, tests.score_beside(rest, at).statistic) for effect, at in null.look_alikes
-        ]
-    same: list[str] = []
-    for effect, at, statistic in others:
-        if null.effect_kinds & set(effect.kinds) or effect.name in (name, *same):
+        others += [(effect, at, tests.score_beside(rest, at)) for effect, at in null.look_alikes]
+    odds = {name: tests.log_odds(score) - RARITY_ODDS * bool(CATALOGUE[name].rarer_than)}
+    for effect, at, theirs in others:
+        if null.effect_kinds & set(effect.kinds) or effect.name in odds:
             continue
-        if statistic < _CONFOUNDED_SHARE * strength:
+        if theirs.statistic < _CONFOUNDED_SHARE * score.statistic:
             continue
         own = tests.score_beside(np.concatenate([rest, at]), columns)
         if own.p_value > CONFOUNDED_P:
-            same.append(effect.name)
-    return same
+            rare = bool(effect.rarer_than) or any(effect is one for one, _ in null.look_alikes)
+            odds[effect.name] = tests.log_odds(theirs) - RARITY_ODDS * rare
+    if len(odds) == 1:
+        return {}
+    shares = special.softmax(np.array([*odds.values()]) / 2)
+    return dict(zip(odds, shares.tolist(), strict=True))
 
 
 def _plain_cause(

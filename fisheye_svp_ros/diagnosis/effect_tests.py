@@ -39,6 +39,8 @@ _TURN_SIZES = (0.5, 2.0, 8.0, 32.0, 128.0, 512.0)  # variance over noise of a co
 # Standard errors by which held-out frames must be predicted better to take an effect in, and to
 # keep it: beside what was found since it need not show so clearly.
 _ENTRY_SIGMAS, _STAY_SIGMAS = 1.5, 1.0
+RARITY_ODDS = 4.0  # twice the log odds of an effect to one that looks alike and is rarer
+_MIN_FRAMES = 3
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,16 @@ class EffectTests:
         """Test an effect in the model given everything else that is included."""
         rest = np.setdiff1d(included, columns)
         return self.adjust_p_value(self.score_beside(rest, columns), rest, columns, effect)
+
+    def log_odds(self, score: Score) -> float:
+        """Return twice the logarithm of the odds that an effect of such a score is there (BIC).
+
+        What counts as so many observations are the frames: points of one have errors in common.
+        Source: Raftery 1995, eq. 35; Pauler, The Schwarz criterion and related methods for normal
+        linear models (1998), for the number.
+        """
+        frames = max(self.null.linear.data.frames, _MIN_FRAMES)
+        return float(score.statistic - score.rank * np.log(frames))
 
     def candidates(
         self,

@@ -13,6 +13,7 @@ from scipy import optimize, special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.effect_tests import (
+    RARITY_ODDS,
     SIGNIFICANCE,
     Candidate,
     EffectTests,
@@ -34,7 +35,6 @@ from fisheye_svp_ros.mixed_model import (
 
 # What is named is surer than significant: a local error now and then has the form of an effect.
 NAMED_P = 0.002
-_RARITY_ODDS = 4.0  # twice the log odds of an effect to one that looks alike and is rarer
 # So many landmarks are no single ones any more: of those that are exact, and of those that err
 # from landmark to landmark anyway.
 _MAX_SHARE, _MAX_BESIDE_BULK = 0.12, 3
@@ -89,7 +89,7 @@ def _commoner_candidate(best: Candidate, others: Iterator[Candidate]) -> Candida
     """Return what stands for the best candidate: a part of it, or a more common confounded one."""
     if best.effect.asked_after:
         return next((c for c in others if c.effect.name in best.effect.asked_after), best)
-    near = takewhile(lambda c: c.criterion > best.criterion - _RARITY_ODDS, others)
+    near = takewhile(lambda c: c.criterion > best.criterion - RARITY_ODDS, others)
     if not best.effect.rarer_than:
         return best
     size = len(best.effect.parameters)

@@ -25,7 +25,6 @@ from fisheye_svp_ros.solve.rig_state import Linearization, RigState, with_effect
 
 _MAX_MODELS = 40
 _SEED = 0
-_MIN_FRAMES = 3
 _MIN_WEIGHT = 0.01  # probability of an effect below which it moves no ray worth counting
 _ODDS_WINDOW = 6.0  # of the criterion: odds of 20, beyond which a model counts for nothing
 
@@ -120,10 +119,10 @@ def model_uncertainty(null: NullModel, models: Sequence[OtherModel]) -> Array:
     """Return what other models, likely too, add to standard errors (K,) of what is shared.
 
     Each model with more effects, or with another effect in the place of one, is as probable as its
-    evidence says (`_log_odds`, Occam's window), and adds so much of the variance that it brings
-    and of the square of the change.  Beside a further form of an effect or one that does nearly
-    the same, or without it, its parameters mean something else: for them that model does not
-    count.  What is added is hardly larger than large, however little the data say of it.
+    evidence says (`EffectTests.log_odds`, Occam's window), and adds so much of the variance that
+    it brings and of the square of the change.  Beside a further form of an effect or one that does
+    nearly the same, or without it, its parameters mean something else: for them that model does
+    not count.  What is added is hardly larger than large, however little the data say of it.
     """
     own, reported = null.column_count, _reporting_matrix(null)
     estimate, covariance, _ = _estimate(null.information, np.arange(own), reported)
@@ -197,19 +196,8 @@ def _fit_other_model(
     return estimate, covariance
 
 
-def _log_odds(null: NullModel, score: Score) -> float:
-    """Return twice the logarithm of the odds that an effect of such a score is there (BIC).
-
-    What counts as so many observations are the frames: points of one have errors in common.
-    Source: Raftery 1995, eq. 35; Pauler, The Schwarz criterion and related methods for normal
-    linear models (1998), for the number.
-    """
-    frames = max(null.linear.data.frames, _MIN_FRAMES)
-    return float(score.statistic - score.rank * np.log(frames))
-
-
-def _is_likely(null: NullModel, least: float, score: Score) -> bool:
-    return _log_odds(null, score) > least
+def _is_likely(tests: EffectTests, least: float, score: Score) -> bool:
+    return tests.log_odds(score) > least
 
 
 def likely_models(null: NullModel, averaged_kinds: Collection[str] = ()) -> list[OtherModel]:
@@ -225,9 +213,9 @@ def likely_models(null: NullModel, averaged_kinds: Collection[str] = ()) -> list
         forms, model = max(waiting.items(), key=lambda item: item[1].criterion)
         found[forms] = waiting.pop(forms)
         for one in tests.candidates(
-            model.included, per_frame=False, worth=partial(_is_likely, null, 0.0)
+            model.included, per_frame=False, worth=partial(_is_likely, tests, 0.0)
         ):
-            kinds, gain = _effect_family(one.effect), _log_odds(null, one.score)
+            kinds, gain = _effect_family(one.effect), tests.log_odds(one.score)
             if model.kinds & kinds or {*one.effect.kinds} & {*averaged_kinds}:
                 continue
             if (larger := forms | {one.form}) not in found:
@@ -248,11 +236,13 @@ def _exchange_effects(null: NullModel) -> Iterator[tuple[frozenset[int], OtherMo
             continue
         rest = np.setdiff1d(null.included_columns, columns)
         score = tests.score_beside(rest, columns)
-        lost = _log_odds(null, score)
+        lost = tests.log_odds(score)
         least = lost - _ODDS_WINDOW
-        for one in tests.candidates(rest, per_frame=False, worth=partial(_is_likely, null, least)):
+        for one in tests.candidates(
+            rest, per_frame=False, worth=partial(_is_likely, tests, least)
+        ):
             kinds = frozenset(one.effect.kinds)
-            gain = _log_odds(null, one.score) - lost
+            gain = tests.log_odds(one.score) - lost
             if _is_lasting(one.effect) and not null.effect_kinds & kinds:
                 included = np.concatenate([rest, null.form_columns(one.form)])
                 yield (

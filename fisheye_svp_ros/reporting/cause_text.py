@@ -11,6 +11,7 @@ import numpy as np
 from fisheye_svp_ros.diagnosis import Cause, Diagnosis
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.terminal import UNITS, with_error, without_minus_zero
+from fisheye_svp_ros.reporting.wording.findings import with_odds
 
 HUMAN_UNITS = {
     'm': (1e3, 'mm'),
@@ -148,7 +149,7 @@ def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
     """Yield the table of causes: effect, size, p-value, share, held-out rms, gain, its class."""
     for c in diagnosis.causes:
         rms = '-' if math.isnan(c.heldout_rms_px) else f'{c.heldout_rms_px:.4f}'
-        same = ', '.join(c.indistinguishable_from) or '-'
+        same = ', '.join(with_odds(c, name) for name in c.indistinguishable_from) or '-'
         p_value = bare_probability(c.p_value)
         same += '' if c.survives else '; significant only together with another cause'
         share = percent(c.share) if c.share else '-'

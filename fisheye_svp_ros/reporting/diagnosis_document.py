@@ -54,6 +54,7 @@ class CauseEntry(TypedDict):
     heldout_rms_px: float
     gain: float
     indistinguishable_from: list[str]
+    odds: dict[str, float]
     to_separate: str
     refuted_by_frames: Sequence[tuple[int, int]]
 
@@ -176,6 +177,7 @@ def _cause(one: Cause) -> CauseEntry:
         'heldout_rms_px': one.heldout_rms_px,
         'gain': one.gain,
         'indistinguishable_from': one.indistinguishable_from,
+        'odds': dict(one.odds),
         'to_separate': separation(one),
         'refuted_by_frames': one.refuted_by_frames,
     }

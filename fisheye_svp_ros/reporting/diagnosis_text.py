@@ -24,6 +24,7 @@ from fisheye_svp_ros.reporting.cause_text import (
 from fisheye_svp_ros.reporting.wording.adequacy import flaw_headline, flaw_reason
 from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason
+from fisheye_svp_ros.reporting.wording.findings import with_odds
 from fisheye_svp_ros.scene.observations import frame_name
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
 
@@ -239,7 +240,7 @@ def _almost(d: Diagnosis) -> str:
 
 
 def _name(d: Diagnosis, cause: Cause) -> str:
-    others = join_names(cause.indistinguishable_from, 'or')
+    others = join_names([with_odds(cause, one) for one in cause.indistinguishable_from], 'or')
     assumed = ', assumed by --with' if is_assumed(d, cause) else ''
     return f'{cause.effect}{assumed}' + (f', confounded with {others}' if others else '')
 

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from fisheye_svp_ros.diagnosis import (
+    CONFIRMED_PROBABILITY,
     MAX_RMS_RATIO,
     NAMED_P,
     RETAKE,
@@ -48,7 +49,7 @@ from fisheye_svp_ros.reporting.wording.adequacy import (
     flaw_statement,
 )
 from fisheye_svp_ros.reporting.wording.decisions import bound_place, decision_reason
-from fisheye_svp_ros.reporting.wording.findings import belief, chance, finding_reason
+from fisheye_svp_ros.reporting.wording.findings import belief, chance, finding_reason, with_odds
 from fisheye_svp_ros.reporting.wording.travel import travel_sentence
 from fisheye_svp_ros.scene.observations import photograph_names
 
@@ -271,7 +272,8 @@ def _causes(d: Diagnosis) -> str:
     found = []
     for one in d.causes:
         worse = frame_ranges(d, one.refuted_by_frames)
-        names = ' or '.join([one.effect, *one.indistinguishable_from])
+        every = [one.effect, *one.indistinguishable_from]
+        names = ' or '.join(with_odds(one, name) for name in every)
         doubt = (
             '' if one.status is Status.CONFIRMED else f'{belief(one.status, one.probability)}: '
         )
@@ -430,6 +432,9 @@ def _sentence(d: Diagnosis, cause: Cause) -> str:
     else:
         confirmed = cause.status is Status.CONFIRMED
         doubt = '' if confirmed else f' ({belief(cause.status, cause.probability)})'
+    if cause.odds.get(cause.effect, 1.0) < CONFIRMED_PROBABILITY:
+        others = ' or '.join(with_odds(cause, name) for name in cause.indistinguishable_from)
+        doubt += f', {chance(cause.odds[cause.effect])} sure, or it is {others}'
     return _statement(d, cause) + doubt
 
 

@@ -30,6 +30,8 @@ def test_a_dome_is_in_the_class_of_what_it_looks_like(seen):
     (cause,) = diagnose(*seen).causes
     assert cause.effect in ('decentering', 'sensor_tilt')
     assert 'dome_port' in cause.indistinguishable_from
+    assert {*cause.odds} == {cause.effect, *cause.indistinguishable_from}
+    assert sum(cause.odds.values()) == pytest.approx(1) and cause.odds['dome_port'] > 0.01
     assert '--port dome:' in separation(cause) and 'a ray error of 0.0' in separation(cause)
 
 

@@ -83,7 +83,9 @@ def _moves_predictions(cause: Mapping[str, Any]) -> bool:
 def _confounded(document: Document) -> Iterator[str]:
     names = {cause['effect'] for cause in document['causes']}
     for cause in document['causes']:
-        alike = set(cause['indistinguishable_from'])
+        alike, odds = set(cause['indistinguishable_from']), cause.get('odds')
+        if odds and ({*odds} != {cause['effect'], *alike} or abs(sum(odds.values()) - 1) > 1e-9):
+            yield f'{cause["effect"]} or {alike}: {odds}'
         if alike & names:
             yield f'{cause["effect"]} is not told from {alike & names}, a cause too'
 

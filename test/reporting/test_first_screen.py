@@ -139,6 +139,12 @@ def test_a_board_that_is_longer_one_way_is_not_one_of_another_scale(
         form='landmark_scale',
         parameters={parameter: {'value': 0.0047, 'stderr': 0.0002, 'unit': '1'}},
     )
+    tilt = replace(
+        _tilt(0.005, 0.001),
+        indistinguishable_from=['decentering'],
+        odds={'sensor_tilt': 0.6, 'decentering': 0.4},
+    )
+    assert ', 60 % sure, or it is decentering (40 %).' in headline(replace(found, causes=[tilt]))
     assert headline(replace(found, causes=[scale])).startswith(f'{words} ({parameter} = 0.47')
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fisheye_svp_ros.diagnosis import Finding, Reason, Status
+from fisheye_svp_ros.diagnosis import Cause, Finding, Reason, Status
 
 _CERTAIN = 0.99  # more cannot be said of models and bootstraps
 
@@ -34,6 +34,11 @@ def chance(probability: float) -> str:
 def belief(status: Status, probability: float) -> str:
     """Return status and probability, as the terminal, the report and the node show them."""
     return f'{status.value}, {chance(probability)}'
+
+
+def with_odds(cause: Cause, name: str) -> str:
+    """Return one of the names of a confounded set, with its share in the probability of all."""
+    return f'{name} ({chance(cause.odds[name])})' if name in cause.odds else name
 
 
 def finding_reason(finding: Finding) -> str:
