@@ -182,7 +182,7 @@ def _nominal(lens: fsvp.Lens, test: Observations, start: Localized) -> float:
 def _whole(found: Diagnosis, test: Observations, local: PredictedOffsets | None = None) -> float:
     """Return the rms of all held-out points, outliers among them."""
     data, known = group_by_frame(test), found.model.data.observations.t
-    terms = tuple(e for e in found.model.state.terms if e[0].holds_for(test.t, known))
+    terms = tuple(t for t in found.model.state.terms if t.effect.holds_for(test.t, known))
     solved = localize_frames(data, replace(found.model.state, terms=terms))
     return predict_other_data(data, solved, local).rms
 

@@ -26,6 +26,7 @@ from benchmark.studies.boards import directions
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations
@@ -209,10 +210,10 @@ def refitted(
     data = RigViews.of_one_camera(views)
     uv = Linearization(data, model, ()).linear.uv
     data = replace(data, views=views._replace(uv=uv + NOISE * rng.normal(size=uv.shape)))
-    begun = replace(model, lens=state.lens, terms=((EFFECT, np.zeros(1)),))
+    begun = replace(model, lens=state.lens, terms=(ModelTerm(EFFECT, np.zeros(1)),))
     fitted = adjust(data, begun, linear.free)
     predicted = answers(design, without(design, design.question('e0')))(taken)
-    return float((fitted.terms[0][1][0] - SHIFT) / predicted)
+    return float((fitted.terms[0].values[0] - SHIFT) / predicted)
 
 
 def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
@@ -221,7 +222,7 @@ def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
     lens = study.calibrated(table, image_size)
     data, free = group_by_frame(table), intrinsic_names(lens)
     state = initial_state(data, lens)
-    state = adjust(data, replace(state, terms=((EFFECT, np.zeros(1)),)), free)
+    state = adjust(data, replace(state, terms=(ModelTerm(EFFECT, np.zeros(1)),)), free)
     linear = Linearization(data, state, free)
     square = float((linear.residual**2).sum()) / int(linear.row_mask.sum())
     design = Taken(linear, confounded_effects(linear, ('radial_profile', 'target_shape')), square)
@@ -277,12 +278,15 @@ class Taken(Design):
 
     def __init__(self, linear: Linearization, effects: Sequence[Effect], square: float) -> None:
         """Take a fit, effects that are not in it, and the mean square of whitened residuals."""
-        terms = [*linear.state.terms, *((e, np.zeros(len(e.parameters))) for e in effects)]
+        terms = [
+            *linear.state.terms,
+            *(ModelTerm(e, np.zeros(len(e.parameters))) for e in effects),
+        ]
         self.names = (
             *linear.free,
-            *(f'{e.name}.{p.name}' for e, _ in terms for p in e.parameters),
+            *(f'{t.name}.{p.name}' for t in terms for p in t.effect.parameters),
         )
-        self.values = np.concatenate([np.zeros(len(linear.free)), *(v for _, v in terms)])
+        self.values = np.concatenate([np.zeros(len(linear.free)), *(t.values for t in terms)])
         self.added = information(linear, effects) / square
         self.known = np.diag(1e-9 * np.diag(self.added.sum(axis=0)))
 

@@ -189,7 +189,8 @@ def _named_changes(evaluation: Evaluation, causes: Sequence[Cause]) -> tuple[Arr
     focal, center = np.zeros(count), np.zeros((count, 2))
     named = {cause.effect for cause in causes}
     first = np.unique(linear.data.frame_of, return_index=True)[1]
-    for effect, values in linear.state.terms:
+    for term in linear.state.terms:
+        effect, values = term.effect, term.values
         if effect.name not in named:
             continue
         if isinstance(effect, SessionStepEffect):
@@ -206,7 +207,7 @@ def _is_large(
     effect: FocalDriftEffect | SessionStepEffect, values: Array, evaluation: Evaluation
 ) -> bool:
     """Whether a change is larger than any of a camera at rest, beyond its error."""
-    columns = next(at for one, at, _ in evaluation.null.terms if one.name == effect.name)
+    columns = next(term.columns for term in evaluation.null.terms if term.name == effect.name)
     large = np.array([parameter.large for parameter in effect.parameters])
     least = np.abs(values) - _MIN_SIGMAS * evaluation.errors[columns]
     return bool((least > large).any())

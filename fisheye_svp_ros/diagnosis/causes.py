@@ -14,11 +14,11 @@ from fisheye_svp_ros.arrays import Array, Index, flat_rows
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.effect_tests import RARITY_ODDS, SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.findings import Status, probability_of, status_of
-from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
 from fisheye_svp_ros.diagnosis.variance_budget import NoiseGrowth
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import FlatPortEffect, RadialProfileEffect
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.mixed_model import project_out, pseudo_inverse
 from fisheye_svp_ros.scene.observations import Observations, photograph_entry
 from fisheye_svp_ros.solve.outliers import Outliers
@@ -113,22 +113,22 @@ class Cause:
 
 def selected_causes(
     tests: EffectTests,
-    found: Sequence[PlacedEffect],
+    found: Sequence[ModelTerm],
     errors: Array,
     shares: dict[str, float],
     held_out: Sequence[tuple[float, float]],
 ) -> list[Cause]:
     """Return the causes that move predictions; held_out: rms and gain once each is in."""
     causes = []
-    for (effect, columns, values), (rms, gain) in zip(found, held_out, strict=True):
-        name = effect.name
+    for term, (rms, gain) in zip(found, held_out, strict=True):
+        effect, columns, name = term.effect, term.columns, term.name
         odds = confounded_odds(tests, name, columns)
         alike = [one for one in odds if one != name]
         score = tests.test_removal(tests.null.included_columns, columns, effect)
         causes.append(
             Cause(
                 form=effect.key,
-                parameters=parameters_of(effect, values, errors[columns]),
+                parameters=parameters_of(term, errors),
                 p_value=tests.correct(effect, score.p_value),
                 share=shares[name],
                 survives=_survives(tests, effect, columns),
@@ -200,17 +200,21 @@ def _error_of_imitation(tests: EffectTests, true: Index, columns: Index) -> floa
     return rms_px(linear, remaining.reshape(linear.residual.shape)) / linear.state.lens.focal
 
 
-def parameters_of(effect: Effect, values: Array, errors: Array) -> dict[str, dict[str, Any]]:
-    """Return value, standard error and unit of each parameter (P,) of an effect, by name."""
+def parameters_of(term: ModelTerm, errors: Array) -> dict[str, dict[str, Any]]:
+    """Return value, standard error and unit of each parameter of an effect, by name.
+
+    errors (K,): standard errors of all that is shared.
+    """
+    effect, values = term.effect, term.effect.report_values(term.values)
     return {
         p.name: {'value': float(v), 'stderr': float(e), 'unit': p.unit}
-        for p, v, e in zip(effect.parameters, effect.report_values(values), errors, strict=True)
+        for p, v, e in zip(effect.parameters, values, errors[term.columns], strict=True)
     }
 
 
 def _survives(tests: EffectTests, effect: Effect, columns: Index) -> bool:
     """Whether an effect is needed whichever one other cause is left out."""
-    for _, other, _ in tests.null.terms:
+    for other in (term.columns for term in tests.null.terms):
         included = np.setdiff1d(tests.null.included_columns, other)
         if not np.array_equal(other, columns) and (
             tests.correct(effect, tests.test_removal(included, columns, effect).p_value)

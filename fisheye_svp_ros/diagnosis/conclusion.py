@@ -494,7 +494,7 @@ def _largest_error(evaluation: Evaluation, causes: Sequence[Cause]) -> TargetErr
     worst = max(causes, key=lambda cause: cause.share)
     if worst.effect == 'target_shape':
         linear = evaluation.fixed_model
-        terms = [term for term in linear.state.terms if term[0].name == worst.effect]
+        terms = [term for term in linear.state.terms if term.name == worst.effect]
         maps = board_maps(linear.data.views, terms, linear.state.lens)
         bent = max(maps, key=lambda board: board.peak_to_valley)
         board = bent.board if len(maps) > 1 else None

@@ -167,7 +167,7 @@ def predict_other_data(
 ) -> HeldOut:
     """Predict other frames of the same camera and target, from poses in the state."""
     # In px every point counts alike, however noisy it is.
-    plain = replace(state, terms=tuple(t for t in state.terms if t[0].stage != 'noise'))
+    plain = replace(state, terms=tuple(t for t in state.terms if t.effect.stage != 'noise'))
     data = test if offsets is None else offsets.apply(test)
     fitted = adjust_poses(data, plain)
     if offsets is not None and offsets.views is not None:
@@ -207,11 +207,11 @@ def refit_shared(
     """
     gone = np.zeros(null.column_count, dtype=bool)
     values = np.zeros(null.column_count)
-    for effect, columns, value in null.terms:
-        if effect.name in names:
-            gone[columns], values[columns] = True, value
-        elif effect.name in held:
-            gone[columns] = True
+    for term in null.terms:
+        if term.name in names:
+            gone[term.columns], values[term.columns] = True, term.values
+        elif term.name in held:
+            gone[term.columns] = True
     combination = np.zeros(len(information))
     combination[-1] = 1.0
     # Without an effect its displacement comes back into the residual.
@@ -312,7 +312,8 @@ def valid_state(
         terms=tuple(
             term
             for term in state.terms
-            if term[0].holds_for(t, known) and not (another_target and term[0].place == 'target')
+            if term.effect.holds_for(t, known)
+            and not (another_target and term.effect.place == 'target')
         ),
     )
 
@@ -369,21 +370,23 @@ def refuting_blocks(null: NullModel, fitted: FittedModel) -> dict[str, tuple[End
     Nothing of few frames; random effects are not predicted.
     """
     linear, own = null.linear, null.included_columns
-    lasting = [term for term in null.terms if not (term[0].per_frame or term[0].of_recording)]
+    lasting = [
+        term for term in null.terms if not (term.effect.per_frame or term.effect.of_recording)
+    ]
     block, ends = contiguous_blocks(linear.data)
     if linear.data.frames < _MIN_FRAMES or len(ends) < BLOCKS:
         return {}
     border = border_of(linear, linear.shared_columns / null.scale[own])
-    models = [own, *(np.setdiff1d(own, columns) for _, columns, _ in lasting)]
+    models = [own, *(np.setdiff1d(own, term.columns) for term in lasting)]
     found: dict[str, tuple[Ends, ...]] = {}
     for i, edge in enumerate(ends):
         out = block == i
         information = split_frames(fitted, null.variances, out)[0].information
         predicted = np.stack([_predict(null, information, model) for model in models], axis=-1)
         whole, *without = misfits(linear, out, border[out] @ predicted)
-        for (effect, _, _), square in zip(lasting, without, strict=True):
+        for term, square in zip(lasting, without, strict=True):
             if whole > _MAX_SQUARE_RATIO * square:
-                found[effect.name] = (*found.get(effect.name, ()), edge)
+                found[term.name] = (*found.get(term.name, ()), edge)
     return found
 
 

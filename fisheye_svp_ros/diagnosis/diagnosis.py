@@ -256,7 +256,7 @@ class Diagnosis:
     def board_maps(self, names: Sequence[str] = ()) -> list[BoardMap]:
         """Return how the target differs from what it is said to be; names: by these effects."""
         state = self.model.state
-        terms = [term for term in state.terms if not names or term[0].name in names]
+        terms = [term for term in state.terms if not names or term.name in names]
         return board_maps(self.model.data.views, terms, state.lens)
 
     @property

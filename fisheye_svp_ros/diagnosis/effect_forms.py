@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from scipy import sparse
@@ -17,8 +18,8 @@ from scipy.spatial import cKDTree
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.base import Effect, Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.of_cameras import OfCameras, by_camera, combine_cameras
 from fisheye_svp_ros.effects.recording_effects import SessionStepEffect
+from fisheye_svp_ros.effects.rig_effect import assign_camera
 from fisheye_svp_ros.solve.rig_state import Linearization
 
 _LONGEST_PAUSES = 4
@@ -108,9 +109,7 @@ def simplest_form(kind: type[Effect], linear: Linearization) -> Effect:
 
     Raises Untestable where there is none.
     """
-    first = [forms[0] for forms in _forms(kind, linear)]
-    own = [effect for effect in first if isinstance(effect, OfCameras)]
-    return combine_cameras(own) if own else first[0]
+    return _merge([forms[0] for forms in _forms(kind, linear)])
 
 
 def _forms(kind: type[Effect], linear: Linearization) -> list[Sequence[Effect]]:
@@ -127,7 +126,7 @@ def _forms(kind: type[Effect], linear: Linearization) -> list[Sequence[Effect]]:
     for _, camera, own in scene.cameras:
         try:
             forms = _catalogue_forms(kind, own, linear.free)
-            found.append(by_camera(camera, labels[camera], forms))
+            found.append([assign_camera(form, camera, labels[camera]) for form in forms])
         except Untestable as why:
             reason = why
     if not found:
@@ -147,13 +146,13 @@ def _common_forms(
 
     What lenses of one kind have in common they show together before one of them shows it.
     """
-    alike: dict[str, list[tuple[OfCameras, Index]]] = {}
+    alike: dict[str, list[tuple[Effect, Index]]] = {}
     for effect, own in zip(effects, at, strict=True):
-        if isinstance(effect, OfCameras):
-            alike.setdefault(effect.parts[0][2].key, []).append((effect, own))
+        if effect.cameras:
+            alike.setdefault(effect.form.key, []).append((effect, own))
     return [
         (
-            combine_cameras([effect for effect, _ in forms]),
+            _merge([effect for effect, _ in forms]),
             np.concatenate([own for _, own in forms]),
         )
         for forms in alike.values()
@@ -161,9 +160,14 @@ def _common_forms(
     ]
 
 
+def _merge(effects: Sequence[Effect]) -> Effect:
+    """Return forms of one effect as one."""
+    return reduce(lambda known, effect: known.merge_with(effect), effects)
+
+
 def _longest_pauses(steps: Sequence[Effect]) -> list[Effect]:
     """Return steps at the longest pauses between frames, where sessions are likely to change."""
-    plain = [step.parts[0][2] if isinstance(step, OfCameras) else step for step in steps]
+    plain = [step.form for step in steps]
     starts = np.array([step.starts[0] for step in plain if isinstance(step, SessionStepEffect)])
     pauses = np.diff(starts, prepend=starts[:1])
     return [steps[i] for i in np.sort(np.argsort(-pauses, kind='stable')[:_LONGEST_PAUSES])]

@@ -139,7 +139,7 @@ class Evaluation:
     @property
     def names(self) -> list[str]:
         """The names of the causes that move predictions."""
-        return [effect.name for effect, _, _ in self.selection.causes]
+        return [cause.name for cause in self.selection.causes]
 
     @cached_property
     def averaged_model(self) -> AveragedModel:
@@ -288,7 +288,9 @@ class Evaluation:
         if self.medium is not None:
             return self.fixed_model  # the lens as it is in air was no free fit either
         start = self.null.linear.state
-        return self._adjust(replace(start, terms=tuple(t for t in start.terms if is_shared(t[0]))))
+        return self._adjust(
+            replace(start, terms=tuple(t for t in start.terms if is_shared(t.effect)))
+        )
 
     def _adjust(self, state: RigState) -> Linearization:
         """Return a state fitted by least squares."""
@@ -391,10 +393,11 @@ class Evaluation:
         p_values = (
             component_significance(null)
             | {
-                effect.name: tests.correct(
-                    effect, tests.test_removal(null.included_columns, columns, effect).p_value
+                cause.name: tests.correct(
+                    cause.effect,
+                    tests.test_removal(null.included_columns, cause.columns, cause.effect).p_value,
                 )
-                for effect, columns, _ in self.selection.causes
+                for cause in self.selection.causes
             }
             | dict(noise_causes)
         )

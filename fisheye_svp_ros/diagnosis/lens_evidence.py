@@ -116,10 +116,10 @@ def _shared_values(evaluation: Evaluation) -> tuple[Array, Array]:
     now = np.append(np.zeros(start), null.linear.state.shared_values(free))
     stated, given = stated_parameters(problem.inputs.lenses), now.copy()
     given[start : start + len(free)] = [stated[name][0] for name in free]
-    before = {effect.name: values for effect, values in problem.base.terms}
-    for effect, columns, values in null.terms:
-        held = before.get(effect.name)
-        given[columns] = 0.0 if held is None or len(held) != len(values) else held
+    before = {term.name: term.values for term in problem.base.terms}
+    for term in null.terms:
+        held = before.get(term.name)
+        given[term.columns] = 0.0 if held is None or len(held) != len(term.values) else held
     return now, given
 
 

@@ -23,7 +23,7 @@ from fisheye_svp_ros.diagnosis.random_effects import (
     ColumnGeometry,
     make_random_effects,
 )
-from fisheye_svp_ros.effects.base import Effect, Term
+from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.extension import Target
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import LensError
@@ -208,15 +208,18 @@ def pose_maps(columns: Array) -> Array:
 def shared_names(linear: Linearization) -> tuple[str, ...]:
     """Return the names of what is shared in a linearization: rig, intrinsics, effects."""
     terms = [
-        name for term in linear.state.terms if is_shared(term[0]) for name in parameter_names(term)
+        name
+        for term in linear.state.terms
+        if is_shared(term.effect)
+        for name in parameter_names(term.effect)
     ]
     rig = (f'rig.{i}' for i in range(6 * (linear.data.cameras - 1)))
     return (*rig, *linear.free, *terms)
 
 
-def parameter_names(term: Term) -> list[str]:
+def parameter_names(effect: Effect) -> list[str]:
     """Return the names of the parameters of an effect, with its own before them."""
-    return [f'{term[0].name}.{parameter.name}' for parameter in term[0].parameters]
+    return [f'{effect.name}.{parameter.name}' for parameter in effect.parameters]
 
 
 def _shared_columns(linear: Linearization) -> Array:
@@ -230,9 +233,9 @@ def _shared_columns(linear: Linearization) -> Array:
 def mask_shared(linear: Linearization, which: Callable[[Effect], bool]) -> Mask:
     """Return which of what is shared (K,) are intrinsics, or effects of some kind."""
     own = [
-        np.full(len(values), which(effect))
-        for effect, values in linear.state.terms
-        if is_shared(effect)
+        np.full(len(term.values), which(term.effect))
+        for term in linear.state.terms
+        if is_shared(term.effect)
     ]
     return np.concatenate(
         [
@@ -300,7 +303,7 @@ def _numbers(lens: Lens) -> dict[str, float]:
         **{
             name: float(value)
             for term in terms
-            for name, value in zip(parameter_names(term), term[1], strict=True)
+            for name, value in zip(parameter_names(term.effect), term.values, strict=True)
         },
     }
 

@@ -29,6 +29,7 @@ from fisheye_svp_ros.diagnosis.random_effects import (
 )
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.mixed_model import (
     LAMBDA_ABSENT,
     Equations,
@@ -57,7 +58,6 @@ _FRAME_STEPS = 6  # the likelihood is flat around the best variances
 _SIMILAR_POSE = 0.1  # of the distance, or rad
 _MIN_CLUSTERS = 3  # fewer are no sample
 
-PlacedEffect = tuple[Effect, Index, Array]  # an effect, its columns among shared ones, its values
 Alternative = tuple[float, Array]  # log determinant and information of the border
 
 
@@ -268,17 +268,17 @@ class NullModel:
         return np.asarray(whole - lost)
 
     @property
-    def terms(self) -> list[PlacedEffect]:
-        """Each effect in the model, its columns among what is shared, and its values."""
-        terms = [term for term in self.linear.state.terms if is_shared(term[0])]
-        ends = np.cumsum([0, *(len(values) for _, values in terms)])
+    def terms(self) -> list[ModelTerm]:
+        """Each effect in the model, with its columns among what is shared."""
+        terms = [term for term in self.linear.state.terms if is_shared(term.effect)]
+        ends = np.cumsum([0, *(len(term.values) for term in terms)])
         columns = np.split(self.included_columns, self.column_count - ends[-1] + ends)[1:-1]
-        return [(effect, at, values) for (effect, values), at in zip(terms, columns, strict=True)]
+        return [replace(term, columns=at) for term, at in zip(terms, columns, strict=True)]
 
     @property
     def effect_kinds(self) -> set[str]:
         """Names of the effects in the model, for each camera of a rig that has one for itself."""
-        return {kind for effect, _ in self.linear.state.terms for kind in effect.kinds}
+        return {kind for term in self.linear.state.terms for kind in term.effect.kinds}
 
     def form_columns(self, form: int) -> Index:
         """Return the border's columns of a form."""
@@ -309,9 +309,10 @@ class NullModel:
         """
         combination = np.zeros(len(self.scale) + 1)
         combination[-1] = 1.0
-        for _, columns, values in self.terms:
-            gone = ~np.isin(columns, included)
-            combination[columns[gone]] = (values * self.scale[columns])[gone]
+        for term in self.terms:
+            gone = ~np.isin(term.columns, included)
+            displaced = term.values * self.scale[term.columns]
+            combination[term.columns[gone]] = displaced[gone]
         return combination
 
     def restrict_information(
@@ -385,10 +386,10 @@ def prior_products(linear: Linearization, state: RigState, scale: Array, sigma: 
     Source: Theil and Goldberger, On pure and mixed statistical estimation in economics,
     International Economic Review 2 (1961).
     """
-    terms = [term for term in state.terms if is_shared(term[0])]
-    values = np.concatenate([np.zeros(0), *(values for _, values in terms)])
+    terms = [term for term in state.terms if is_shared(term.effect)]
+    values = np.concatenate([np.zeros(0), *(term.values for term in terms)])
     expected = np.concatenate(
-        [np.zeros(0), *(effect.prior_sigma(linear.scene) for effect, _ in terms)]
+        [np.zeros(0), *(term.effect.prior_sigma(linear.scene) for term in terms)]
     )
     at = linear.shared_columns.shape[-1] - len(values) + np.arange(len(values))
     rows = np.zeros((len(values), len(scale) + 1))

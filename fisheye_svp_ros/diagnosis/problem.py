@@ -25,8 +25,8 @@ from fisheye_svp_ros.effects.extension import (
     landmark_rows,
     on_boards,
 )
-from fisheye_svp_ros.effects.of_cameras import camera_terms
 from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
+from fisheye_svp_ros.effects.terms import camera_terms
 from fisheye_svp_ros.errors import GeometryError, ObservationError, ParameterError
 from fisheye_svp_ros.mixed_model import eliminate
 from fisheye_svp_ros.optics.lens import Lens
@@ -229,7 +229,7 @@ class Problem:
     @property
     def given_effects(self) -> tuple[Effect, ...]:
         """The effects that the lens came with."""
-        return tuple(effect for effect, _ in self.base.terms)
+        return tuple(term.effect for term in self.base.terms)
 
 
 def _lenses(state: RigState) -> dict[str, Any]:
@@ -333,7 +333,7 @@ def extended_lenses(
 ) -> dict[str, Lens]:
     """Return the lenses that were fitted, with their effects, for every command and node."""
     # What happened to one recording is no part of the lens.
-    lasting = [term for term in state.terms if not term[0].of_recording]
+    lasting = [term for term in state.terms if not term.effect.of_recording]
     extended = {}
     for camera, (name, fitted) in enumerate(zip(lenses, state.lenses, strict=True)):
         # A fitted height curve may turn a little earlier than the one the lens came with.

@@ -23,7 +23,6 @@ from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
 from fisheye_svp_ros.diagnosis.null_model import (
     FINEST_FIELD,
     NullModel,
-    PlacedEffect,
 )
 from fisheye_svp_ros.diagnosis.problem import Problem, Progress
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
@@ -37,6 +36,7 @@ from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.detection_effects import NoiseVsAngleEffect
 from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.mixed_model import Variances, pseudo_inverse
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, shorten_step
@@ -88,9 +88,9 @@ class Selection:
         return self.null.linear.state
 
     @property
-    def causes(self) -> list[PlacedEffect]:
+    def causes(self) -> list[ModelTerm]:
         """What was found: effects, their columns among what is shared, values."""
-        return [term for term in self.null.terms if term[0] not in self.problem.given_effects]
+        return [term for term in self.null.terms if term.effect not in self.problem.given_effects]
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ def _change_effects(problem: Problem, search: _Search, null: NullModel, most: in
     if gone or forms:
         return replace(search, state=_change_state(null, included, gone, forms))
     name = LandmarkSurveyEffect.name
-    if name in options.left_out or any(e.name == name for e, _ in search.state.terms):
+    if name in options.left_out or any(term.name == name for term in search.state.terms):
         return search
     found = find_single_landmarks(tests)
     if found is None:
@@ -218,7 +218,7 @@ def _revise_outliers(problem: Problem, search: _Search, fitted: FittedModel) -> 
     changed = len(kept.rows) < len(problem.outliers.rows) or len(outliers.rows) > len(kept.rows)
     state = search.state
     if growth is not None:
-        term = (NoiseVsAngleEffect(), np.array([growth.value]))
+        term = ModelTerm(NoiseVsAngleEffect(), np.array([growth.value]))
         state = replace(state, terms=(*state.terms, term))
     elif changed:
         state = replace(state)  # the same, to be fitted to other data

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.diagnosis.causes import (
     Cause,
     confounded_effects,
@@ -38,7 +38,6 @@ from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.findings import Finding, Reason, Rival, Status
 from fisheye_svp_ros.diagnosis.model_errors import with_uncertainty
-from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
 from fisheye_svp_ros.diagnosis.problem import (
     DiagnosisOptions,
     Inputs,
@@ -55,6 +54,7 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
     significant_components,
 )
 from fisheye_svp_ros.effects.base import Effect
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -314,26 +314,26 @@ class _Doubt(NamedTuple):
     """A cause that is not confirmed; z: of what it gains on held-out frames."""
 
     z: float
-    cause: PlacedEffect
+    cause: ModelTerm
     reason: Reason
     rival: Rival | None
 
 
-def _weakest_cause(evaluation: Evaluation) -> tuple[PlacedEffect, Finding] | None:
+def _weakest_cause(evaluation: Evaluation) -> tuple[ModelTerm, Finding] | None:
     """Return the cause that is confirmed least and why it is not, if there is one."""
     doubts = list(_doubts(evaluation))
     if not doubts:
         return None
     z, cause, reason, rival = min(doubts, key=lambda one: one.z)
-    effect, columns, values = cause
+    effect = cause.effect
     tests = EffectTests(evaluation.null)
-    p_value = tests.test_removal(evaluation.null.included_columns, columns, effect).p_value
+    p_value = tests.test_removal(evaluation.null.included_columns, cause.columns, effect).p_value
     return cause, Finding(
         form=effect.key,
         reason=reason,
         p_value=p_value,
         p_corrected=tests.correct(effect, p_value),
-        parameters=parameters_of(effect, values, evaluation.errors[columns]),
+        parameters=parameters_of(cause, evaluation.errors),
         rival=rival,
         z=z,
     )
@@ -345,13 +345,13 @@ def _doubts(evaluation: Evaluation) -> Iterator[_Doubt]:
     tests, full = EffectTests(null), cross_validate(null)
     kept = full.is_predictable
     twins = [
-        (effect.name, columns, confounded_effects(tests, effect.name, columns))
-        for effect, columns, _ in null.terms
-        if not effect.per_frame
+        (term.name, term.columns, confounded_effects(tests, term.name, term.columns))
+        for term in null.terms
+        if not term.effect.per_frame
     ]
     other = None if evaluation.held_out is None else evaluation.predict()
     for cause in selection.causes:
-        effect, columns, values = cause
+        effect, columns = cause.effect, cause.columns
         if effect.name in selection.problem.options.included or effect.per_frame:
             continue
         z = _gain_in_sigmas(cross_validate(null, [effect.name]).take(kept), full.take(kept))
@@ -366,7 +366,7 @@ def _doubts(evaluation: Evaluation) -> Iterator[_Doubt]:
                 reason, z = (Reason.REFUTED_BY_FILE if z_file < -1 else Reason.NO_GAIN), z_file
         if reason is None:
             reason, rival = find_confounder(tests, effect, columns, twins)
-        if reason is None and _is_implausible(effect, values):
+        if reason is None and _is_implausible(cause):
             reason = Reason.IMPLAUSIBLE
         if reason is not None:
             yield _Doubt(z, cause, reason, rival)
@@ -407,9 +407,9 @@ def _holds_back(candidates: Sequence[Finding]) -> bool:
     return any(one.reason is Reason.IMPLAUSIBLE for one in candidates)
 
 
-def _is_implausible(effect: Effect, values: Array) -> bool:
+def _is_implausible(cause: ModelTerm) -> bool:
     """Say whether an effect is larger than in any real lens."""
-    return effect.name == 'viewpoint_shift' and bool(abs(values[0]) > _FAR_SHIFT)
+    return cause.name == 'viewpoint_shift' and bool(abs(cause.values[0]) > _FAR_SHIFT)
 
 
 def _confirm(selection: Selection, medium: Medium | None) -> tuple[Evaluation, list[Finding]]:
@@ -420,16 +420,16 @@ def _confirm(selection: Selection, medium: Medium | None) -> tuple[Evaluation, l
         weakest = _weakest_cause(evaluation)
         if weakest is None:
             return evaluation, _add_refused_causes(selection, candidates)
-        (effect, _, values), finding = weakest
-        candidates[effect.name] = finding
-        selection = without_cause(selection, effect.name)
-        if finding.status is Status.REFUTED or _is_implausible(effect, values):
-            selection = replace(selection, refuted=(*selection.refuted, effect.name))
+        cause, finding = weakest
+        candidates[cause.name] = finding
+        selection = without_cause(selection, cause.name)
+        if finding.status is Status.REFUTED or _is_implausible(cause):
+            selection = replace(selection, refuted=(*selection.refuted, cause.name))
 
 
 def _add_refused_causes(selection: Selection, found: Mapping[str, Finding]) -> list[Finding]:
     """Return also what was significant in the selection and did not predict better."""
-    known = {effect.name for effect, _, _ in selection.causes}
+    known = {cause.name for cause in selection.causes}
     every = dict(found)
     alone = selection.null.linear.data.frames < 2
     reason = Reason.NO_OTHER_FRAME if alone else Reason.NO_GAIN

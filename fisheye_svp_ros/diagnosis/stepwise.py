@@ -130,7 +130,8 @@ def eliminate_effects(
     gone: list[Finding] = []
     while True:
         weakest: tuple[float, Index, Finding] | None = None
-        for effect, columns, _ in tests.null.terms:
+        for term in tests.null.terms:
+            effect, columns = term.effect, term.columns
             if effect.name in known or not np.isin(columns, included).all():
                 continue
             step = _test_removal(tests, included, effect, columns, quick)

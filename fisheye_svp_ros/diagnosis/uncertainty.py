@@ -74,9 +74,9 @@ def standard_errors(null: NullModel, jackknife: bool = True) -> Array:
 def _reporting_matrix(null: NullModel) -> Array:
     """Return what makes coefficients (X,), normalised, those that are reported: (X, X)."""
     found = np.eye(len(null.scale))
-    for effect, columns, _ in null.terms:
-        scale = null.scale[columns]
-        own = effect.report_values(np.eye(len(columns)))
+    for term in null.terms:
+        columns, scale = term.columns, null.scale[term.columns]
+        own = term.effect.report_values(np.eye(len(columns)))
         found[np.ix_(columns, columns)] = scale[:, None] * own / scale
     return found
 
@@ -133,9 +133,9 @@ def model_uncertainty(null: NullModel, models: Sequence[OtherModel]) -> Array:
         other, wider = _fit_other_model(null, one, reported, prior)
         change = other[there] - estimate[at]
         more[at] = np.maximum(np.diag(wider)[there] - np.diag(covariance)[at], 0.0) + change**2
-        for effect, columns, _ in null.terms:
-            if one.kinds & _effect_family(effect):
-                more[columns] = 0.0
+        for term in null.terms:
+            if one.kinds & _effect_family(term.effect):
+                more[term.columns] = 0.0
         added += weight * more
     return np.asarray(np.sqrt(added) / null.scale[:own])
 
@@ -231,7 +231,8 @@ def _exchange_effects(null: NullModel) -> Iterator[tuple[frozenset[int], OtherMo
     Beside other effects of the recording intrinsics mean something else: those stay as they are.
     """
     tests = EffectTests(null)
-    for i, (effect, columns, _) in enumerate(null.terms):
+    for i, term in enumerate(null.terms):
+        effect, columns = term.effect, term.columns
         if not _is_lasting(effect):
             continue
         rest = np.setdiff1d(null.included_columns, columns)
@@ -315,7 +316,7 @@ class LensCovariance:
         into[place, own] = 1 / null.scale[own]
         missing: set[int] = set()
         for form, effect in enumerate(null.fixed.forms.effects):
-            columns, theirs = null.form_columns(form), parameter_names((effect, np.zeros(0)))
+            columns, theirs = null.form_columns(form), parameter_names(effect)
             if set(theirs) <= set(names):
                 into[[names.index(name) for name in theirs], columns] = 1 / null.scale[columns]
             elif _is_of_lens(effect):
@@ -335,7 +336,7 @@ class LensCovariance:
 
 
 def _effect_names(state: RigState) -> set[str]:
-    return {name for term in state.terms for name in parameter_names(term)}
+    return {name for term in state.terms for name in parameter_names(term.effect)}
 
 
 def _is_of_lens(effect: Effect) -> bool:

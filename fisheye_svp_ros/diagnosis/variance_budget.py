@@ -19,10 +19,11 @@ from scipy import optimize, special
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import MIN_PAIRS, FittedModel
-from fisheye_svp_ros.diagnosis.null_model import NullModel, PlacedEffect
+from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.mixed_model import (
     component_p_values,
     component_traces,
@@ -62,7 +63,7 @@ class Component(NamedTuple):
     p_value: float
 
 
-def cause_squares(null: NullModel, causes: Sequence[PlacedEffect]) -> dict[str, float]:
+def cause_squares(null: NullModel, causes: Sequence[ModelTerm]) -> dict[str, float]:
     """Return the mean squared displacement of each cause, px^2, poses and intrinsics taken out.
 
     What causes do together is shared between them by Shapley's value: the mean, over all orders,
@@ -76,8 +77,9 @@ def cause_squares(null: NullModel, causes: Sequence[PlacedEffect]) -> dict[str, 
     f = factor_equations(null.full.select(nothing.alive), nothing.lam, null.variances.weight)
     every = np.zeros(null.column_count)
     owner = np.full(null.column_count, -1)
-    for one, (_, columns, values) in enumerate(causes):
-        every[columns], owner[columns] = values * null.scale[columns], one
+    for number, cause in enumerate(causes):
+        every[cause.columns] = cause.values * null.scale[cause.columns]
+        owner[cause.columns] = number
     rest = np.flatnonzero(owner < 0)
     remaining = eliminate(f.information, rest)[: null.column_count, : null.column_count]
     signal = remaining @ every
@@ -89,18 +91,18 @@ def cause_squares(null: NullModel, causes: Sequence[PlacedEffect]) -> dict[str, 
 
     px2, count = _px2(null), len(causes)
     squares = {}
-    for one, (effect, _, _) in enumerate(causes):
-        others = [other for other in range(count) if other != one]
+    for number, cause in enumerate(causes):
+        others = [other for other in range(count) if other != number]
         added = [
             np.mean(
                 [
-                    explained_square(tuple(sorted((*some, one)))) - explained_square(some)
+                    explained_square(tuple(sorted((*some, number)))) - explained_square(some)
                     for some in combinations(others, size)
                 ]
             )
             for size in range(count)
         ]
-        squares[effect.name] = max(float(np.mean(added)), 0.0) * px2
+        squares[cause.name] = max(float(np.mean(added)), 0.0) * px2
     return squares
 
 

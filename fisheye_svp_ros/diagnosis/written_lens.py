@@ -35,7 +35,6 @@ from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.random_effects import ImageGrid
 from fisheye_svp_ros.diagnosis.selection import Selection
 from fisheye_svp_ros.effects.base import Effect
-from fisheye_svp_ros.effects.of_cameras import OfCameras
 from fisheye_svp_ros.effects.ray_effects import FlatPortEffect, ViewpointShiftEffect
 from fisheye_svp_ros.mixed_model import (
     Variances,
@@ -200,7 +199,7 @@ class AveragedModel:
             averaged,
             tuple(
                 AveragedShift(
-                    effect.parts[0][1] if isinstance(effect, OfCameras) else '',
+                    next(iter(effect.cameras), ''),
                     float(found.weight[i]),
                     float(found.mean[i]),
                     float(found.stderr[i]),

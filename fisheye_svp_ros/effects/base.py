@@ -14,10 +14,9 @@ from __future__ import annotations
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
-from math import prod
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -31,6 +30,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.boards import Board, find_boards
 from fisheye_svp_ros.scene.observations import Views
 
+DIMENSIONS = {'target': 3, 'pose': 6, 'ray': 2, 'image': 2, 'detector': 2, 'noise': 0}  # D
 _PAUSE = 4.0  # times the median time between views: over so long no motion is known
 _MAX_PLAUSIBLE = 30.0  # times what would be a large value of a parameter
 
@@ -252,6 +252,20 @@ class Effect(ABC):
         return (self.name,)
 
     @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras of a rig that have it, each for itself; none where all have it as one."""
+        return ()
+
+    @property
+    def form(self) -> Effect:
+        """What it is, whichever camera has it."""
+        return self
+
+    def forms_of_camera(self, camera: int) -> Iterator[tuple[Effect, Index]]:
+        """Yield what acts in the views of a camera, and which of the parameters are its own."""
+        yield self, np.arange(len(self.parameters))
+
+    @property
     def key(self) -> str:
         """A short name of this form, unique within a data set."""
         parts = [
@@ -308,9 +322,6 @@ class PlaneEffect(Effect):
         return values / ratio
 
 
-Term = tuple[Effect, Array]
-
-
 class NoiseEffect(Effect):
     """An effect that moves no prediction: it changes the scatter or the table itself."""
 
@@ -326,15 +337,6 @@ class NoiseEffect(Effect):
     def record_points(self, uv: Array, values: Array, rng: np.random.Generator) -> Array:
         """Return noisy image points (S, N, 2), px, NaN for none, as a table would have them."""
         return uv
-
-
-def noise_scale(terms: Sequence[Term], scene: Scene) -> Array | float:
-    """Return the factor (S, N) of noise effects on the standard deviation of the noise."""
-    return prod(
-        effect.noise_scale(scene, values)
-        for effect, values in terms
-        if isinstance(effect, NoiseEffect)
-    )
 
 
 def require_time(scene: Scene, minimum: int) -> Array:

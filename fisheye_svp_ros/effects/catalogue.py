@@ -15,7 +15,8 @@ from fisheye_svp_ros.effects import pose_effects as pose
 from fisheye_svp_ros.effects import ray_effects as ray
 from fisheye_svp_ros.effects import recording_effects as recording
 from fisheye_svp_ros.effects import target_effects as target
-from fisheye_svp_ros.effects.base import Effect, Term
+from fisheye_svp_ros.effects.base import Effect
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.registry import Registry
 
@@ -54,7 +55,7 @@ CATALOGUE: Registry[type[Effect]] = Registry(
 )
 
 
-def load_effects(entries: Mapping[str, Any], where: str) -> tuple[Term, ...]:
+def load_effects(entries: Mapping[str, Any], where: str) -> tuple[ModelTerm, ...]:
     """Return the effects of a lens's mapping and their values.
 
     Raises LensError, naming `where` and the effect, for an unknown or incomplete one.
@@ -64,5 +65,5 @@ def load_effects(entries: Mapping[str, Any], where: str) -> tuple[Term, ...]:
         if name not in CATALOGUE:
             known = ', '.join(CATALOGUE)
             raise LensError(f'{where}: effect {name!r} is unknown; known are {known}')
-        terms.append(CATALOGUE[name].from_dict(entry, where))
+        terms.append(ModelTerm(*CATALOGUE[name].from_dict(entry, where)))
     return tuple(terms)

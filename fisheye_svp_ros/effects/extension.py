@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.effects.base import Scene, Term
+from fisheye_svp_ros.effects.base import Scene
 from fisheye_svp_ros.effects.catalogue import load_effects
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.lens import Lens, curve_limit, monotone_limit
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
@@ -33,7 +34,7 @@ class Target:
     Numbers ascend; None where the target is not known by its landmarks.
     """
 
-    terms: tuple[Term, ...]
+    terms: tuple[ModelTerm, ...]
     landmark: Index | None
     board: Index
     points: Array
@@ -89,10 +90,10 @@ class Target:
 
     def displacement(self, scene: Scene, stage: str) -> Array | float:
         """Displacement (S, N, D) by the corrections at a stage, in views that show the target."""
-        terms = [term for term in self.terms if term[0].stage == stage]
+        terms = [term for term in self.terms if term.effect.stage == stage]
         if not terms:
             return 0.0
-        parts = [effect.displacement(scene, values) for effect, values in terms]
+        parts = [term.displacement(scene) for term in terms]
         return np.asarray(np.sum(parts, axis=0) * self.landmark_mask(scene.views)[..., None])
 
     def _lookup(self, views: Views) -> tuple[Index, Mask, Mask]:
@@ -126,7 +127,7 @@ def on_boards(seen: Observations, rows: Sequence[Sequence[float]] | None) -> Obs
     return replace(seen, board=board)
 
 
-def extend_lens(lens: Lens, terms: Iterable[Term], seen: Observations | None = None) -> Lens:
+def extend_lens(lens: Lens, terms: Iterable[ModelTerm], seen: Observations | None = None) -> Lens:
     """Return a lens with effects added.
 
     Viewpoint shifts, focal lengths, principal point and, where that is exact, radial coefficients
@@ -137,27 +138,29 @@ def extend_lens(lens: Lens, terms: Iterable[Term], seen: Observations | None = N
     """
     terms = (*load_effects(lens.corrections, lens.name), *terms)
     lens = replace(lens, corrections={})
-    if seen is not None and any(effect.place == 'target' for effect, _ in terms):
+    if seen is not None and any(term.effect.place == 'target' for term in terms):
         rows = landmark_rows(seen)
         if lens.target.get(LANDMARKS) != rows:
             lens = replace(lens, target={LANDMARKS: rows})
     # All effects were found at the same focal length, so that their order does not matter.
-    images = [term for term in terms if term[0].stage == 'image']
+    images = [term for term in terms if term.effect.stage == 'image']
     ratio = reduce(_extend_lens, images, lens).focal / lens.focal
-    refocused = [(effect, effect.rescale_values(values, ratio)) for effect, values in terms]
-    lens = reduce(_extend_lens, sorted(refocused, key=lambda term: term[0].stage == 'ray'), lens)
+    refocused = [replace(t, values=t.effect.rescale_values(t.values, ratio)) for t in terms]
+    lens = reduce(
+        _extend_lens, sorted(refocused, key=lambda term: term.effect.stage == 'ray'), lens
+    )
     if curve_limit(lens) < lens.max_incidence:
         lens = replace(lens, max_incidence=monotone_limit(lens))
     return lens
 
 
-def curved_lens(lens: Lens, terms: Iterable[Term]) -> Lens:
+def curved_lens(lens: Lens, terms: Iterable[ModelTerm]) -> Lens:
     """Return a lens with what effects add to its curves; its field ends where they do."""
-    curved = reduce(lambda one, term: term[0].with_curves(one, term[1]), terms, lens)
+    curved = reduce(lambda one, term: term.effect.with_curves(one, term.values), terms, lens)
     if curved is lens:
         return lens
     return replace(curved, max_incidence=min(lens.max_incidence, curve_limit(curved)))
 
 
-def _extend_lens(lens: Lens, term: Term) -> Lens:
-    return term[0].extend(lens, term[1])
+def _extend_lens(lens: Lens, term: ModelTerm) -> Lens:
+    return term.effect.extend(lens, term.values)

@@ -15,10 +15,9 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask, gather_rows
 from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
-from fisheye_svp_ros.effects.base import Term as Term
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import Target, curved_lens
-from fisheye_svp_ros.effects.of_cameras import OfCameras, camera_terms
+from fisheye_svp_ros.effects.terms import ModelTerm, camera_terms
 from fisheye_svp_ros.optics import camera, engines
 from fisheye_svp_ros.optics.camera import Image, Incidence, LinearImage, Rays, lens_columns
 from fisheye_svp_ros.optics.lens import Lens
@@ -76,7 +75,9 @@ class ForwardModel:
     cameras: of a rig whose lenses differ, the model of each camera.
     """
 
-    def __init__(self, lens: Lens | Sequence[Lens], terms: Sequence[Term] | None = None) -> None:
+    def __init__(
+        self, lens: Lens | Sequence[Lens], terms: Sequence[ModelTerm] | None = None
+    ) -> None:
         """Take the corrections of the lens and of its target, or other effects in their place.
 
         One lens, and its effects, is that of every camera.
@@ -123,14 +124,14 @@ class ForwardModel:
 
     def without_motion(self) -> ForwardModel:
         """Return the model of a camera that does not move; itself where that is the same."""
-        kept = tuple(term for term in self.terms if not term[0].of_motion)
+        kept = tuple(term for term in self.terms if not term.effect.of_motion)
         if len(kept) == len(self.terms):
             return self
         model = copy(self)
         model.terms = kept
         return model
 
-    def terms_for(self, views: Views) -> tuple[Term, ...]:
+    def terms_for(self, views: Views) -> tuple[ModelTerm, ...]:
         """Return the corrections of the lens, and of its target if any of the views shows it."""
         target = self.seeing(views)._target
         return self.terms if target is None else (*self.terms, *target.terms)
@@ -142,7 +143,7 @@ class ForwardModel:
     @property
     def noise_terms(self) -> list[tuple[NoiseEffect, Array]]:
         """The effects that move no prediction, and their values."""
-        return [(e, values) for e, values in self.terms if isinstance(e, NoiseEffect)]
+        return [(t.effect, t.values) for t in self.terms if isinstance(t.effect, NoiseEffect)]
 
     def project(self, points: Array) -> Image:
         """Project points (..., 3), m, in the camera frame."""
@@ -248,11 +249,9 @@ class ForwardModel:
         columns = np.zeros((*linear.uv.shape, count))
         for (rows, number, own), (_, _, seen) in zip(linear.cameras, scene.cameras, strict=True):
             model = self.cameras[number]
-            if not isinstance(effect, OfCameras):
-                columns[rows] = model.effect_columns(effect, seen, own)
-            elif term := effect.of_camera(number, np.arange(float(count))):
+            for form, mine in effect.forms_of_camera(number):
                 block = np.zeros((*own.uv.shape, count))
-                block[..., term[1].astype(int)] = model.effect_columns(term[0], seen, own)
+                block[..., mine] = model.effect_columns(form, seen, own)
                 columns[rows] = block
         return columns
 
@@ -314,13 +313,13 @@ class ForwardModel:
     def _acts(self, *stages: str) -> bool:
         """Whether there is any effect at some stages."""
         terms = self.terms if self._target is None else (*self.terms, *self._target.terms)
-        return any(effect.stage in stages for effect, _ in terms)
+        return any(term.effect.stage in stages for term in terms)
 
     def _displace(self, scene: Scene, stage: str) -> Array | float:
         moved: Array | float = 0.0
-        for effect, values in self.terms:
-            if effect.stage == stage:
-                moved = moved + effect.displacement(scene, values)
+        for term in self.terms:
+            if term.effect.stage == stage:
+                moved = moved + term.displacement(scene)
         return moved if self._target is None else moved + self._target.displacement(scene, stage)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.effects.base import Scene
-from fisheye_svp_ros.effects.forward import Term
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import cross_matrix, identity
 from fisheye_svp_ros.scene.boards import find_boards
@@ -53,15 +53,15 @@ class KnownTarget(NamedTuple):
         numbers, first = np.unique(views.landmark[views.used], return_index=True)
         return cls(numbers, views.board[views.used][first], views.points[views.used][first])
 
-    def displacements(self, terms: Sequence[Term], lens: Lens) -> Array:
+    def displacements(self, terms: Sequence[ModelTerm], lens: Lens) -> Array:
         """Return the displacements (L, 3), m, by the effects on the target among some terms."""
         views = views_of(self.points[None], np.zeros((1, len(self.points), 2)))
         views = views._replace(board=self.board[None], landmark=self.landmark[None])
         scene = Scene(views, lens, identity(1), views.uv)
         moved = np.zeros_like(self.points)
-        for effect, values in terms:
-            if effect.stage == 'target':
-                moved = moved + effect.displacement(scene, values)[0]
+        for term in terms:
+            if term.effect.stage == 'target':
+                moved = moved + term.displacement(scene)[0]
         return moved
 
     def maps(self, moved: Array) -> list[BoardMap]:
@@ -82,7 +82,7 @@ def at_landmarks(views: Views, landmark: Index, values: Array) -> Array:
     return np.where(known[..., None], values[slot], 0.0)
 
 
-def board_maps(views: Views, terms: Sequence[Term], lens: Lens) -> list[BoardMap]:
+def board_maps(views: Views, terms: Sequence[ModelTerm], lens: Lens) -> list[BoardMap]:
     """Return how effects on the target, among some terms, displace the landmarks of views."""
     known = KnownTarget.from_views(views)
     return known.maps(known.displacements(terms, lens))

@@ -19,6 +19,7 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.optics.lens import Lens, field_of_view, intrinsic_names
 from fisheye_svp_ros.planning.optimal_design import ViewLimits
@@ -105,7 +106,7 @@ def _evaluate(session: Session) -> SessionState:
         return _session_state(session, ForwardModel(session.lens), planned.wanted)
     table = observations_of(session.taken, session.points)
     linear = _refit(session, table)
-    lens, ((_, shift), *_) = linear.state.lens, linear.state.terms
+    lens, shift = linear.state.lens, linear.state.terms[0].values
     session = replace(session, latest=(lens, float(shift[0])))
     if len(session.taken) >= _MIN_DIAGNOSED:
         with suppress(FisheyeSvpError):  # the next photograph may mend it
@@ -164,7 +165,7 @@ def _model(linear: Linearization) -> ForwardModel:
     terms = [
         term
         for term in linear.state.terms
-        if term[0].stage in ('ray', 'image') and not term[0].of_target
+        if term.effect.stage in ('ray', 'image') and not term.effect.of_target
     ]
     return ForwardModel(linear.state.lens, terms)
 
@@ -190,8 +191,9 @@ def _session_state(
 def _value(linear: Linearization, number: str) -> float:
     """Return a number of lens or effects; 0 where there is none of it."""
     values = dict(linear.state.parameters)
-    for effect, own in linear.state.terms:
-        values |= {p.name: float(v) for p, v in zip(effect.parameters, own, strict=True)}
+    for term in linear.state.terms:
+        numbers = zip(term.effect.parameters, term.values, strict=True)
+        values |= {parameter.name: float(value) for parameter, value in numbers}
     return values.get(number, 0.0)
 
 
@@ -200,7 +202,7 @@ def _refit(session: Session, table: Observations) -> Linearization:
     lens, shift = session.latest or (session.lens, 0.0)
     data, free = group_by_frame(table), intrinsic_names(lens)
     state = initial_state(data, lens)
-    state = replace(state, terms=((_EFFECT, np.array([shift])),))
+    state = replace(state, terms=(ModelTerm(_EFFECT, np.array([shift])),))
     state = adjust(data, state, free, _prior(session.lens, free))
     return Linearization(data, state, free)
 

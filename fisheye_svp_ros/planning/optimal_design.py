@@ -191,11 +191,11 @@ class Design:
         known: whether the views of the fit have been taken, or are there to say what is shared.
         """
         state, lens, free = linear.state, linear.state.lens, linear.free
-        terms = [t for t in state.terms if t[0].stage != 'noise']
+        terms = [t for t in state.terms if t.effect.stage != 'noise']
         parameters = [
-            (e.name, p, v)
-            for e, values in terms
-            for p, v in zip(e.parameters, values, strict=True)
+            (term.name, p, v)
+            for term in terms
+            for p, v in zip(term.effect.parameters, term.values, strict=True)
         ]
         parameters += [(e.name, p, 0.0) for e in effects for p in e.parameters]
         self.names = (*free, *(f'{name}.{p.name}' for name, p, _ in parameters))
@@ -279,7 +279,7 @@ class Design:
 
 def confounded_effects(linear: Linearization, names: Sequence[str]) -> list[Effect]:
     """Return the richest forms of effects of lens or target that are not in a fit."""
-    there = {effect.name for effect, _ in linear.state.terms}
+    there = {term.name for term in linear.state.terms}
     found = []
     for name in names:
         if name in there or CATALOGUE[name].budget_stage() not in ('lens', 'target'):

@@ -147,7 +147,7 @@ def _choose_question(
     """Return what is asked for, what it may be mistaken for, and effects to take in."""
     if number is not None:
         return number, (), _effects_with(number, after)
-    fitted = {effect.name for effect, _ in after.state.terms}
+    fitted = {term.name for term in after.state.terms}
     mine = [c for c in causes if c.effect in fitted and c.stage in ('lens', 'target')]
     for cause in mine:
         if cause.indistinguishable_from:
@@ -176,7 +176,7 @@ def _effects_with(number: str, after: Linearization) -> list[Effect]:
     None where the fit has it.  Raises ParameterError where no effect does.
     """
     known = list(after.free)
-    if number in {*after.free, *(name for e, _ in after.state.terms for name in _names_of(e))}:
+    if number in {*after.free, *(name for t in after.state.terms for name in _names_of(t.effect))}:
         return []
     for name, kind in CATALOGUE.items():
         if kind.stage == 'noise':

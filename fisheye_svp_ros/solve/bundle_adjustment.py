@@ -257,9 +257,9 @@ class Adjustment:
         if held is not None:
             moving += [np.ones(6 * (len(template.rig.position) - 1) + len(self._free), dtype=bool)]
             moving += [
-                np.full(len(values), effect.name not in held)
-                for effect, values in template.terms
-                if is_shared(effect)
+                np.full(len(term.values), term.name not in held)
+                for term in template.terms
+                if is_shared(term.effect)
             ]
         self._moving = np.concatenate(moving)
 

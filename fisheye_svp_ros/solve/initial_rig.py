@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.effects.forward import ForwardModel, Term
-from fisheye_svp_ros.effects.of_cameras import by_camera
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.rig_effect import assign_camera
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import Views
@@ -67,18 +68,16 @@ def prediction_distances(model: ForwardModel, pose: Pose, views: Views) -> Array
     return np.where(views.used, np.nan_to_num(distance, nan=np.inf), np.nan)
 
 
-def _camera_terms(labels: Sequence[str], models: Sequence[ForwardModel]) -> list[Term]:
+def _camera_terms(labels: Sequence[str], models: Sequence[ForwardModel]) -> list[ModelTerm]:
     """Return the corrections of the lenses of a rig, those of one effect as one."""
-    held: dict[str, Term] = {}
+    held: dict[str, ModelTerm] = {}
     for i, (label, model) in enumerate(zip(labels, models, strict=True)):
-        effects = by_camera(i, label, (effect for effect, _ in model.terms))
-        for effect, (_, values) in zip(effects, model.terms, strict=True):
-            known = held.get(effect.name)
-            held[effect.name] = (
-                (effect, values)
-                if known is None
-                else (known[0].merge_with(effect), np.concatenate([known[1], values]))
-            )
+        for term in model.terms:
+            effect, values = assign_camera(term.effect, i, label), term.values
+            if known := held.get(term.name):
+                effect = known.effect.merge_with(effect)
+                values = np.concatenate([known.values, values])
+            held[term.name] = ModelTerm(effect, values)
     return list(held.values())
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, flat_rows
 from fisheye_svp_ros.effects.ray_effects import RadialProfileEffect
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.mixed_model import project_out, pseudo_inverse
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
@@ -95,7 +96,7 @@ def _free_names(
 def fit_free_curve(data: RigViews, base: RigState) -> RigState:
     """Return the fit of a lens curve and a centre of any kind, in air."""
     theta = Linearization(data, base, ()).scene.theta_max
-    known = [t for t in base.terms if t[0].name != RadialProfileEffect.name]
+    known = [t for t in base.terms if t.name != RadialProfileEffect.name]
     effect = RadialProfileEffect(CURVE_TERMS, round(theta, 6))
-    free = replace(base, terms=(*known, (effect, np.zeros(CURVE_TERMS))))
+    free = replace(base, terms=(*known, ModelTerm(effect, np.zeros(CURVE_TERMS))))
     return adjust(data, free, INTRINSICS)

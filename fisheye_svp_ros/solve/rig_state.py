@@ -9,8 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.effects.base import Effect, Scene, noise_scale
-from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews, Term
+from fisheye_svp_ros.effects.base import Effect, Scene
+from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews
+from fisheye_svp_ros.effects.terms import ModelTerm, noise_scale
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, intrinsic_names, parameter_values
 from fisheye_svp_ros.pose import Pose, cross_matrix
@@ -105,7 +106,7 @@ class RigState:
     pose: Pose
     rig: Pose
     lens: Lens
-    terms: tuple[Term, ...]
+    terms: tuple[ModelTerm, ...]
     others: tuple[Lens, ...] = ()
     labels: tuple[str, ...] = ('',)
     corrected: bool = False
@@ -144,7 +145,7 @@ class RigState:
             for one, names in zip(self.lenses, self.lens_names(free), strict=True)
         ]
         return np.concatenate(
-            [*map(np.array, lens), *(values for effect, values in self.terms if is_shared(effect))]
+            [*map(np.array, lens), *(term.values for term in self.terms if is_shared(term.effect))]
         )
 
     def with_shared_values(self, free: Sequence[str], values: Array) -> RigState:
@@ -153,10 +154,11 @@ class RigState:
         for lens, names in zip(self.lenses, self.lens_names(free), strict=True):
             lenses.append(lens.with_parameters(names, values[: len(names)].tolist()))
             values = values[len(names) :]
-        for effect, known in self.terms:
-            if is_shared(effect):
-                known, values = values[: len(known)], values[len(known) :]
-            terms.append((effect, known))
+        for term in self.terms:
+            if is_shared(term.effect):
+                count = len(term.values)
+                term, values = replace(term, values=values[:count]), values[count:]
+            terms.append(term)
         return replace(self, lens=lenses[0], others=tuple(lenses[1:]), terms=tuple(terms))
 
     def retract(
@@ -175,7 +177,7 @@ class RigState:
 
     def without_effects(self, names: Collection[str]) -> RigState:
         """Return the state without some effects."""
-        return replace(self, terms=tuple(t for t in self.terms if t[0].name not in names))
+        return replace(self, terms=tuple(t for t in self.terms if t.name not in names))
 
     def view_poses(self, data: RigViews) -> Pose:
         """Return the camera's pose in each view (S,)."""
@@ -226,7 +228,7 @@ class Linearization:
         """Raise GeometryError where the state has no image of some of the points."""
         lost = self.row_mask & ~np.isfinite(self.residual)
         if lost.any():
-            named = ', '.join(effect.name for effect, _ in self.state.terms)
+            named = ', '.join(term.name for term in self.state.terms)
             raise GeometryError(
                 f'{int(lost.sum() + 1) // 2} points lie out of sight of the fitted lens'
                 + (f' with {named}' if named else '')
@@ -239,9 +241,9 @@ class Linearization:
         shared += [self._board_columns()] if self.state.boards else []
         shared.append(self._lens_columns())
         shared += [
-            self.model.effect_columns(effect, self.scene, self.linear)
-            for effect, _ in self.state.terms
-            if is_shared(effect)
+            self.model.effect_columns(term.effect, self.scene, self.linear)
+            for term in self.state.terms
+            if is_shared(term.effect)
         ]
         return self.whiten(np.concatenate(shared, axis=-1))
 
@@ -342,17 +344,20 @@ def free_parameters(lenses: Mapping[str, Lens], free: bool | None = None) -> tup
 def with_effect(state: RigState, effect: Effect, values: Array | None = None) -> RigState:
     """Return the state with one more effect, joined with an earlier form of the same."""
     start = np.zeros(len(effect.parameters)) if values is None else values
-    for i, (old, known) in enumerate(state.terms):
+    term, terms = ModelTerm(effect, start), list(state.terms)
+    for i, old in enumerate(terms):
         if old.name == effect.name:
-            joined = old.merge_with(effect)
-            both = transfer_values(old, known, joined) + transfer_values(effect, start, joined)
-            return replace(state, terms=(*state.terms[:i], (joined, both), *state.terms[i + 1 :]))
-    return replace(state, terms=(*state.terms, (effect, start)))
+            joined = old.effect.merge_with(effect)
+            terms[i] = ModelTerm(
+                joined, transfer_values(old, joined) + transfer_values(term, joined)
+            )
+            return replace(state, terms=tuple(terms))
+    return replace(state, terms=(*terms, term))
 
 
-def transfer_values(old: Effect, values: Array, new: Effect) -> Array:
+def transfer_values(term: ModelTerm, new: Effect) -> Array:
     """Return start values of a form of an effect from another form's, by parameter name."""
-    known = dict(zip((p.name for p in old.parameters), values, strict=True))
+    known = dict(zip((p.name for p in term.effect.parameters), term.values, strict=True))
     return np.array([known.get(parameter.name, 0.0) for parameter in new.parameters])
 
 

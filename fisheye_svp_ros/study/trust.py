@@ -324,7 +324,7 @@ def known_errors(
     measured: dict[str, Callable[[RigViews, RigState], Array]] = {}
     if after.data.poses is not None:
         measured |= {'position_error_m': _position_errors, 'axis_error_rad': _axis_errors}
-    doubtful = any(effect.stage in ('target', 'pose') for effect, _ in after.state.terms)
+    doubtful = any(term.effect.stage in ('target', 'pose') for term in after.state.terms)
     if after.data.cameras == 2 and not doubtful:
         measured['depth_error_m'] = _depth_errors
     pairs = [list(_train_folds(linear, free)) for linear in (before, after)] if measured else []

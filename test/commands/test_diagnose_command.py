@@ -30,6 +30,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.pose_effects import StereoTimeOffsetEffect
 from fisheye_svp_ros.effects.target_effects import TargetShapeEffect
 from fisheye_svp_ros.effects.target_map import board_maps
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.csv_files import CsvTable
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, save_lens
@@ -675,7 +676,7 @@ def test_the_bow_of_a_board_is_measured_between_its_extremes():
     found = diagnose(simulate(ForwardModel(LENS), board, poses, 0.1, rng), LENS)
     effect = TargetShapeEffect.candidates(found.model.scene)[0]
     bow = np.array([0.002, 0.0, 0.0])
-    state = replace(found.model.state, terms=((effect, bow),))
+    state = replace(found.model.state, terms=(ModelTerm(effect, bow),))
     (one,) = board_maps(found.model.data.views, state.terms, state.lens)
     assert len(one.height) == len(board.ids)
     x = one.place[:, 0] / np.abs(one.place[:, 0]).max()

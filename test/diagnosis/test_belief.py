@@ -19,6 +19,7 @@ from fisheye_svp_ros.diagnosis import (
 )
 from fisheye_svp_ros.diagnosis.findings import probability_of, status_of
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.terms import ModelTerm
 
 
 def test_a_corrected_p_value_bounds_the_probability() -> None:
@@ -67,7 +68,7 @@ def test_nothing_contradicts_the_belief(
     effect: str, values: list[float], noise: float, frames: int
 ) -> None:
     rng = np.random.default_rng(5)
-    terms = [(CATALOGUE[effect](), np.array(values))] if effect else []
+    terms = [ModelTerm(CATALOGUE[effect](), np.array(values))] if effect else []
     found = diagnose(
         observe(lens(), terms, *scene(rng, frames=frames), noise, rng),
         lens(),

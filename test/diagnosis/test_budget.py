@@ -7,6 +7,7 @@ from helpers.scenes import lens, observe, scene
 from fisheye_svp_ros.diagnosis import NullModel
 from fisheye_svp_ros.diagnosis.variance_budget import cause_squares
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.rig_state import group_by_frame, with_effect
@@ -18,11 +19,11 @@ def state():
     rng = np.random.default_rng(4)
     pose, views = scene(rng, 1, 12)
     terms = [
-        (CATALOGUE['decentering'](), np.array([0.004, 0.002])),
-        (CATALOGUE['skew'](), np.array([3e-4])),
+        ModelTerm(CATALOGUE['decentering'](), np.array([0.004, 0.002])),
+        ModelTerm(CATALOGUE['skew'](), np.array([3e-4])),
     ]
     data = group_by_frame(observe(lens(), tuple(terms), pose, views, 0.1, rng))
-    found = with_effect(initial_state(data, lens()), *terms[0])
+    found = with_effect(initial_state(data, lens()), terms[0].effect, terms[0].values)
     for name in ('sensor_tilt', 'skew'):
         found = with_effect(found, CATALOGUE[name]())
     return data, adjust(data, found, ('cx', 'cy'))
@@ -33,9 +34,9 @@ def displacement(null, names):
     linear = null.linear
     shared = linear.shared_columns
     signal = np.zeros(linear.residual.shape)
-    for effect, columns, values in null.terms:
-        if effect.name in names:
-            signal += shared[..., columns] @ values
+    for term in null.terms:
+        if term.name in names:
+            signal += shared[..., term.columns] @ term.values
     frames, rows, _ = linear.frame_columns.shape
     poses = np.zeros((frames, rows, frames, 6))
     poses[np.arange(frames), :, np.arange(frames)] = linear.frame_columns

@@ -15,6 +15,7 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import intrinsic_names
@@ -74,7 +75,7 @@ def test_clean_data_is_adequate():
     assert found.noise_px == pytest.approx(SIGMA, rel=0.1)
 
 
-@pytest.mark.parametrize('terms', [(), ((CATALOGUE['skew'](), np.array([0.002])),)])
+@pytest.mark.parametrize('terms', [(), (ModelTerm(CATALOGUE['skew'](), np.array([0.002])),)])
 def test_rounding_is_no_cause(terms):
     """Points simulated without noise are exact but for what their numbers round to."""
     rng = np.random.default_rng(11)
@@ -98,7 +99,7 @@ def test_hidden_effect_is_named_and_measured(name, values):
     pose, views = scene(rng)
     model_scene = fitted(12)[2].scene
     effect = CATALOGUE[name].candidates(model_scene)[0]
-    observations = observe(lens(), [(effect, np.array(values))], pose, views, SIGMA, rng)
+    observations = observe(lens(), [ModelTerm(effect, np.array(values))], pose, views, SIGMA, rng)
     found = diagnose(observations, lens())
     assert found.verdict == 'explained'
     assert [cause.effect for cause in found.causes] == [name]
@@ -146,7 +147,7 @@ def test_true_poses_reveal_what_free_poses_hide():
     rng = np.random.default_rng(13)
     pose, views = scene(rng)
     scale = CATALOGUE['landmark_scale'].candidates(fitted(13)[2].scene)[0]
-    observations = observe(lens(), [(scale, np.array([0.004]))], pose, views, SIGMA, rng)
+    observations = observe(lens(), [ModelTerm(scale, np.array([0.004]))], pose, views, SIGMA, rng)
     assert diagnose(observations, lens()).verdict == 'adequate'
     poses = {int(frame): pose.take(int(frame)) for frame in np.unique(views.frame)}
     (cause,) = diagnose(observations, lens(), poses=poses).causes
@@ -177,7 +178,7 @@ def test_a_single_landmark_keeps_its_name_beside_landmarks_that_are_all_a_little
     moves = 2e-4 * rng.normal(size=(60, 3))
     moves[7] = [3e-3, -3e-3, 3e-3]
     all_of_them = LandmarkSurveyEffect(tuple(range(60)))
-    table = observe(lens(), [(all_of_them, moves.ravel())], pose, views, SIGMA, rng)
+    table = observe(lens(), [ModelTerm(all_of_them, moves.ravel())], pose, views, SIGMA, rng)
     found = diagnose(table, lens())
     assert [cause.effect for cause in found.causes] == ['landmark_survey']
     values = found.causes[0].parameters
@@ -190,7 +191,9 @@ def test_landmarks_far_from_their_place_are_no_gross_errors():
     rng = np.random.default_rng(20)
     pose, views = scene(rng)
     moves = np.array([0.15, 0.1, 0.0, 0.1, -0.15, 0.0])
-    table = observe(lens(), [(LandmarkSurveyEffect((3, 44)), moves)], pose, views, SIGMA, rng)
+    table = observe(
+        lens(), [ModelTerm(LandmarkSurveyEffect((3, 44)), moves)], pose, views, SIGMA, rng
+    )
     uv = table.uv.copy()
     uv[[5, 200, 700, 900]] += [15.0, -12.0]
     found = diagnose(replace(table, uv=uv), lens())
@@ -321,7 +324,9 @@ def test_a_fine_ripple_of_the_image_has_its_place():
 def test_what_the_user_knows_is_taken_in_or_left_out():
     rng = np.random.default_rng(19)
     pose, views = scene(rng)
-    table = observe(lens(), [(CATALOGUE['skew'](), np.array([0.002]))], pose, views, SIGMA, rng)
+    table = observe(
+        lens(), [ModelTerm(CATALOGUE['skew'](), np.array([0.002]))], pose, views, SIGMA, rng
+    )
     known = diagnose(table, lens(), options=DiagnosisOptions(included=('aspect',), quick=True))
     assert {cause.effect for cause in known.causes} == {'aspect', 'skew'}
     without = diagnose(table, lens(), options=DiagnosisOptions(left_out=('skew',), quick=True))
@@ -340,7 +345,7 @@ def table_of(seed, frames=12, cameras=1, terms=()):
 
 
 def test_what_the_user_knows_is_a_cause_that_the_simulation_lacked():
-    terms = [(CATALOGUE['skew'](), np.array([0.002]))]
+    terms = [ModelTerm(CATALOGUE['skew'](), np.array([0.002]))]
     table, held_out = table_of(27, terms=terms), table_of(28, terms=terms)
     found, known = (
         diagnose(table, lens(), held_out=held_out, options=DiagnosisOptions(names, quick=True))
@@ -358,11 +363,11 @@ def test_boards_are_known_by_the_landmarks_where_a_table_does_not_tell_of_them()
     shape = CATALOGUE['target_shape'].candidates(model.scene(*seen, model.linearise(*seen)))[0]
     values = np.resize([0.004, -0.003, 0.005, 0.006], len(shape.parameters))
     table, other = (
-        observe(lens(), [(shape, values)], *seen, SIGMA, np.random.default_rng(seed))
+        observe(lens(), [ModelTerm(shape, values)], *seen, SIGMA, np.random.default_rng(seed))
         for seed in (1, 2)
     )
     bare = replace(other, board=np.zeros_like(other.board))
-    extended = extend_lens(lens(), [(shape, values)], table)
+    extended = extend_lens(lens(), [ModelTerm(shape, values)], table)
     assert diagnose(bare, extended, options=DiagnosisOptions(quick=True)).verdict == 'adequate'
     found = diagnose(table, lens(), held_out=bare, options=DiagnosisOptions(quick=True))
     assert [cause.effect for cause in found.causes] == ['target_shape']
@@ -400,7 +405,7 @@ def test_a_rig_is_the_first_camera_in_the_second(cameras, names, x):
 
 def test_what_the_lens_already_holds_is_no_cause_again():
     effect, values = CATALOGUE['decentering'](), np.array([0.002, -0.001])
-    table = table_of(21, 24, terms=[(effect, values)])
+    table = table_of(21, 24, terms=[ModelTerm(effect, values)])
     known = replace(lens(), corrections={'decentering': effect.to_dict(values)})
     found = diagnose(table, known)
     assert found.verdict == 'adequate' and not found.causes
@@ -410,7 +415,7 @@ def test_what_the_lens_already_holds_is_no_cause_again():
 
 def test_what_happened_to_a_recording_is_no_part_of_the_lens():
     step = CATALOGUE['session_step']((12.0,), False)
-    table = table_of(22, 24, terms=[(step, np.array([0.002, 1.0, 0.0]))])
+    table = table_of(22, 24, terms=[ModelTerm(step, np.array([0.002, 1.0, 0.0]))])
     found = diagnose(table, lens(), held_out=table_of(23, 8))
     assert [cause.effect for cause in found.causes] == ['session_step']
     assert not found.lens.corrections
@@ -420,7 +425,7 @@ def test_what_happened_to_a_recording_is_no_part_of_the_lens():
 
 def test_a_lens_that_is_fitted_is_that_of_the_mean_session():
     step, first = CATALOGUE['session_step']((12.0,), False), lens()
-    table = table_of(22, 24, terms=[(step, np.array([0.004, 1.0, -2.0]))])
+    table = table_of(22, 24, terms=[ModelTerm(step, np.array([0.004, 1.0, -2.0]))])
     found = diagnose(table, first, free_intrinsics=True)
     assert [cause.effect for cause in found.causes] == ['session_step']
     cx, cy, fx = (found.intrinsics[name] for name in ('cx', 'cy', 'fx'))
@@ -453,7 +458,11 @@ def test_the_last_fit_is_the_best_under_the_last_variances():
     rng = np.random.default_rng(25)
     pose, views = scene(rng)
     moves = rng.normal(size=views.points[0].shape) * 1e-3
-    terms = [(CATALOGUE['viewpoint_shift'].candidates(fitted(25)[2].scene)[0], np.array([0.02]))]
+    terms = [
+        ModelTerm(
+            CATALOGUE['viewpoint_shift'].candidates(fitted(25)[2].scene)[0], np.array([0.02])
+        )
+    ]
     table = observe(lens(), terms, pose, views._replace(points=views.points + moves), SIGMA, rng)
     table = replace(table, xyz=views.points[0][table.landmark])
     inputs = Inputs.check(table, lens(), DiagnosisOptions())
@@ -461,7 +470,7 @@ def test_the_last_fit_is_the_best_under_the_last_variances():
     own, information = found.null.included_columns, found.null.information
     step = np.linalg.solve(information[np.ix_(own, own)], information[own, -1])
     errors = standard_errors(found.null) * found.null.scale[own]
-    assert [effect.name for effect, _, _ in found.causes] == ['viewpoint_shift']
+    assert [cause.name for cause in found.causes] == ['viewpoint_shift']
     assert np.abs(step / errors).max() < 0.1
 
 
@@ -524,7 +533,7 @@ def rig_table(seed, right_terms=(), frames=16):
 
 def test_each_camera_of_a_rig_has_causes_of_its_own():
     skew = CATALOGUE['skew']()
-    table, lenses = rig_table(26, [(skew, np.array([0.002]))], 10)
+    table, lenses = rig_table(26, [ModelTerm(skew, np.array([0.002]))], 10)
     found = diagnose(table, lenses, free_intrinsics=True)
     models = [found.model.state.model.camera(camera) for camera in (0, 1)]
     assert [model.lens.name for model in models] == ['fish214', 'right']

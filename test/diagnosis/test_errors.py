@@ -18,6 +18,7 @@ from fisheye_svp_ros.diagnosis.uncertainty import (
 )
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.optics.lens import parameter_values
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
@@ -36,16 +37,18 @@ def test_standard_errors_hold_with_local_errors_in_the_background():
         rng = np.random.default_rng(300 + seed)
         pose, views = scene(rng, frames=16)
         moves = rng.normal(size=views.points[0].shape) * 3e-4
-        terms = [(ViewpointShiftEffect(1), np.array([SHIFT]))]
+        terms = [ModelTerm(ViewpointShiftEffect(1), np.array([SHIFT]))]
         true = views._replace(points=views.points + moves)
         table = observe(lens(), terms, pose, true, SIGMA, rng)
         data = group_by_frame(replace(table, xyz=views.points[0][table.landmark]))
         begin = initial_state(data, lens())
-        state = adjust(data, replace(begin, terms=((ViewpointShiftEffect(1), np.zeros(1)),)), ())
+        state = adjust(
+            data, replace(begin, terms=(ModelTerm(ViewpointShiftEffect(1), np.zeros(1)),)), ()
+        )
         null = NullModel.estimate(data, state, ())
         fitted = refit(data, state, (), null.variances)
         (error,) = standard_errors(null)
-        off.append((float(fitted.terms[0][1][0]) - SHIFT) / error)
+        off.append((float(fitted.terms[0].values[0]) - SHIFT) / error)
     # Of a t distribution with a dozen draws: wide of this less than once in a thousand runs.
     assert 0.45 < np.sqrt(np.mean(np.square(off))) < 1.75, off
 
@@ -76,7 +79,7 @@ def test_an_effect_that_may_be_there_widens_the_errors_of_what_it_would_change(s
     """The principal point without the decentering that moved it: as far off as is said."""
     rng = np.random.default_rng(31)
     pose, views = scene(rng, frames=16)
-    terms = [(CATALOGUE['decentering'](), np.array([size, 0.0]))]
+    terms = [ModelTerm(CATALOGUE['decentering'](), np.array([size, 0.0]))]
     data = group_by_frame(observe(lens(), terms, pose, views, SIGMA, rng))
     state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
     null = NullModel.estimate(data, state, ('cx', 'cy'))
@@ -95,7 +98,7 @@ def test_an_effect_that_may_be_there_is_hardly_larger_than_large(monkeypatch):
     pose, views = scene(rng, frames=16)
     tilt = CATALOGUE['sensor_tilt']
     data = group_by_frame(
-        observe(lens(), [(tilt(), np.array([0.01, 0.0]))], pose, views, 12 * SIGMA, rng)
+        observe(lens(), [ModelTerm(tilt(), np.array([0.01, 0.0]))], pose, views, 12 * SIGMA, rng)
     )
     state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
     others = {*CATALOGUE} - {tilt.name}
@@ -112,9 +115,9 @@ def test_a_plate_beside_a_shift_makes_the_shift_mean_something_else():
     pose, views = scene(rng, frames=16)
     shift, plate = CATALOGUE['viewpoint_shift'](), CATALOGUE['flat_port']()
     near = replace(lens(), max_incidence=1.4)
-    terms = [(shift, np.array([3e-3])), (plate, np.array([4e-3]))]
+    terms = [ModelTerm(shift, np.array([3e-3])), ModelTerm(plate, np.array([4e-3]))]
     data = group_by_frame(observe(near, terms, pose, views, 0.1 * SIGMA, rng))
-    begin = replace(initial_state(data, near), terms=((shift, np.zeros(1)),))
+    begin = replace(initial_state(data, near), terms=(ModelTerm(shift, np.zeros(1)),))
     others = [name for name in CATALOGUE if name not in (shift.name, plate.name)]
     state = adjust(data, begin, ('cx', 'fx'))
     null = NullModel.estimate(data, state, ('cx', 'fx'), left_out=others)
@@ -128,9 +131,11 @@ def test_an_effect_that_may_be_another_one_widens_the_errors_of_what_that_would_
     pose, views = scene(rng, frames=16)
     tilt, decentering = CATALOGUE['sensor_tilt'](), CATALOGUE['decentering']()
     data = group_by_frame(
-        observe(lens(), [(decentering, np.array([8e-4, 0.0]))], pose, views, 3 * SIGMA, rng)
+        observe(
+            lens(), [ModelTerm(decentering, np.array([8e-4, 0.0]))], pose, views, 3 * SIGMA, rng
+        )
     )
-    begin = replace(initial_state(data, lens()), terms=((tilt, np.zeros(2)),))
+    begin = replace(initial_state(data, lens()), terms=(ModelTerm(tilt, np.zeros(2)),))
     state = adjust(data, begin, ('cx', 'cy'))
     null = NullModel.estimate(data, state, ('cx', 'cy'))
     errors, more = standard_errors(null), model_uncertainty(null, likely_models(null))
@@ -159,8 +164,8 @@ def test_two_effects_that_hide_each_other_widen_the_errors():
     rng = np.random.default_rng(31)
     pose, views = scene(rng, frames=16)
     terms = [
-        (CATALOGUE['decentering'](), np.array([1e-3, 0.0])),
-        (CATALOGUE['sensor_tilt'](), np.array([-5e-3, 0.0])),
+        ModelTerm(CATALOGUE['decentering'](), np.array([1e-3, 0.0])),
+        ModelTerm(CATALOGUE['sensor_tilt'](), np.array([-5e-3, 0.0])),
     ]
     data = group_by_frame(observe(lens(), terms, pose, views, 0.1 * SIGMA, rng))
     state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
@@ -177,7 +182,7 @@ def test_a_warped_board_leaves_a_calibrated_shift_unsettled():
     data = group_by_frame(observe(lens(), (), pose, views, SIGMA, rng))
     model_scene = NullModel.estimate(data, initial_state(data, lens()), ()).linear.scene
     shape = CATALOGUE['target_shape'].candidates(model_scene)[0]
-    bent = [(shape, np.array([0.006, 0.0, 0.005] * 3))]
+    bent = [ModelTerm(shape, np.array([0.006, 0.0, 0.005] * 3))]
     table = observe(lens(), bent, pose, views, SIGMA, rng)
     shifted = ViewpointShiftEffect(1).with_curves(lens(), np.array([1e-6]))
     found = assess_lens(table, shifted, ('fx', 'fy', 'cx', 'cy', 'e0'))
@@ -190,7 +195,7 @@ def test_a_calibration_says_how_far_off_an_effect_that_it_leaves_out_may_bring_i
     """A lens without the viewpoint shift that is there: fx is as far off as is said."""
     rng = np.random.default_rng(7)
     pose, views = scene(rng, frames=16)
-    shift = [(ViewpointShiftEffect(1), np.array([SHIFT]))]
+    shift = [ModelTerm(ViewpointShiftEffect(1), np.array([SHIFT]))]
     table = observe(lens(), shift, pose, views, SIGMA, rng)
     data, names = group_by_frame(table), ('fx', 'fy')
     state = adjust(data, initial_state(data, lens()), names)

@@ -13,6 +13,7 @@ from fisheye_svp_ros.diagnosis.fitted_model import refit
 from fisheye_svp_ros.diagnosis.stepwise import bulk_p_values
 from fisheye_svp_ros.effects.base import Scene
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
@@ -91,7 +92,7 @@ def test_large_dots_of_large_boards_are_no_boards_out_of_place(radius, size):
     pose = Pose(pose.rotation, size * pose.position)
     views = views._replace(points=size * views.points)
     dots = CATALOGUE['dot_centroid']()
-    table = observe(lens(), [(dots, np.array([radius**2]))], pose, views, SIGMA / 2, rng)
+    table = observe(lens(), [ModelTerm(dots, np.array([radius**2]))], pose, views, SIGMA / 2, rng)
     found = diagnose(table, lens())
     assert [cause.effect for cause in found.causes] == ['dot_centroid']
     area = found.causes[0].parameters['radius_squared']
@@ -216,7 +217,7 @@ def test_what_was_taken_in_stays_for_as_long_as_it_gains_more_than_its_error(
     """As for a stretched board, which held-out frames hardly miss beside offsets of landmarks."""
     rng = np.random.default_rng(61)
     pose, views = scene(rng)
-    terms = [(CATALOGUE['decentering'](), np.array([2e-3, -1e-3]))]
+    terms = [ModelTerm(CATALOGUE['decentering'](), np.array([2e-3, -1e-3]))]
     table = observe(lens(), terms, pose, views, SIGMA, rng)
     whole = EffectTests.held_out_gain
 

@@ -13,6 +13,7 @@ from fisheye_svp_ros.diagnosis.lens_evidence import _distances
 from fisheye_svp_ros.diagnosis.problem import extended_lenses
 from fisheye_svp_ros.diagnosis.uncertainty import LensCovariance, likely_models, total_errors
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.ray_errors import SAMPLES, ray_model, typical_points
@@ -39,17 +40,17 @@ def test_effects_that_hide_each_other_move_rays_less_than_parameters():
     rng = np.random.default_rng(31)
     pose, views = scene(rng, frames=16)
     terms = [
-        (CATALOGUE['decentering'](), np.array([1e-3, 0.0])),
-        (CATALOGUE['sensor_tilt'](), np.array([-5e-3, 0.0])),
+        ModelTerm(CATALOGUE['decentering'](), np.array([1e-3, 0.0])),
+        ModelTerm(CATALOGUE['sensor_tilt'](), np.array([-5e-3, 0.0])),
     ]
     table = observe(lens(), terms, pose, views, SIGMA, rng)
     data = group_by_frame(table)
-    begin = replace(initial_state(data, lens()), terms=((terms[0][0], np.zeros(2)),))
+    begin = replace(initial_state(data, lens()), terms=(ModelTerm(terms[0].effect, np.zeros(2)),))
     null = NullModel.estimate(data, adjust(data, begin, CENTER), CENTER)
     columns = null.column_count
     uv = typical_points(data.views.uv[data.views.used])
     fitted = extended_lenses({'': lens()}, null.linear.state, table)['']
-    truth = reduce(lambda one, term: term[0].extend(one, term[1]), terms, lens())
+    truth = reduce(lambda one, term: term.effect.extend(one, term.values), terms, lens())
     off = ray_error(fitted, truth, uv, (1.0,))
 
     errors = total_errors(null)

@@ -12,6 +12,7 @@ from fisheye_svp_ros.diagnosis import EffectTests, NullModel
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, OF_LANDMARKS, make_random_effects
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.mixed_model import (
     LAMBDA_ABSENT,
     Variances,
@@ -372,11 +373,11 @@ def test_a_step_that_takes_points_out_of_sight_is_cut_short():
     port = CATALOGUE['flat_port']()
 
     def after(part):
-        return replace(linear.state, terms=((port, np.array([10.0 * part])),))
+        return replace(linear.state, terms=(ModelTerm(port, np.array([10.0 * part])),))
 
     assert not np.isfinite(Linearization(linear.data, after(1.0), ()).residual).all()
     state, residual = shorten_step(linear.data, (), after)
-    assert np.isfinite(residual).all() and state.terms[0][1] < 10.0
+    assert np.isfinite(residual).all() and state.terms[0].values < 10.0
     refitted = refit(
         linear.data, after(0.0), (), NullModel.estimate(linear.data, linear.state, ()).variances
     )

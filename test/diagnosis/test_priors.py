@@ -12,8 +12,9 @@ from fisheye_svp_ros.diagnosis import NullModel
 from fisheye_svp_ros.diagnosis.fitted_model import refit
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
-from fisheye_svp_ros.effects.of_cameras import by_camera, combine_cameras
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
+from fisheye_svp_ros.effects.rig_effect import assign_camera
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.mixed_model import Variances, no_variances
 from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust
@@ -30,12 +31,12 @@ def few_views(seed: int = 2) -> tuple[RigViews, RigState, Variances]:
     """Return views that tell little of a shift of three orders, a state with it, and noise."""
     rng = np.random.default_rng(seed)
     pose, views = scene(rng, frames=5)
-    terms = [(ViewpointShiftEffect(1), np.array([SHIFT]))]
+    terms = [ModelTerm(ViewpointShiftEffect(1), np.array([SHIFT]))]
     data = group_by_frame(observe(lens(), terms, pose, views, SIGMA, rng))
     state = adjust(data, initial_state(data, lens()), FREE)
     landmarks = len(np.unique(data.views.landmark[data.views.used]))
     variances = replace(no_variances(len(NAMES), landmarks), sigma=SIGMA)
-    return data, replace(state, terms=((EFFECT, np.zeros(ORDER)),)), variances
+    return data, replace(state, terms=(ModelTerm(EFFECT, np.zeros(ORDER)),)), variances
 
 
 def prior_of(data: RigViews, state: RigState) -> np.ndarray:
@@ -45,9 +46,9 @@ def prior_of(data: RigViews, state: RigState) -> np.ndarray:
 def test_wild_orders_stay_within_the_prior() -> None:
     data, state, variances = few_views()
     expected = prior_of(data, state)
-    free = adjust(data, state, FREE).terms[0][1]
+    free = adjust(data, state, FREE).terms[0].values
     assert (np.abs(free) > 3 * expected).any()
-    fitted = refit(data, adjust(data, state, FREE), FREE, variances).terms[0][1]
+    fitted = refit(data, adjust(data, state, FREE), FREE, variances).terms[0].values
     assert (np.abs(fitted) < 2 * expected).all()
 
 
@@ -57,7 +58,7 @@ def test_the_refit_is_the_adjustment_under_the_same_prior() -> None:
     fitted = refit(data, state, FREE, variances)
     whole = adjust(data, state, FREE, Prior(np.zeros(ORDER), root))
     expected = prior_of(data, state)
-    off = (fitted.terms[0][1] - whole.terms[0][1]) / expected
+    off = (fitted.terms[0].values - whole.terms[0].values) / expected
     assert np.abs(off).max() < 0.02, off
 
     null = NullModel.with_variances(data, whole, FREE, variances)
@@ -72,12 +73,8 @@ def test_higher_orders_are_known_by_what_they_do_at_the_edge_of_the_field() -> N
     view = Linearization(data, state, FREE).scene
     sizes = EFFECT.prior_sigma(view) * view.lens.max_incidence ** (2 * np.arange(ORDER))
     assert sizes == pytest.approx(LARGE)
-    each = combine_cameras(
-        [
-            *by_camera(0, 'left', [ViewpointShiftEffect(1)]),
-            *by_camera(1, 'right', [ViewpointShiftEffect(2)]),
-        ]
-    )
+    left = assign_camera(ViewpointShiftEffect(1), 0, 'left')
+    each = left.merge_with(assign_camera(ViewpointShiftEffect(2), 1, 'right'))
     rig = replace(view, cameras=((np.arange(1), 0, view), (np.arange(1), 1, view)))
     assert each.prior_sigma(rig) == pytest.approx(
         [LARGE, LARGE, LARGE / view.lens.max_incidence**2]

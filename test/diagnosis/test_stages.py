@@ -15,6 +15,7 @@ from fisheye_svp_ros.diagnosis.stepwise import eliminate_effects
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.effects.recording_effects import FocalDriftEffect, SessionStepEffect
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting.first_screen import first_screen, headline
 from fisheye_svp_ros.scene.observations import views_of
@@ -77,8 +78,8 @@ def test_a_tilt_beside_a_jump_stays_confirmed():
     rng = np.random.default_rng(1)
     pose, _, views = bursts(rng, 24)
     terms = [
-        (SessionStepEffect((float(views.t[12, 0]),)), np.array([0.01, 6.0, -5.0])),
-        (CATALOGUE['sensor_tilt'](), np.array([0.008, -0.008])),
+        ModelTerm(SessionStepEffect((float(views.t[12, 0]),)), np.array([0.01, 6.0, -5.0])),
+        ModelTerm(CATALOGUE['sensor_tilt'](), np.array([0.008, -0.008])),
     ]
     found = diagnose(observe(AIR, terms, pose, views, SIGMA, rng), AIR, free_intrinsics=True)
     assert len(names(found)) == 2
@@ -97,16 +98,20 @@ def false_tilt():
     """Return the tests of a jump of the intrinsics that is fitted as a drift beside a tilt."""
     rng = np.random.default_rng(4)
     pose, views = scene(rng)
-    step = SessionStepEffect((float(views.t[8, 0]),)), np.array([0.004, 2.0, 1.0])
+    step = ModelTerm(SessionStepEffect((float(views.t[8, 0]),)), np.array([0.004, 2.0, 1.0]))
     data = group_by_frame(observe(lens(), [step], pose, views, SIGMA, rng))
-    false = (FocalDriftEffect(2), np.zeros(2)), (CATALOGUE['sensor_tilt'](), np.zeros(2))
+    false = (
+        ModelTerm(FocalDriftEffect(2), np.zeros(2)),
+        ModelTerm(CATALOGUE['sensor_tilt'](), np.zeros(2)),
+    )
     state = adjust(data, replace(initial_state(data, lens()), terms=false), ())
     return EffectTests(NullModel.estimate(data, state, ()))
 
 
 def confounder(tests):
-    (_, drift, _), (tilt, columns, _) = tests.null.terms
-    return find_confounder(tests, tilt, columns, [('focal_drift', drift, ['session_step'])])
+    drift, tilt = tests.null.terms
+    twins = [('focal_drift', drift.columns, ['session_step'])]
+    return find_confounder(tests, tilt.effect, tilt.columns, twins)
 
 
 def test_an_effect_with_more_parameters_takes_the_place_of_another_cause(false_tilt):
@@ -129,7 +134,7 @@ def test_a_cause_must_predict_better_beside_what_takes_the_place_of_another(
 def test_one_frame_confirms_nothing_and_is_not_adequate():
     """Its errors are far above the noise, and no other frame tells whose they are."""
     rng = np.random.default_rng(3)
-    shifted = [(ViewpointShiftEffect(), np.array([0.008]))]
+    shifted = [ModelTerm(ViewpointShiftEffect(), np.array([0.008]))]
     table = observe(lens(), shifted, *scene(rng, frames=1), 0.01, rng)
     found = diagnose(table, lens())
     assert found.causes == [] and found.verdict == 'unexplained'
@@ -148,11 +153,11 @@ def test_one_frame_confirms_nothing_and_is_not_adequate():
 def test_p_values_are_corrected_once(false_tilt):
     """A cause had the p-value of one test, a candidate that of all: 23 times as large and more."""
     null = false_tilt.null
-    *_, (effect, columns, _) = null.terms
-    alone = false_tilt.test_removal(null.included_columns, columns, effect).p_value
-    forms = null.fixed.forms.form_counts[effect.name]
+    tilt = null.terms[-1]
+    alone = false_tilt.test_removal(null.included_columns, tilt.columns, tilt.effect).p_value
+    forms = null.fixed.forms.form_counts[tilt.name]
     corrected = min(1.0, alone * false_tilt.effect_count * forms)
-    shares = {one.name: 0.1 for one, _, _ in null.terms}
+    shares = {term.name: 0.1 for term in null.terms}
     errors = np.ones(null.column_count)
     *_, cause = selected_causes(false_tilt, null.terms, errors, shares, [(0.1, 0.0)] * 2)
     assert cause.p_value == corrected > alone

@@ -8,6 +8,7 @@ from helpers.scenes import lens, observe, scene
 from fisheye_svp_ros.diagnosis import DiagnosisOptions
 from fisheye_svp_ros.diagnosis.problem import Inputs, Problem
 from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.solve.rig_state import rms_px
 
 SIGMA = 0.2
@@ -27,10 +28,11 @@ def test_a_third_of_the_landmarks_displaced_is_where_causes_are_sought_from():
     rng = np.random.default_rng(2)
     effect = LandmarkSurveyEffect(tuple(range(0, 60, 3)))
     moves = 0.04 * rng.normal(size=60)
-    table = observe(lens(), [(effect, moves)], *scene(rng), SIGMA, rng)
+    table = observe(lens(), [ModelTerm(effect, moves)], *scene(rng), SIGMA, rng)
     for free in (False, True):
         problem = prepared(table, free_intrinsics=free)
-        ((found, values),) = problem.start.terms
+        (term,) = problem.start.terms
+        found, values = term.effect, term.values
         assert set(found.landmarks) == set(effect.landmarks)
         np.testing.assert_allclose(
             values[np.argsort(np.repeat(found.landmarks, 3))], moves, atol=3e-3

@@ -10,7 +10,8 @@ from fisheye_svp_ros.effects.base import Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE, load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.effects.of_cameras import of_cameras
+from fisheye_svp_ros.effects.rig_effect import rig_kind
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.optics.camera import project
@@ -85,7 +86,9 @@ def test_columns_are_the_derivatives_of_the_prediction(name, linearised):
             step = np.zeros(len(effect.parameters))
             step[i] = 1e-6 * parameter.large
             up, down = (
-                ForwardModel(model.lens, [(effect, sign * step)]).predict(pose, views, False).uv
+                ForwardModel(model.lens, [ModelTerm(effect, sign * step)])
+                .predict(pose, views, False)
+                .uv
                 for sign in (1, -1)
             )
             expected = (up - down) / (2 * step[i])
@@ -101,12 +104,12 @@ def test_lens_file_keeps_effects(name, linearised, tmp_path):
     rng = np.random.default_rng(1)
     for effect in forms(name, scene_):
         values = rng.normal(size=len(effect.parameters)) * 1e-4
-        extended = extend_lens(model.lens, [(effect, values)])
+        extended = extend_lens(model.lens, [ModelTerm(effect, values)])
         save_lens(extended, tmp_path / 'lens.yaml')
         assert load_lens(tmp_path / 'lens.yaml') == extended
         np.testing.assert_allclose(
             ForwardModel(extended).predict(pose, views, False).uv,
-            ForwardModel(model.lens, [(effect, values)]).predict(pose, views, False).uv,
+            ForwardModel(model.lens, [ModelTerm(effect, values)]).predict(pose, views, False).uv,
             rtol=0,
             atol=1e-9,
         )
@@ -125,14 +128,15 @@ def test_a_flat_target_is_stretched_within_its_plane(normal, linearised, tmp_pat
         np.linalg.eigvalsh(stretch), np.hypot(0.005, 0.002) * np.array([-1, 0, 1]), atol=1e-12
     )
     assert whole.key == 'landmark_scale(axes=1)' and plane.key == 'landmark_scale(axes=2)'
-    extended = extend_lens(model.lens, [(plane, np.array([0.01, 0.004]))])
+    extended = extend_lens(model.lens, [ModelTerm(plane, np.array([0.01, 0.004]))])
     save_lens(extended, tmp_path / 'lens.yaml')
     assert load_lens(tmp_path / 'lens.yaml') == extended
 
 
 def test_a_stretch_of_an_older_lens_file_is_read():
     entry = {'axes': 2, 'centre': [0.0, 0.0, 0.0], 'parameters': {'x_over_y': 0.01}}
-    ((effect, values),) = load_effects({'landmark_scale': entry}, 'lens.yaml')
+    (term,) = load_effects({'landmark_scale': entry}, 'lens.yaml')
+    effect, values = term.effect, term.values
     assert effect.axes == 2 and not effect.plane and values.tolist() == [0.01]
 
 
@@ -140,7 +144,9 @@ def test_a_stretch_of_an_older_lens_file_is_read():
 def test_no_views_are_no_trouble(name, linearised):
     model, pose, views, _, scene_ = linearised
     for effect in forms(name, scene_):
-        extended = ForwardModel(model.lens, [(effect, np.full(len(effect.parameters), 1e-5))])
+        extended = ForwardModel(
+            model.lens, [ModelTerm(effect, np.full(len(effect.parameters), 1e-5))]
+        )
         none = np.zeros(0, dtype=int)
         assert extended.predict(pose.take(none), views.take(none)).uv.shape == (0, 60, 2)
 
@@ -197,9 +203,9 @@ def test_dot_centroid_is_the_centroid_of_the_dots_image():
 def test_back_projection_undoes_image_effects():
     pose, views = scene(np.random.default_rng(2), frames=4)
     terms = [
-        (CATALOGUE['decentering'](), np.array([0.002, -0.003])),
-        (CATALOGUE['focal_length'](), np.array([0.01])),
-        (CATALOGUE['viewpoint_shift'](1), np.array([0.01])),
+        ModelTerm(CATALOGUE['decentering'](), np.array([0.002, -0.003])),
+        ModelTerm(CATALOGUE['focal_length'](), np.array([0.01])),
+        ModelTerm(CATALOGUE['viewpoint_shift'](1), np.array([0.01])),
     ]
     model = ForwardModel(lens(), terms)
     image = model.predict(pose, views)
@@ -212,7 +218,7 @@ def test_back_projection_undoes_image_effects():
 
 def test_a_profile_that_turns_back_past_its_data_is_used_up_to_there():
     effect = CATALOGUE['radial_profile'](4, 1.54)
-    model = ForwardModel(lens(), ((effect, np.array([-1.3, -2.3, 1.4, -0.3]) * 2),))
+    model = ForwardModel(lens(), (ModelTerm(effect, np.array([-1.3, -2.3, 1.4, -0.3]) * 2),))
     curve = model.lens.image_height
     assert np.radians(100) < curve.limit < np.radians(140)
     theta = np.linspace(0.0, curve.limit, 200)[:-1]
@@ -276,7 +282,7 @@ def test_every_effect_says_where_it_stands_in_the_budget_and_what_it_is():
         'noise_vs_angle',
     }
     for name, kind in CATALOGUE.items():
-        assert of_cameras(kind).budget_stage() == stages[name]
+        assert rig_kind(kind).budget_stage() == stages[name]
         assert kind.summary().endswith('.') and kind.to_separate and kind.signature
     assert 'along the axis' in CATALOGUE['viewpoint_shift'].summary()
 
@@ -306,7 +312,10 @@ def test_a_dome_turns_rays_as_its_glass_does(distance):
         for one, terms in (
             (replace(plain, port=glass), ()),
             (plain, ()),
-            (plain, [(CATALOGUE['dome_port'](0.05, 0.004, 1.5), np.array([0.004, -0.003]))]),
+            (
+                plain,
+                [ModelTerm(CATALOGUE['dome_port'](0.05, 0.004, 1.5), np.array([0.004, -0.003]))],
+            ),
         )
     )
     seen = exact.valid & found.valid

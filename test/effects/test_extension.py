@@ -10,6 +10,7 @@ import fisheye_svp_ros as fsvp
 from fisheye_svp_ros.effects.catalogue import CATALOGUE, load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import lens_from_dict, lens_to_dict, load_lens, save_lens
 from fisheye_svp_ros.io.share import lens_path
@@ -30,8 +31,8 @@ from fisheye_svp_ros.simulate.scenario import model_of, true_lens
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.study.budget import Setup, make_budget
 
-SHIFT = CATALOGUE['viewpoint_shift'](order=2), np.array([0.004, 0.001])
-PORT = CATALOGUE['flat_port'](1.4), np.array([0.01])
+SHIFT = ModelTerm(CATALOGUE['viewpoint_shift'](order=2), np.array([0.004, 0.001]))
+PORT = ModelTerm(CATALOGUE['flat_port'](1.4), np.array([0.01]))
 FISH214 = load_lens(lens_path('fish214'))
 KB = replace(lens(), image_height=KannalaBrandt(-0.01, 0.002, 0.0, 0.0))
 SEEN = scene(np.random.default_rng(5), frames=4)
@@ -56,7 +57,9 @@ def some(*names, size=0.3):
     rng = np.random.default_rng(len(names))
     effects = [CATALOGUE[name](**SHAPES[name]) for name in names]
     return [
-        (e, size * rng.uniform(0.5, 1.0, len(e.parameters)) * [p.large for p in e.parameters])
+        ModelTerm(
+            e, size * rng.uniform(0.5, 1.0, len(e.parameters)) * [p.large for p in e.parameters]
+        )
         for e in effects
     ]
 
@@ -67,7 +70,8 @@ def bowed(seen, height=0.01):
         ForwardModel(KB, ()).scene(*seen, ForwardModel(KB, ()).linearise(*seen))
     )[0]
     values = np.full(len(shape.parameters), height)
-    return observe(KB, [(shape, values)], *seen, 0.0, np.random.default_rng(1)), (shape, values)
+    term = ModelTerm(shape, values)
+    return observe(KB, [term], *seen, 0.0, np.random.default_rng(1)), term
 
 
 @pytest.mark.parametrize(
@@ -82,7 +86,7 @@ def test_an_extended_lens_predicts_what_its_effects_do(base):
     found = ForwardModel(extended).predict(*SEEN, False).uv
     # Only aspect times other effects of the image and on the phase of its pixels is left over.
     np.testing.assert_allclose(found, expected, rtol=0, atol=0.1)
-    without = [term for term in terms if term[0].name not in ('aspect', 'detector_bias')]
+    without = [term for term in terms if term.name not in ('aspect', 'detector_bias')]
     np.testing.assert_allclose(
         ForwardModel(extend_lens(base, without)).predict(*SEEN, False).uv,
         ForwardModel(base, without).predict(*SEEN, False).uv,
@@ -94,11 +98,11 @@ def test_an_extended_lens_predicts_what_its_effects_do(base):
 
 def test_what_the_lens_has_a_place_for_goes_there():
     extended = extend_lens(KB, some(*SHAPES))
-    (_, (relative,)), (_, (cx, cy)), (_, (aspect,)) = (
-        term
+    (relative,), (cx, cy), (aspect,) = (
+        term.values
         for name in ('focal_length', 'principal_point', 'aspect')
         for term in some(*SHAPES)
-        if term[0].name == name
+        if term.name == name
     )
     assert extended.fx == pytest.approx(KB.fx * (1 + relative) * (1 + aspect / 2))
     assert extended.fy == pytest.approx(KB.fy * (1 + relative) * (1 - aspect / 2))
@@ -118,9 +122,9 @@ def test_what_the_lens_has_a_place_for_goes_there():
     assert extended.max_incidence <= np.pi / 2
     other = extend_lens(replace(KB, image_height=Stereographic()), some('radial_profile'))
     assert set(other.corrections) == {'radial_profile'}
-    assert set(extend_lens(KB, [(CATALOGUE['radial_profile'](8), np.ones(8))]).corrections) == {
-        'radial_profile'
-    }
+    assert set(
+        extend_lens(KB, [ModelTerm(CATALOGUE['radial_profile'](8), np.ones(8))]).corrections
+    ) == {'radial_profile'}
 
 
 def test_found_coefficients_add_to_those_of_the_lens():
@@ -131,17 +135,21 @@ def test_found_coefficients_add_to_those_of_the_lens():
     )
     twice = extend_lens(extend_lens(KB, some('skew')), some('skew'))
     assert twice.corrections['skew']['parameters']['shear'] == pytest.approx(
-        2 * some('skew')[0][1][0]
+        2 * some('skew')[0].values[0]
     )
     form = CATALOGUE['detector_bias']
     with pytest.raises(LensError, match=r'already holds detector_bias\(order=1\) in corrections'):
-        extend_lens(extend_lens(KB, [(form(1), np.ones(1))]), [(form(2), np.ones(4))])
+        extend_lens(
+            extend_lens(KB, [ModelTerm(form(1), np.ones(1))]), [ModelTerm(form(2), np.ones(4))]
+        )
 
 
 def test_svp_takes_away_whatever_the_shift_is_made_of(tmp_path):
     document = lens_to_dict(FISH214)
     document['max_incidence_deg'] = 85.0
-    document['effects'] = {e.name: e.to_dict(v) for e, v in (SHIFT, PORT, *some('skew'))}
+    document['effects'] = {
+        t.name: t.effect.to_dict(t.values) for t in (SHIFT, PORT, *some('skew'))
+    }
     found = lens_from_dict(document)
     # An older file and a hand-written one mean the same.
     document['corrections'] = document.pop('effects')
@@ -180,7 +188,8 @@ def test_what_an_svp_user_is_given_has_the_corrected_curve():
     change = given.fx * given.image_height.value_and_slope(theta)[0] - (
         plain.fx * plain.image_height.value_and_slope(theta)[0]
     )
-    effect, values = some('radial_profile')[0]
+    (term,) = some('radial_profile')
+    effect, values = term.effect, term.values
     expected = effect.with_curves(base, values).image_height.value_and_slope(theta)[0]
     expected -= base.image_height.value_and_slope(theta)[0]
     assert change == pytest.approx(base.fx * expected, rel=0.02)
@@ -269,7 +278,7 @@ class TestTarget:
 
     def test_one_that_names_no_landmarks_is_any(self):
         table, term = bowed(SEEN)
-        old = {**lens_to_dict(KB), 'effects': {'target_shape': term[0].to_dict(term[1])}}
+        old = {**lens_to_dict(KB), 'effects': {'target_shape': term.effect.to_dict(term.values)}}
         model = ForwardModel(lens_from_dict(old))
         solved = localize(model, group_views(table))
         assert np.nanmax(np.abs(solved.residual)) < 1e-6
@@ -324,7 +333,7 @@ def contrast(photograph, corner):
 
 def test_photographs_are_taken_with_all_of_the_lens():
     small = replace(KB, width=160, height=120, fx=40.0, fy=40.0, cx=79.5, cy=59.5)
-    extended = extend_lens(small, [(CATALOGUE['decentering'](), np.array([0.1, -0.08]))])
+    extended = extend_lens(small, [ModelTerm(CATALOGUE['decentering'](), np.array([0.1, -0.08]))])
     printed, exposure = Print(4, 3, 0.05), Exposure(noise=0.0, blur=0.0, vignetting=0.0)
     pose = Pose(np.eye(3), np.array([0.075, 0.05, -0.12]))
     photograph = render(extended, printed, pose, exposure, np.random.default_rng(0))

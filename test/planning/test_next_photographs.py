@@ -12,6 +12,7 @@ from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.diagnosis import Cause
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
@@ -48,7 +49,9 @@ def fitted(observations, terms=()):
 
 @pytest.fixture(scope='module')
 def linear():
-    return fitted(photographs(SHIFTED, None, 8), ((ViewpointShiftEffect(1), np.zeros(1)),))
+    return fitted(
+        photographs(SHIFTED, None, 8), (ModelTerm(ViewpointShiftEffect(1), np.zeros(1)),)
+    )
 
 
 @pytest.fixture(scope='module')
@@ -127,8 +130,8 @@ def test_predicted_errors_are_those_of_noisy_refits(linear, board, shots):
                 )
             )
         )
-        again = fitted(both, ((ViewpointShiftEffect(1), np.zeros(1)),))
-        pulls.append((again.state.terms[0][1][0] - 0.003) / answers[-1])
+        again = fitted(both, (ModelTerm(ViewpointShiftEffect(1), np.zeros(1)),))
+        pulls.append((again.state.terms[0].values[0] - 0.003) / answers[-1])
     assert np.abs(pulls).max() < 4
 
 

@@ -12,6 +12,7 @@ from fisheye_svp_ros.effects.detection_effects import (
     WrongIdsEffect,
 )
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import LensError, ParameterError
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
@@ -138,7 +139,7 @@ def test_stereo_is_one_table_of_two_cameras():
 def noisy(effect, values, sigma=0.2, frames=300):
     """Return clean and noisy image points (frames, N, 2) with one effect of the noise."""
     landmarks = environment('inner', 2.0)
-    terms = ((effect, np.array(values)),)
+    terms = (ModelTerm(effect, np.array(values)),)
     tables = (
         simulate(ForwardModel(FISH180, some), landmarks, paper_pose(frames), noise, rng())
         for some, noise in (((), 0.0), (terms, sigma))

@@ -9,8 +9,9 @@ from scipy.optimize import least_squares
 
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.image_effects import DecenteringEffect, SkewEffect
-from fisheye_svp_ros.effects.of_cameras import by_camera, combine_cameras
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
+from fisheye_svp_ros.effects.rig_effect import assign_camera
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.pose import Pose, identity
@@ -39,7 +40,7 @@ def observed(cameras=1, frames=4, seed=5):
 
 
 def with_shift(state):
-    return replace(state, terms=((ViewpointShiftEffect(1), np.zeros(1)),))
+    return replace(state, terms=(ModelTerm(ViewpointShiftEffect(1), np.zeros(1)),))
 
 
 def prior_rows(prior, state):
@@ -132,11 +133,11 @@ def test_a_prior_far_away_in_rotation_is_followed_exactly():
 def test_what_is_held_stays_and_poses_can_be_fitted_alone():
     data = observed()
     state = with_shift(initial_state(data, lens()))
-    held = replace(state, terms=((ViewpointShiftEffect(1), np.array([0.002])),))
+    held = replace(state, terms=(ModelTerm(ViewpointShiftEffect(1), np.array([0.002])),))
     fitted = adjust(data, held, FREE, held=('viewpoint_shift',))
-    assert fitted.terms[0][1] == 0.002 and fitted.lens.fx != state.lens.fx
+    assert fitted.terms[0].values == 0.002 and fitted.lens.fx != state.lens.fx
     posed = adjust_poses(data, held)
-    assert posed.lens == held.lens and posed.terms[0][1] == 0.002
+    assert posed.lens == held.lens and posed.terms[0].values == 0.002
     again = localize_frames(data, held)
     assert np.abs(again.pose.difference(posed.pose)).max() < 1e-8
 
@@ -145,7 +146,7 @@ def test_poses_alone_are_at_the_minimum_beside_an_effect_of_the_image():
     """Without its slope no step keeps what it promises: 60 steps, and a worse place."""
     data = observed()
     state = initial_state(data, lens())
-    bent = replace(state, terms=((DecenteringEffect(), np.array([0.02, -0.01])),))
+    bent = replace(state, terms=(ModelTerm(DecenteringEffect(), np.array([0.02, -0.01])),))
     posed = adjust_poses(data, bent)
 
     def rows(step):
@@ -173,14 +174,12 @@ def two_lenses():
 def rig_state(data):
     """Return a state of two lenses that share one effect and have another each for itself."""
     state = initial_state(data, *([two_lenses()[0], two_lenses()[1:]]))
-    own = combine_cameras(
-        [
-            by_camera(i, label, [DecenteringEffect()])[0]
-            for i, label in enumerate(('left', 'right'))
-        ]
+    left, right = (
+        assign_camera(DecenteringEffect(), i, label) for i, label in enumerate(('left', 'right'))
     )
     values = np.array([1e-4, -2e-4, 3e-4, 1e-4])
-    return replace(state, terms=((own, values), (SkewEffect(), np.array([1e-3]))))
+    own = ModelTerm(left.merge_with(right), values)
+    return replace(state, terms=(own, ModelTerm(SkewEffect(), np.array([1e-3]))))
 
 
 def test_columns_of_a_rig_of_two_lenses_are_those_of_differences():
@@ -221,6 +220,17 @@ def test_a_rig_predicts_each_view_by_its_camera():
             image.uv[rows], own.predict(pose.take(rows), views.take(rows)).uv, equal_nan=True
         )
     assert not state.model.is_lens_only and not ForwardModel(two_lenses()).is_lens_only
+
+
+def test_an_effect_of_single_cameras_is_asked_like_any_other():
+    data = observed(cameras=2)
+    state = rig_state(data)
+    pose, views, effect = state.view_poses(data), data.views, state.terms[0].effect
+    linear = state.model.linearise(pose, views)
+    seen = state.model.scene(pose, views, linear)
+    columns = state.model.effect_columns(effect, seen, linear)
+    np.testing.assert_array_equal(effect.columns(seen), columns)
+    assert (effect.cameras, effect.form) == (('left', 'right'), DecenteringEffect())
 
 
 def test_gauss_newton_under_white_noise_is_the_adjustment():

@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
@@ -166,7 +167,7 @@ def test_no_correction_keeps_a_pose_from_being_found(name, form, size):
     lens, rng = LENSES['fish180'].svp(), np.random.default_rng(0)
     effect = CATALOGUE[name](**form)
     values = np.full(len(effect.parameters), size)
-    model = ForwardModel(lens, [(effect, values)])
+    model = ForwardModel(lens, [ModelTerm(effect, values)])
     true = Pose(
         rotation_from_vector(rng.normal(scale=0.3, size=(20, 3))),
         rng.normal(scale=0.02, size=(20, 3)),
@@ -198,7 +199,9 @@ def test_no_correction_keeps_a_pose_from_being_found(name, form, size):
 def test_a_solvers_derivatives_have_how_corrections_vary_over_the_image(name):
     rng = np.random.default_rng(36)
     effect = CATALOGUE[name]()
-    model = ForwardModel(LENSES['fish180'], [(effect, np.full(len(effect.parameters), 0.003))])
+    model = ForwardModel(
+        LENSES['fish180'], [ModelTerm(effect, np.full(len(effect.parameters), 0.003))]
+    )
     pose = scattered_poses(rng, 10, 0.5)
     views = seen(LENSES['fish180'], environment('inner', 0.5).points, pose)
     found = model.d_pose(model.linearise(pose, views), views)
@@ -312,7 +315,7 @@ def test_a_rolling_shutter_in_a_lens_follows_from_neighbouring_poses():
     """Velocities that changed with every step of the poses lost a third of the frames."""
     rng = np.random.default_rng(4)
     pose, views = scenes.scene(rng, frames=30)
-    shutter = (CATALOGUE['rolling_shutter'](), np.array([0.04]))
+    shutter = ModelTerm(CATALOGUE['rolling_shutter'](), np.array([0.04]))
     model = ForwardModel(scenes.lens(), [shutter])
     uv = model.predict(pose, views).uv + rng.normal(size=views.uv.shape) * 0.1
     seen = views._replace(uv=uv, weight=np.where(np.isfinite(uv).all(axis=-1), 10.0, 0.0))

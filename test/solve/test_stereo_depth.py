@@ -7,6 +7,7 @@ from scipy.optimize import brentq, least_squares, minimize_scalar
 
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
@@ -222,7 +223,9 @@ def test_optimal_points_equal_scipy_and_beat_the_midpoint():
 def test_no_correction_of_a_lens_keeps_a_point_from_being_found(name):
     rng = np.random.default_rng(51)
     effect = CATALOGUE[name]()
-    model = ForwardModel(SVP['fish180'].lens, [(effect, np.full(len(effect.parameters), 0.005))])
+    model = ForwardModel(
+        SVP['fish180'].lens, [ModelTerm(effect, np.full(len(effect.parameters), 0.005))]
+    )
     points, pose = random_points(rng, 300), rig('parallel')
     left, right = (
         model.project(seen).uv + rng.normal(scale=0.3, size=(300, 2))

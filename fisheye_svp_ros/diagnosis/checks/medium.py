@@ -239,7 +239,7 @@ class InAir:
         """Return what is known of index and intrinsics, beside rows as noisy as a fit's."""
         linear = Linearization(data, state, ())
         noise = float(np.median(np.abs(linear.residual[linear.row_mask]))) / _MEDIAN_SIZE
-        others = sum(len(values) for effect, values in state.terms if is_shared(effect))
+        others = sum(len(term.values) for term in state.terms if is_shared(term.effect))
         mean = np.concatenate(
             [
                 [state.lens.parameters[index]],

@@ -34,11 +34,11 @@ def predict_board(data: RigViews, lens: Lens) -> HeldOut:
     """
     state = initial_state(data, replace(lens, target={}))
     # In px every point counts alike, however noisy it is.
-    terms = tuple(term for term in state.terms if term[0].stage != 'noise')
+    terms = tuple(term for term in state.terms if term.effect.stage != 'noise')
     landmarks = np.unique(data.views.landmark[data.views.used]).tolist()
     free = LandmarkSurveyEffect(tuple(landmarks), everywhere=True)
     state = with_effect(replace(state, terms=terms), free)
-    return fit_and_predict(data, state, (), [effect.name for effect, _ in terms])[1]
+    return fit_and_predict(data, state, (), [term.name for term in terms])[1]
 
 
 def measure_travel(data: RigViews, given: Lens, extended: Lens) -> Travel:

@@ -26,9 +26,8 @@ from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import Progress
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.selection import Selection, select_causes
-from fisheye_svp_ros.effects.forward import Term
-from fisheye_svp_ros.effects.of_cameras import camera_terms
 from fisheye_svp_ros.effects.target_map import KnownTarget, at_landmarks, less_similarity
+from fisheye_svp_ros.effects.terms import ModelTerm, camera_terms
 from fisheye_svp_ros.pose import Pose, identity, vector_from_rotation
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.rig_checks import MIN_SHARED_FRAMES, is_unpaired
@@ -74,20 +73,20 @@ class Transfer:
         return self.less_px.high < 0
 
 
-def moves_with_lens(term: Term) -> bool:
+def moves_with_lens(term: ModelTerm) -> bool:
     """Whether an effect moves with the lens, from one recording and target to the next."""
-    effect = term[0]
+    effect = term.effect
     return effect.budget_stage() == 'lens' and not effect.of_recording
 
 
-def displaces_landmarks(term: Term) -> bool:
+def displaces_landmarks(term: ModelTerm) -> bool:
     """Whether an effect displaces landmarks."""
-    return term[0].stage == 'target'
+    return term.effect.stage == 'target'
 
 
-def without_terms(state: RigState, which: Callable[[Term], bool]) -> RigState:
+def without_terms(state: RigState, which: Callable[[ModelTerm], bool]) -> RigState:
     """Return the state without some of its effects."""
-    return state.without_effects([term[0].name for term in state.terms if which(term)])
+    return state.without_effects([term.name for term in state.terms if which(term)])
 
 
 def fit_and_predict(
@@ -196,9 +195,9 @@ def agree_on_target(
     progress('cross-camera validation', 0.78)
     pairs, problem = compare_cameras(selection), selection.problem
     gone = tuple(
-        e.name
-        for e, _, _ in selection.causes
-        if e.stage == 'target' and e.name not in problem.options.included
+        cause.name
+        for cause in selection.causes
+        if displaces_landmarks(cause) and cause.name not in problem.options.included
     )
     if not gone or all(pair.verdict != 'contradict' for pair in pairs):
         return selection, pairs

@@ -26,8 +26,8 @@ from fisheye_svp_ros.diagnosis.cross_validation import HeldOut
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
-from fisheye_svp_ros.effects.forward import Term
 from fisheye_svp_ros.effects.target_map import KnownTarget, less_similarity
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.optics.lens import INTRINSICS
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, with_effect
 
@@ -152,10 +152,10 @@ def _transfer_causes(
     bare = without_terms(other.null.linear.state, moves_with_lens)
 
     def predict(
-        terms: Sequence[Term], state: RigState = bare, free: Sequence[str] = free
+        terms: Sequence[ModelTerm], state: RigState = bare, free: Sequence[str] = free
     ) -> HeldOut:
         there = replace(state, terms=(*state.terms, *terms))
-        return fit_and_predict(data, there, free, [effect.name for effect, _ in terms])[1]
+        return fit_and_predict(data, there, free, [term.name for term in terms])[1]
 
     without, there = predict(()), predict(carried)
     whole = (
@@ -163,10 +163,10 @@ def _transfer_causes(
         predict(carried, replace(bare, lens=one.null.linear.state.lens), ()),
     )
     causes = {
-        effect.name: Transfer.compare(
-            source, to, predict([term for term in carried if term[0].name != effect.name]), there
+        cause.name: Transfer.compare(
+            source, to, predict([term for term in carried if term.name != cause.name]), there
         )
-        for effect, _ in carried
+        for cause in carried
     }
     return TransferredCauses(
         Transfer.compare(source, to, without, there),
@@ -209,11 +209,11 @@ def _parameters(one: DatasetModel, other: DatasetModel) -> dict[str, SharedParam
 def _with_lens_effects(one: DatasetModel, other: DatasetModel) -> RigState:
     """Return the state with the other's causes of the lens as well, starting from nothing."""
     state = one.null.linear.state
-    known = {effect.name: len(values) for effect, values in state.terms}
-    for effect, values in other.null.linear.state.terms:
+    known = {term.name: len(term.values) for term in state.terms}
+    for term in other.null.linear.state.terms:
         # Of two forms of one effect the one with more parameters.
-        if moves_with_lens((effect, values)) and len(values) > known.get(effect.name, 0):
-            state = with_effect(state, effect, np.zeros_like(values))
+        if moves_with_lens(term) and len(term.values) > known.get(term.name, 0):
+            state = with_effect(state, term.effect, np.zeros_like(term.values))
     return state
 
 
@@ -223,15 +223,16 @@ def _estimates(one: DatasetModel, state: RigState) -> dict[str, tuple[float, flo
     state = refit(data, state, free, variances)
     null = NullModel.with_variances(data, state, free, variances)
     errors = standard_errors(null)
-    rig = null.column_count - len(free) - sum(len(values) for _, _, values in null.terms)
+    rig = null.column_count - len(free) - sum(len(term.values) for term in null.terms)
     found = {
         name: (state.parameters[name], float(errors[rig + i]), 'px' if name in INTRINSICS else '')
         for i, name in enumerate(free)
     }
-    for effect, columns, values in null.terms:
-        if moves_with_lens((effect, values)):
-            found |= {
-                f'{effect.name}.{p.name}': (float(v), float(e), p.unit)
-                for p, v, e in zip(effect.parameters, values, errors[columns], strict=True)
-            }
+    for term in filter(moves_with_lens, null.terms):
+        found |= {
+            f'{term.name}.{p.name}': (float(v), float(e), p.unit)
+            for p, v, e in zip(
+                term.effect.parameters, term.values, errors[term.columns], strict=True
+            )
+        }
     return found

@@ -1,20 +1,20 @@
-"""An effect of single cameras of a rig, each with parameters of its own."""
+"""An effect that single cameras of a rig have, each with parameters of its own."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Self
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, Term
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.effects.base import DIMENSIONS, Effect, Parameter, Scene
 
 
 @dataclass(frozen=True)
-class OfCameras(Effect):
+class RigEffect(Effect):
     """Forms of one effect by camera: its number in the rig, its name and the form."""
 
     parts: tuple[tuple[int, str, Effect], ...] = ()
@@ -37,6 +37,14 @@ class OfCameras(Effect):
         return tuple(f'{label}.{self.name}' for _, label, _ in self.parts)
 
     @property
+    def cameras(self) -> tuple[str, ...]:
+        return tuple(label for _, label, _ in self.parts)
+
+    @property
+    def form(self) -> Effect:
+        return self.parts[0][2]
+
+    @property
     def of_recording(self) -> bool:
         return any(effect.of_recording for _, _, effect in self.parts)
 
@@ -48,24 +56,27 @@ class OfCameras(Effect):
         return all(effect.holds_for(t, known) for _, _, effect in self.parts)
 
     def prior_sigma(self, scene: Scene) -> Array:
-        own = {number: one for _, number, one in scene.cameras}
+        own = {number: camera for _, number, camera in scene.cameras}
         return np.concatenate(
             [effect.prior_sigma(own[number]) for number, _, effect in self.parts]
         )
 
     def columns(self, scene: Scene) -> Array:
-        """Every camera has a scene of its own: see `of_camera`."""
-        raise NotImplementedError('an effect of single cameras is asked camera by camera')
+        columns = np.zeros((*scene.uv.shape[:2], DIMENSIONS[self.stage], len(self.parameters)))
+        for rows, number, seen in scene.cameras:
+            for form, own in self.forms_of_camera(number):
+                block = np.zeros((*seen.uv.shape[:2], *columns.shape[2:]))
+                block[..., own] = form.columns(seen)
+                columns[rows] = block
+        return columns
 
-    def of_camera(self, camera: int, values: Array) -> Term | None:
-        """Return the form of one camera with its values (out of all), None if it has none."""
+    def forms_of_camera(self, camera: int) -> Iterator[tuple[Effect, Index]]:
         start = 0
         for number, _, effect in self.parts:
             stop = start + len(effect.parameters)
             if number == camera:
-                return effect, values[start:stop]
+                yield effect, np.arange(start, stop)
             start = stop
-        return None
 
     def merge_with(self, other: Self) -> Effect:
         known = {number: (label, effect) for number, label, effect in self.parts}
@@ -77,40 +88,12 @@ class OfCameras(Effect):
 
 
 @cache
-def of_cameras(kind: type[Effect]) -> type[OfCameras]:
+def rig_kind(kind: type[Effect]) -> type[RigEffect]:
     """Return the class of an effect's forms by camera; it has the effect's name."""
-    words = {
-        name: getattr(kind, name)
-        for name in (
-            'name',
-            'stage',
-            'rarer_than',
-            'asked_after',
-            'to_separate',
-            'abrupt',
-            'of_frames',
-        )
-    }
-    return type(f'{kind.__name__}OfCameras', (OfCameras,), words)
+    words = {name: getattr(kind, name) for name in Effect.__annotations__ if hasattr(kind, name)}
+    return type(f'Rig{kind.__name__}', (RigEffect,), words)
 
 
-def by_camera(camera: int, label: str, effects: Iterable[Effect]) -> Sequence[OfCameras]:
-    """Return effects as those of one camera."""
-    return [of_cameras(type(effect))(((camera, label, effect),)) for effect in effects]
-
-
-def combine_cameras(effects: Sequence[OfCameras]) -> OfCameras:
-    """Return forms of one effect of different cameras as one, its parameters in their order."""
-    return type(effects[0])(tuple(part for effect in effects for part in effect.parts))
-
-
-def camera_terms(terms: Iterable[Term], camera: int) -> tuple[Term, ...]:
-    """Return what acts in the views of one camera."""
-    found = []
-    for effect, values in terms:
-        if isinstance(effect, OfCameras):
-            own = effect.of_camera(camera, np.asarray(values))
-            found += [] if own is None else [own]
-        else:
-            found.append((effect, values))
-    return tuple(found)
+def assign_camera(effect: Effect, camera: int, label: str) -> Effect:
+    """Return an effect as that of one camera; `merge_with` joins those of several."""
+    return rig_kind(type(effect))(((camera, label, effect),))
