@@ -162,6 +162,10 @@ class StampJoin:
         """Stop waiting for an optional topic until it matches a set again."""
         self._tracks[topic].expected = False
 
+    def expects(self, topic: str) -> bool:
+        """Say whether sets wait for an optional topic."""
+        return self._tracks[topic].expected
+
     def expect(self, topic: str) -> None:
         """Wait for an optional topic, for the patience of one set."""
         self._shares.setdefault(topic, self._required[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 MAX_RMS_RATIO = 1.5  # a set may fit this much worse than the one before it, by chance
 MAX_POSE_CHANGE = 0.1  # rad, and of the distance of the nearest landmark
 PERFECT_FIT_PX = 1e-6  # px; what fits better fits perfectly
+_MAX_AHEAD = 2  # intervals between two sets by which a motion is carried on
 OUTLIER_SEARCH_INTERVAL = 10  # sets, of those that fit badly one after the other
 
 
@@ -62,7 +64,8 @@ class Localizer(SolverNode):
         self._markers = self.announce(MarkerArray, '~/markers', LATCHED)
         self._transforms = Transforms(self, self.settings.publish_tf)
         self._base = BasePose(self, self.settings)
-        self._before: tuple[Pose | None, float] = None, 0.0
+        self._latest: deque[tuple[int, Pose]] = deque(maxlen=2)  # stamps and poses, to go on from
+        self._rms_before = 0.0  # px
         self._misfits = 0  # sets up to the one before that fit badly, without outliers found
         self._errors: LensErrors | None = None  # of the latest lens
         self.start()
@@ -99,7 +102,7 @@ class Localizer(SolverNode):
             sigma = errors.inflate_sigma(self.settings.sigma_px)
             views = views._replace(weight=np.full_like(views.weight, 1 / sigma))
         true: Pose | None = items.get('true_pose')
-        found = self._localize(model, views, true).require(self.settings.gate)
+        found = self._localize(stamp, model, views, true).require(self.settings.gate)
         solution = found.solution
         pose, world = solution.pose.take(0), landmarks.frame
         camera = self.settings.camera_frame or seen.frame
@@ -130,23 +133,27 @@ class Localizer(SolverNode):
         return self._errors
 
     def _localize(
-        self, model: ForwardModel, views: Views, true: Pose | None
+        self, stamp: int, model: ForwardModel, views: Views, true: Pose | None
     ) -> SetSolutions[Localization]:
-        """Solve from where the camera was, which is faster; from anywhere if that is not near.
+        """Solve from where the camera should be, which is faster; from anywhere if it is not near.
 
         A wrong lens is wrong in every set; to search each for outliers would take 20 ms more.
         Where a scenario names the lens, its error is what is measured: no point is an outlier.
         """
-        start, before = self._before
+        start = _pose_at(stamp, self._latest)
         measured = bool(self.settings.lens)
         searched = measured and self._misfits % OUTLIER_SEARCH_INTERVAL == 0
         found = localize_sets(model, views, true, start, examined=True, searched=searched)
         if start is not None and not (
-            _rms_px(found) < MAX_RMS_RATIO * before and _is_near(start, found.solution.pose, views)
+            _rms_px(found) < MAX_RMS_RATIO * self._rms_before
+            and _is_near(start, found.solution.pose, views)
         ):
+            self._latest.clear()
             found = localize_sets(model, views, true, examined=True, searched=measured)
         rms, pose = _rms_px(found), found.solution.pose
-        self._before = (pose, max(rms, PERFECT_FIT_PX)) if np.isfinite(rms) else (None, 0.0)
+        if np.isfinite(rms):
+            self._latest.append((stamp, pose))
+            self._rms_before = max(rms, PERFECT_FIT_PX)
         whole = found.metrics['points'][0] == views.used.sum()
         self._misfits = self._misfits + 1 if found.reasons[0] and whole else 0
         return found
@@ -162,6 +169,17 @@ def _errors_of(lens: Lens) -> LensErrors:
 def _rms_px(found: SetSolutions[Localization]) -> float:
     """Return the residual of one view; infinite without a pose."""
     return float(found.metrics['rms_px'][0]) if found.solved[0] else np.inf
+
+
+def _pose_at(stamp: int, latest: Sequence[tuple[int, Pose]]) -> Pose | None:
+    """Return where a camera is that goes on as it went, (1,); latest: stamps, ns, and poses."""
+    if not latest:
+        return None
+    now, pose = latest[-1]
+    before, other = latest[0]
+    if not before < now < stamp <= now + _MAX_AHEAD * (now - before):
+        return pose
+    return pose.retract(pose.difference(other) * (stamp - now) / (now - before))
 
 
 def _is_near(start: Pose, pose: Pose, views: Views) -> bool:

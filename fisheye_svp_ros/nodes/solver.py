@@ -99,7 +99,9 @@ class SolverNode(ManagedNode):
 
     def __init__(self, node_name: str | None = None, **options: Any) -> None:
         super().__init__(node_name, **options)
-        engines.settle(engines.LOADING)  # a node runs for long, but its start must not
+        self._compilation = engines.settle_in_background()  # a start must not wait
+        if self._compilation is not None:
+            self.get_logger().info(wording.compiling())
         self._metrics = {
             name: self.announce(Float64, f'~/metrics/{name}') for name in self.METRICS
         }
@@ -137,6 +139,12 @@ class SolverNode(ManagedNode):
         # Last, because a recorder that sees this topic counts on having seen the others.
         self._result = self.announce(DiagnosticArray, '~/result', wait=True)
         super().start()
+
+    def destroy_node(self) -> None:
+        """End what runs beside the node, too."""
+        if self._compilation is not None:
+            self._compilation.stop()
+        super().destroy_node()
 
     def collect_image_points(self, topic: str) -> None:
         """Listen to the image points of a camera."""
@@ -263,7 +271,22 @@ class SolverNode(ManagedNode):
             self.warn(overload)
         inactive = '' if self.listening else wording.inactive(self.get_fully_qualified_name())
         troubles = filter(None, (inactive, self._latched_landmarks.trouble))
-        return {**counts, **self._validation.rejected}, '; '.join(troubles)
+        return {
+            **counts,
+            **self._validation.rejected,
+            'engine': self._engine(),
+        }, '; '.join(troubles)
+
+    def _engine(self) -> str:
+        """Return what solves; say once that Numba has compiled, or why it has not."""
+        compilation = self._compilation
+        if compilation is None:
+            return engines.settle(0)
+        if compilation.state == 'compiling':
+            return 'numpy, until Numba has compiled'
+        self._compilation = None
+        self.get_logger().info(wording.compiled(compilation.state))
+        return engines.settle(0)
 
     def _listen_to_camera_info(self) -> None:
         def hear(topic: str, stamp: int, unread: Unread) -> None:
@@ -343,6 +366,8 @@ class SolverNode(ManagedNode):
         """Do not let sets wait for what nobody publishes, or has never sent for many sets."""
         optional = (*self._poses, *(['scenario'] if self.settings.lens else []))
         for topic in optional if len(self._join) else ():
+            if not self._join.expects(topic):
+                continue  # to look at the graph takes longer than to read a set
             one = self._inputs[topic]
             silent = not one.has_messages and len(self._join) > _MAX_UNANSWERED
             if silent or not self.count_publishers(one.resolved):

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from helpers.nodes import until
+
+from fisheye_svp_ros.optics import engines
 
 if TYPE_CHECKING:
     from helpers.graph import Graph
@@ -21,6 +24,13 @@ def frequent_reports(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
         from fisheye_svp_ros.nodes import base
 
         monkeypatch.setattr(base, '_REPORT_PERIOD', 0.1)
+
+
+@pytest.fixture(autouse=True)
+def compiles_nothing(same_engine: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have nodes compile nothing in the background where Numba has not compiled yet."""
+    if find_spec('numba') is None or not engines.cache.is_compiled():
+        monkeypatch.setenv(engines.VARIABLE, 'numpy')
 
 
 @pytest.fixture(scope='session')

@@ -1,9 +1,10 @@
 """The engines that the projection and its solvers run on, and which of them does.
 
 NumPy is the reference.  Numba computes the same faster, but must be loaded and, once on a machine,
-compile, which only long work pays back: what begins such work says so (`settle`).  A lens behind a
-port is traced by `port_projection`; an image field moves what any of them returns.  Anything else
-runs on NumPy, and gives the same to the last digit whatever was compiled before.
+compile, which only long work pays back: what begins such work says so (`settle`), and what must
+not wait has it compiled meanwhile (`settle_in_background`).  A lens behind a port is traced by
+`port_projection`; an image field moves what any of them returns.  Anything else runs on NumPy, and
+gives the same to the last digit whatever was compiled before.
 FISHEYE_SVP_ENGINE or `use` have the last word; nothing outside this package asks which one runs.
 """
 
@@ -17,6 +18,7 @@ from types import ModuleType
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.engines import cache, numpy_engine, port_projection
+from fisheye_svp_ros.optics.engines.compilation import Compilation
 from fisheye_svp_ros.optics.engines.results import Incidence, Localization, Rigs, Seen
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -37,6 +39,20 @@ def use(name: str) -> None:
     global _engine
     _engine = _load_engine(name)
     os.environ[VARIABLE] = name
+
+
+def settle_in_background() -> Compilation | None:
+    """Take Numba now if it has compiled; else have it compile, and take it then.
+
+    Returns what tells how far that is; None where there is nothing to compile, or not to be.
+    """
+    global _engine
+    wanted = os.environ.get(VARIABLE, 'auto') != 'numpy' and find_spec('numba') is not None
+    if not wanted or cache.is_compiled():
+        settle(LOADING)
+        return None
+    _engine = numpy_engine
+    return Compilation(lambda: use('numba'), VARIABLE)
 
 
 def settle(points: float) -> str:
@@ -60,7 +76,7 @@ def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
 
 def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     """Return image points (M, 2), px, of points (M, 3), m, in the camera frame, and validity."""
-    engine = _engine if lens.port is None else port_projection
+    engine = _running() if lens.port is None else port_projection
     uv, valid = engine.project(lens, points, limited)
     return uv if lens.image_field is None else lens.image_field.apply(uv), valid
 
@@ -73,7 +89,7 @@ def linearise_views(
     rotation (S, 3, 3), position (S, 3): cameras in the world.  The derivatives (S, N, 2, 6) are
     by the small changes of `pose.Pose.retract`, px/m and px/rad.
     """
-    engine = _engine if lens.port is None else port_projection
+    engine = _running() if lens.port is None else port_projection
     uv, valid, d_pose = engine.linearise_views(lens, rotation, position, points, limited)
     if lens.image_field is not None:
         d_pose, uv = lens.image_field.carry(uv, d_pose), lens.image_field.apply(uv)
@@ -90,7 +106,9 @@ def localize(
     """
     if not lens.is_bare:
         return None
-    found: tuple[Localization, int, int] | None = _engine.localize(lens, seen, row, minimum, start)
+    found: tuple[Localization, int, int] | None = _running().localize(
+        lens, seen, row, minimum, start
+    )
     return found
 
 
@@ -104,7 +122,7 @@ def adjust_rigs(
     """
     if not all(lens.is_bare for lens in lenses):
         return None
-    rigs: Rigs | None = _engine.adjust_rigs(lenses, seen, state)
+    rigs: Rigs | None = _running().adjust_rigs(lenses, seen, state)
     return rigs
 
 
@@ -123,4 +141,20 @@ def _load_engine(name: str) -> ModuleType:
     return numba_engine
 
 
-_engine = _load_engine(os.environ.get(VARIABLE, 'auto'))
+def _running() -> ModuleType:
+    if _engine is None:
+        use('numba')
+    assert _engine is not None
+    return _engine
+
+
+def _compiles_first() -> bool:
+    """Say whether the engine asked for is there, but would have to compile now."""
+    numba = os.environ.get(VARIABLE) == 'numba' and find_spec('numba') is not None
+    return numba and not cache.is_compiled()
+
+
+# What has to compile waits until it is needed: a node has it compile in the background by then.
+_engine: ModuleType | None = (
+    None if _compiles_first() else _load_engine(os.environ.get(VARIABLE, 'auto'))
+)

@@ -85,3 +85,18 @@ def no_camera_info(topic: str) -> str:
 def cameras_mixed(topic: str, frame: str, before: str) -> str:
     """Tell of two cameras on one topic."""
     return f'{topic}: from {frame!r}, but {before!r} before; give each camera its own topic'
+
+
+def compiling() -> str:
+    """Say that a node is slower for a while."""
+    return (
+        'solving with NumPy until Numba has compiled in the background, once on this machine: '
+        'about a minute'
+    )
+
+
+def compiled(state: str) -> str:
+    """Say that it has, or why not; state: of `optics.engines.compilation.Compilation`."""
+    if state == 'compiled':
+        return 'solving with Numba from now on'
+    return f'solving with NumPy: Numba has not compiled ({state})'
