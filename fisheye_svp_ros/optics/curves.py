@@ -64,6 +64,20 @@ class Stereographic(Trigonometric):
 
 
 @dataclass(frozen=True)
+class Perspective(ImageHeight):
+    """h = f tan(theta): a pinhole, and any rectified image."""
+
+    limit = np.pi / 2
+
+    def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
+        height = np.tan(theta)
+        return height, 1 + height * height
+
+    def angle(self, height: Array) -> Array:
+        return np.arctan(height)
+
+
+@dataclass(frozen=True)
 class KannalaBrandt(ImageHeight):
     """h = f (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9).
 
@@ -153,6 +167,7 @@ IMAGE_HEIGHTS: Registry[type[ImageHeight]] = Registry(
         'equidistant': Equidistant,
         'equisolid': Equisolid,
         'stereographic': Stereographic,
+        'perspective': Perspective,
         'kannala_brandt': KannalaBrandt,
     },
     ImageHeight,

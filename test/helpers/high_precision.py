@@ -12,6 +12,7 @@ _HEIGHTS = {
     'Equidistant': lambda k, a: a,
     'Equisolid': lambda k, a: 2 * mpmath.sin(a / 2),
     'Stereographic': lambda k, a: 2 * mpmath.tan(a / 2),
+    'Perspective': lambda k, a: mpmath.tan(a),
     'KannalaBrandt': lambda k, a: (
         a + sum(mpmath.mpf(value) * a ** (2 * i + 3) for i, value in enumerate(k))
     ),

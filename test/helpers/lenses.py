@@ -12,6 +12,7 @@ from fisheye_svp_ros.optics.curves import (
     Gennery,
     KannalaBrandt,
     Orthographic,
+    Perspective,
     Stereographic,
 )
 from fisheye_svp_ros.optics.lens import Lens
@@ -23,6 +24,7 @@ HEIGHTS = {
     'equidistant': (Equidistant(), 107.0),
     'equisolid': (Equisolid(), 107.0),
     'stereographic': (Stereographic(), 120.0),
+    'perspective': (Perspective(), 68.0),
     'kannala_brandt': (KannalaBrandt(-0.02, 0.004, -0.003, 0.0004), 100.0),
 }
 SHIFTS = {

@@ -215,6 +215,16 @@ def test_every_model_as_opencv_projects_it(model: str, d: tuple[float, ...]) -> 
     assert off < max(1.05 * worst, 1e-5) and worst <= 0.2
 
 
+@pytest.mark.parametrize('d', [(), (0.0,) * 5])
+def test_a_wide_pinhole_is_taken_as_it_is(d: tuple[float, ...]) -> None:
+    """Of 137 degrees over the diagonal, as a rectified image has it."""
+    lens, worst = lens_of('plumb_bob', (1280, 800), (300.0, 300.0, 640.0, 400.0), d, 'c', 'info')
+    rays = np.array([[2.1, 1.3, 1.0], [-2.0, 1.2, 1.0], [0.0, 0.0, 1.0]])
+    seen = forward.project(lens, rays)
+    assert worst == 0.0 and seen.valid.all()
+    np.testing.assert_allclose(seen.uv, 300 * rays[:, :2] + (640, 400), atol=1e-9)
+
+
 @pytest.mark.parametrize('skew', [-0.97, 4.26])
 @pytest.mark.parametrize('d', [(0.02, -0.01, 0.003, -0.0005), (0.02, -0.01, 0.003, -0.0005, 0.0)])
 def test_a_skew_is_taken_over_from_message_and_file(

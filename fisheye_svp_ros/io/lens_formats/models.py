@@ -19,7 +19,7 @@ from fisheye_svp_ros.effects.image_effects import DecenteringEffect, SensorTiltE
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_formats.fields import MAX_NUMBER
 from fisheye_svp_ros.optics.curve_base import ViewpointShift
-from fisheye_svp_ros.optics.curves import KannalaBrandt
+from fisheye_svp_ros.optics.curves import KannalaBrandt, Perspective
 from fisheye_svp_ros.optics.lens import Lens, field_of_view
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.observations import views_of
@@ -119,6 +119,12 @@ class Distortion:
         )
 
     @property
+    def is_pinhole(self) -> bool:
+        """Whether there is none, of a pinhole."""
+        factors = (*self.stretch, *self.below)
+        return self.base is PERSPECTIVE and not any(factors) and not self.sideways
+
+    @property
     def sideways(self) -> bool:
         """Whether image points move otherwise than along the radius."""
         return any(self.tangential) or any(map(any, self.prism))
@@ -186,6 +192,10 @@ def nearest_lens(
     if distortion.is_kannala_brandt:
         k = (*distortion.stretch, *[0.0] * RADIAL_TERMS)[:RADIAL_TERMS]
         lens, worst = kannala_brandt(name, size, (fx, fy, cx, cy), k, where), 0.0
+    elif distortion.is_pinhole:
+        lens = kannala_brandt(name, size, (fx, fy, cx, cy), [0.0] * RADIAL_TERMS, where)
+        lens, worst = replace(lens, image_height=Perspective()), 0.0
+        lens = replace(lens, max_incidence=field_of_view(lens))
     else:
         lens, worst = fit_curve(
             name, size, (fx, fy, cx, cy), distortion.height, distortion.base.limit, where
