@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> None:
             coverage = args.overlays / 'coverage.png'
             with keep_existing(not coverage.exists()):  # photographs, but no earlier overlays
                 write_overlays(
-                    find_photographs(args.photographs, args.every, args.split),
+                    find_photographs(args.photographs, args.every, args.split or 1),
                     detection,
                     args.overlays,
                 )
@@ -270,16 +270,18 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     for line in doubtful_folders(paths):
         say(line)
     if args.split is None:
-        args.split = count_cameras(find_photographs(paths, args.every), pattern, args.detector)
-        if args.split > 1:
+        cameras = count_cameras(find_photographs(paths, args.every), pattern, args.detector)
+        if cameras > 1:
+            args.split = cameras
             say(
                 'both halves of these wide images show the board: they are split into left and '
                 'right; --split 1 keeps them whole'
             )
-    count = count_photographs(paths, args.every, args.split)
+    split = args.split or 1
+    count = count_photographs(paths, args.every, split)
     with progress('searching', count) as done:
         detection = detect(
-            find_photographs(paths, args.every, args.split),
+            find_photographs(paths, args.every, split),
             pattern,
             args.detector,
             progress=done,

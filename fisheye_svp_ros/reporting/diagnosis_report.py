@@ -19,7 +19,7 @@ from fisheye_svp_ros.reporting.blocks import data_uri, page
 from fisheye_svp_ros.reporting.cause_text import outlier_rows
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, PointResiduals, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
-from fisheye_svp_ros.reporting.first_screen import first_screen, verdict_words
+from fisheye_svp_ros.reporting.first_screen import first_screen, tone, verdict_words
 from fisheye_svp_ros.reporting.next_steps import (
     ReportInputs,
     command_to_go_on,
@@ -91,6 +91,7 @@ def write_report(
             screen=first_screen(diagnosis, inputs.observations, known),
             command=command_to_go_on(diagnosis, inputs),
             verdict=verdict_words(diagnosis),
+            tone=tone(diagnosis),
             sentences=text.verdict_sentences(diagnosis, known),
             pictures={
                 'target': None,

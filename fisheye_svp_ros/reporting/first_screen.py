@@ -345,6 +345,8 @@ def verdict_words(d: Diagnosis) -> str:
     """Return the verdict as a sentence that agrees with the headline."""
     if d.adequacy.is_misfit:
         return f'Inadequate data: {flaw_statement(d.adequacy.flaws[0])}'
+    if d.verdict == 'adequate' and d.adequacy.flaws:
+        return f'Adequate where points are; {flaw_statement(d.adequacy.flaws[0])}'
     if d.verdict == 'unexplained' and only_gross(d):
         return 'Unexplained: outliers; nothing else is wrong'
     if d.verdict == 'adequate' and d.offers_extended:
@@ -355,6 +357,14 @@ def verdict_words(d: Diagnosis) -> str:
         rest = '; some of the residual error is unexplained' if d.remaining else ''
         return f'{_VERDICTS[d.verdict].partition(":")[0]}: the lens as given is off{rest}'
     return _VERDICTS[d.verdict]
+
+
+def tone(d: Diagnosis) -> str:
+    """Return the verdict whose color the headline has: that of adequate data reassures."""
+    if d.adequacy.is_misfit:
+        return 'unexplained'
+    settled = d.decision['lens'].say == 'keep' and d.decision['photographs'].say == 'enough'
+    return 'partly_explained' if d.verdict == 'adequate' and not settled else d.verdict
 
 
 def target_words(d: Diagnosis) -> str:

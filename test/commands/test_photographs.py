@@ -19,7 +19,7 @@ from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, write
 
 import fisheye_svp_ros as fsvp
 from fisheye_svp_ros import cli
-from fisheye_svp_ros.commands.detect import read_input
+from fisheye_svp_ros.commands.detect import read_input, search_options
 from fisheye_svp_ros.commands.diagnose import _read as read_views
 from fisheye_svp_ros.commands.lenses import lenses_of, load_lenses
 from fisheye_svp_ros.errors import LensError, ParameterError
@@ -51,6 +51,13 @@ def test_beside_photographs_a_table_is_a_table(tmp_path: Path) -> None:
     write_observations(tmp_path / 'test.csv', table)
     read, sizes = read_input(str(tmp_path / 'test.csv'), Namespace(board=BOARD))
     assert len(read) == 4 and not sizes
+
+
+def test_the_next_command_has_the_options_that_were_given(folder: Path) -> None:
+    """It printed "--split 1" where nobody had asked for it."""
+    args = Namespace(board=BOARD, detector=None, sync=None, every=1, split=None)
+    read_input(str(folder), args)
+    assert search_options(args) == ('--board', BOARD)
 
 
 def test_detect_then_calibrate(

@@ -12,7 +12,12 @@ from helpers.flawed_sets import flawed
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, FlawKind, diagnose
 from fisheye_svp_ros.io.lens_files import save_lens
-from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
+from fisheye_svp_ros.reporting.first_screen import (
+    first_screen,
+    terminal_lines,
+    tone,
+    verdict_words,
+)
 from fisheye_svp_ros.scene.observations import group_views
 from fisheye_svp_ros.solve.frame_groups import find_frame_groups
 from fisheye_svp_ros.solve.lens_calibration import calibrate
@@ -57,6 +62,8 @@ def test_nothing_reassures_on_inadequate_data(name):
     check(found)
     text = screen(found)
     assert 'Keep' not in text and 'Enough' not in text and '% sure' not in text
+    assert tone(found) != 'adequate'  # no green headline
+    assert 'describes these data' not in verdict_words(found)
     if found.adequacy.is_misfit:
         assert found.verdict == 'unexplained'
 
@@ -67,6 +74,7 @@ def test_sound_data_are_adequate():
     check(found)
     assert not found.adequacy.flaws
     assert [one.say for one in found.decision.values()] == ['keep', 'keep', 'enough']
+    assert tone(found) == 'adequate' and 'describes these data' in verdict_words(found)
 
 
 @once('zoom alternates')

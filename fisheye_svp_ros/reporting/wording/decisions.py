@@ -68,11 +68,11 @@ def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
 def _unnamed_parts(facts: LensFacts) -> str:
     """Return what the extended lens has without a confirmed cause, as a clause; '' for nothing."""
     if facts.written:
-        parts = ', '.join(name.replace('_', ' ') for name in facts.written)
-        return f'; unconfirmed in it: {parts}'
+        parts = ' and '.join(name.replace('_', ' ') for name in facts.written)
+        return f', an unconfirmed {parts} included'
     if facts.lens_causes:
         return ''
-    return '; its parameters are estimated with errors of the target'
+    return ', its parameters estimated with errors of the target'
 
 
 def _offset(facts: LensFacts) -> str:
