@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import functools
 from collections import deque
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rclpy.serialization import deserialize_message
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.decoding import read_transform, stamp_of
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
-from fisheye_svp_ros.nodes.frame_tree import FrameTree
+from fisheye_svp_ros.nodes.frame_listener import FrameListener
 from fisheye_svp_ros.nodes.quality import TRANSFORMS
-from fisheye_svp_ros.nodes.transforms import Transforms, message_class
+from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.pose import Pose, carried_pose
 from fisheye_svp_ros.study.settings import RobotSettings
 
@@ -39,19 +36,14 @@ class BasePose:
                 'set publish_tf:=false'
             )
         self._node, self._base, self._odom = node, base, odom
-        self._tree = FrameTree()
+        self._frames = FrameListener(node, self._publish_odometry)
         self._waiting: deque[tuple[Pose, int, str]] = deque(maxlen=_MAX_WAITING)
         if not base:
             return
-        self._kind = message_class('base_frame')
+        topics = [topic for topic in TRANSFORMS if odom or topic == '/tf_static']
+        self._frames.listen('base_frame', topics)
         self._publisher = node.announce(PoseWithCovarianceStamped, '~/base_pose')
         self._transforms = Transforms(node, bool(odom))
-        for topic, qos in TRANSFORMS.items():
-            if odom or topic == '/tf_static':
-                hear = functools.partial(self._hear, topic == '/tf_static')
-                node.create_subscription(
-                    self._kind, topic, node.guard_callback(hear), qos, raw=True
-                )
 
     def publish(
         self, camera_pose: Pose, covariance: Array, stamp: int, world: str, camera: str
@@ -59,7 +51,7 @@ class BasePose:
         """Publish the base that carries a camera; covariance (6, 6) of the camera, m and rad."""
         if not self._base:
             return
-        mount = self._tree.find(camera, self._base, stamp)
+        mount = self._frames.find(camera, self._base, stamp)
         if mount is None:
             self._node.warn(
                 f'no base_pose: /tf_static has no chain from {self._base!r} (base_frame) to '
@@ -79,18 +71,11 @@ class BasePose:
             self._waiting.append((base, stamp, world))
             self._publish_odometry()
 
-    def _hear(self, fixed: bool, data: bytes) -> None:
-        for one in deserialize_message(data, self._kind).transforms:
-            stamp = None if fixed else stamp_of(one)
-            self._tree.add(one.header.frame_id, one.child_frame_id, read_transform(one), stamp)
-        if not fixed:
-            self._publish_odometry()
-
     def _publish_odometry(self) -> None:
         """Publish where the odometry stands in the world, for each pose that has odometry."""
         for _ in range(len(self._waiting)):
             base, stamp, world = self._waiting.popleft()
-            there = self._tree.find(self._odom, self._base, stamp)
+            there = self._frames.find(self._odom, self._base, stamp)
             if there is None:
                 self._waiting.append((base, stamp, world))
             else:

@@ -85,6 +85,7 @@ class ImageTopics:
     """Subscriptions of a node to the images on a topic, and to the camera_info of these.
 
     decode: what reads an Image and a CompressedImage; take: what gets the stamps and images.
+    info: the topic of camera_info, as the node calls it; info_name: what that is, if not itself.
     """
 
     def __init__(
@@ -95,6 +96,7 @@ class ImageTopics:
         take: Callable[[int, Unread], None],
         info: str,
         infos: CameraInfos,
+        info_name: str = '',
     ) -> None:
         self._taken: deque[tuple[int, str]] = deque(maxlen=_MAX_LEAD)
         compressed = topic + COMPRESSED_SUFFIX
@@ -114,6 +116,7 @@ class ImageTopics:
             partial(infos.hear, info),
             INFO_INPUT,
             latched=True,
+            name=info_name,
         )
 
     def remember(self, stamp: int, image: Unread) -> None:
@@ -123,6 +126,18 @@ class ImageTopics:
     def is_repeated(self, stamp: int, image: Unread) -> bool:
         """Say whether it was taken from the other topic: image_transport sends it on both."""
         return any(at == stamp and topic != image.topic for at, topic in self._taken)
+
+
+def info_topic(node: BaseNode, raw: str, info: str, own: str) -> str:
+    """Return the topic of camera_info: beside the images, as image_transport has it.
+
+    raw, info: as the node calls them.  It is `info` itself where that is remapped, or where what
+    is beside the images is the node's own output.
+    """
+    named = str(node.resolve_topic_name(info))
+    beside = f'{node.resolve_topic_name(raw).rpartition("/")[0]}/{CAMERA_INFO}'
+    remapped = named != node.resolve_topic_name(info, only_expand=True)
+    return named if remapped or beside == own else beside
 
 
 def _compressed_topic(node: BaseNode, raw: str) -> str:

@@ -25,6 +25,7 @@ from fisheye_svp_ros.nodes.camera_info import (
     COMPRESSED_SUFFIX,
     CameraInfos,
     ImageTopics,
+    info_topic,
 )
 from fisheye_svp_ros.nodes.quality import SENSOR
 from fisheye_svp_ros.nodes.subscriptions import Unread
@@ -45,7 +46,7 @@ class RectifierSettings(Settings):
     lens: str = parameter(
         CAMERA_INFO,
         'Lens: a file, or a name in config/lenses; for a rig, a file or folder with '
-        'both; `camera_info`: from the topic `image/camera_info`',
+        'both; `camera_info`: from that topic beside the images',
         file=True,
     )
     stereo: bool = parameter(
@@ -108,7 +109,8 @@ class Rectifier(BaseNode):
 
     def _connect(self, camera: str) -> None:
         """Create the topics of a camera, given by its namespace with a slash."""
-        own, raw = (self.resolve_topic_name(camera + name) for name in (CAMERA_INFO, _INFO))
+        own = str(self.resolve_topic_name(f'{camera}{CAMERA_INFO}'))
+        raw = info_topic(self, f'{camera}image', f'{camera}{_INFO}', own)
         if own == raw:
             raise ParameterError(
                 f'the node would subscribe to its own output {raw}; choose another namespace, for '
@@ -125,6 +127,7 @@ class Rectifier(BaseNode):
             partial(self._take, camera),
             f'{camera}{_INFO}',
             self._infos,
+            raw,
         )
 
     def needed_inputs(self) -> Sequence[Sequence[str]]:

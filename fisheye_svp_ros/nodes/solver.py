@@ -30,6 +30,7 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import ManagedNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.declaration import check_access
+from fisheye_svp_ros.nodes.frame_listener import FrameListener
 from fisheye_svp_ros.nodes.join import LIMIT, LatchedLandmarks, Pending, StampJoin
 from fisheye_svp_ros.nodes.lenses import lens_of, lenses_of, shift_scale
 from fisheye_svp_ros.nodes.quality import INFO_INPUT
@@ -115,7 +116,10 @@ class SolverNode(ManagedNode):
         self._unread: deque[tuple[int, str]] = deque(maxlen=_UNREAD)
         self._pace = Pace()
         self._latched_landmarks = LatchedLandmarks()
-        self._validation = SetValidation(self._image_points, tuple(self._poses), self.drop)
+        self._listener = FrameListener(self)
+        self._validation = SetValidation(
+            self._image_points, tuple(self._poses), self.drop, self._find_frame
+        )
         self._left_out: list[str] = []  # of the set that is solved
         self._said = ''
         self._lenses: dict[str, Lens] = {}  # those of the parameter lens
@@ -420,10 +424,16 @@ class SolverNode(ManagedNode):
         landmarks = self._latched_landmarks.find_for_set(
             read.get('landmarks'), self._join.distance('landmarks', one.stamp)
         )
-        items, self._left_out = self._validation.check(read, landmarks, self.settings)
+        items, self._left_out = self._validation.check(read, landmarks, self.settings, one.stamp)
         for text in self._left_out:
             self.warn(text)
         return items, landmarks
+
+    def _find_frame(self, frame: str, child: str, stamp: int) -> Pose | None:
+        """See `FrameListener.find`; what this node itself tells of `odom_frame` proves nothing."""
+        if getattr(self.settings, 'odom_frame', ''):
+            return None
+        return self._listener.find(frame, child, stamp)
 
     def _fail(self, stamp: int, problem: str) -> None:
         self._pace.counts['not solved'] += 1

@@ -33,7 +33,8 @@ class SetValidation:
     """Makes of what came for a set what can be solved, and counts what is left out of it.
 
     image_points: topics without which there is no set; true_poses: topics of these;
-    drop: counts a message of a topic that cannot be read, and tells of it.
+    drop: counts a message of a topic that cannot be read, and tells of it.  find: where a frame
+    stands in another at a time, ns, as far as that is known.
     """
 
     def __init__(
@@ -41,9 +42,11 @@ class SetValidation:
         image_points: Sequence[str],
         true_poses: Sequence[str],
         drop: Callable[[str, Exception], None],
+        find: Callable[[str, str, int], Pose | None],
     ) -> None:
         self.rejected: Counter[str] = Counter()  # by topic and reason, since the start
-        self._image_points, self._true_poses, self._drop = image_points, true_poses, drop
+        self._image_points, self._true_poses = image_points, true_poses
+        self._drop, self._find = drop, find
         self._frames: dict[str, tuple[str, float]] = {}  # by topic, and when it was last met, s
 
     def read(self, unread: Items) -> dict[str, Any]:
@@ -64,10 +67,11 @@ class SetValidation:
         return items
 
     def check(
-        self, items: dict[str, Any], landmarks: LandmarkSet, settings: SolverSettings
+        self, items: dict[str, Any], landmarks: LandmarkSet, settings: SolverSettings, stamp: int
     ) -> tuple[dict[str, Any], list[str]]:
         """Return what is to be solved, and what was left out of it, as sentences.
 
+        stamp: of the set, ns.  A true pose of another frame is transformed where that is known.
         Raises ObservationError for image points of another camera, where no landmark is known,
         and, with the setting `strict`, where one is not.
         """
@@ -79,8 +83,12 @@ class SetValidation:
         for topic in self._true_poses:
             if topic not in items:
                 continue
-            checked[topic], frame = items[topic]
-            if frames_differ(frame, landmarks.frame):
+            pose, frame = items[topic]
+            if not frames_differ(frame, landmarks.frame):
+                checked[topic] = pose
+            elif (there := self._find(landmarks.frame, frame, stamp)) is not None:
+                checked[topic] = there.compose(pose)
+            else:
                 del checked[topic]
                 self.rejected[f'{topic}: in another frame'] += 1
                 texts.append(wording.frames_differ(topic, frame, 'landmarks', landmarks.frame))

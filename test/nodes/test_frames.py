@@ -22,7 +22,7 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.optics.curves import kannala_brandt_equivalent
-from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.rigs import paper_pose
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 
@@ -76,6 +76,36 @@ def test_a_true_pose_of_another_frame_gives_no_error(
         )
     )
     assert counts['true_pose: in another frame'] == '1' and counts['true_pose: dropped'] == '0'
+
+
+def test_a_true_pose_is_transformed_where_tf_knows_how(graph: Callable[..., Graph]) -> None:
+    told = Framed(graph(*SOLVING))
+    there = Pose(rotation_from_vector(np.array([0.1, 0.2, 0.7])), np.array([4.0, -2.0, 0.5]))
+    told.node._listener.tree.add('map', 'odom', there, None)
+    truth = told.graph.tell(PoseStamped, 'true_pose')
+    truth.publish(messages.pose_message(there.inverse().compose(paper_pose()), 1, 'odom'))
+    told.tell(1, 'camera')
+    status = told.status(1)
+    errors = {pair.key: pair.value for pair in status.values}
+    assert status.level == status.OK and float(errors['position_error_m']) < 1e-6
+
+
+def test_what_tf_tells_is_heard_once_frames_differ(graph: Callable[..., Graph]) -> None:
+    kind = pytest.importorskip('tf2_msgs.msg', reason='tf2_msgs is not installed').TFMessage
+    told = Framed(graph(*SOLVING))
+    truth = told.graph.tell(PoseStamped, 'true_pose')
+    stamps = iter(range(1, 1000))
+
+    def errors() -> dict[str, str]:
+        stamp = next(stamps)
+        truth.publish(messages.pose_message(paper_pose(), stamp, 'odom'))
+        told.tell(stamp, 'camera')
+        return {pair.key: pair.value for pair in told.status(stamp).values}
+
+    assert 'position_error_m' not in errors()
+    one = messages.transform_message(Pose(np.eye(3), np.zeros(3)), 0, 'map', 'odom')
+    told.graph.tell(kind, '/tf_static', LATCHED).publish(kind(transforms=[one]))
+    told.graph.until(lambda: 'position_error_m' in errors())
 
 
 def test_true_poses_of_different_frames_are_not_interpolated(graph: Callable[..., Graph]) -> None:

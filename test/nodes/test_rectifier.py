@@ -180,6 +180,21 @@ def test_one_camera_with_a_camera_info(graph: Callable[..., Graph]) -> None:
     assert node._side('', 8) is kept  # maps are computed once
 
 
+def test_the_camera_info_beside_the_images_is_read(ros_domain: int) -> None:
+    """As image_transport has it: /camera/image_raw and /camera/camera_info."""
+    g = Graph('-r', '__ns:=/rect', '-r', 'image:=/camera/image_raw')
+    try:
+        g.start(Rectifier)
+        infos = g.hear(CameraInfo, '/rect/camera_info', SENSOR)
+        tell = g.tell(Image, '/camera/image_raw', SENSOR)
+        info = g.tell(CameraInfo, '/camera/camera_info', LATCHED)
+        info.publish(camera_info_message(LENS, 7, 'optical'))
+        raw = image_message(photograph(poses(1, 4).take(0)), 7, 'optical')
+        g.until(lambda: (tell.publish(raw), infos)[1])
+    finally:
+        g.close()
+
+
 @pytest.fixture
 def lenses(tmp_path: Path) -> Path:
     folder = tmp_path / 'lenses'

@@ -39,7 +39,7 @@ def frames_differ(topic: str, frame: str, other_topic: str, other: str) -> str:
     """Tell of two inputs that cannot belong together."""
     return (
         f'{topic}: left out: in frame {frame!r}, but {other_topic} in {other!r}; '
-        'publish both in one frame'
+        'publish both in one frame, or on /tf where one stands in the other'
     )
 
 
