@@ -23,6 +23,7 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
+from fisheye_svp_ros.nodes.progress import Progress
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.set_collection import (
     CollectedSet,
@@ -123,6 +124,7 @@ class ModelCritic(SolverNode):
             ('~/reset', self._reset),
         ):
             self.create_service(Trigger, name, self.guard_callback(answer))
+        self._progress = Progress(self)
         self.start_timer(0.2, self._tick)
         self.start()
 
@@ -168,17 +170,27 @@ class ModelCritic(SolverNode):
         self._latest = stamp, items
         if is_repeated(seen, list(self._frames.values())):
             self._repeated += 1
+            self._tell_progress(stamp)
             return
         self._new += stamp not in self._frames
         self._frames[stamp] = seen
         for old in list(self._frames)[: -self.settings.max_frames]:
             del self._frames[old]
+        self._tell_progress(stamp)
+
+    def _tell_progress(self, stamp: int) -> None:
+        """Tell how many frames there are, and are missing for the next diagnosis."""
+        least, every = self.settings.min_frames, self.settings.every_frames
+        missing = max(least - len(self._frames), every - self._new if self._judged else 0, 0)
+        more = {'views_repeated': self._repeated, 'diagnosing': self._running is not None}
+        self._progress.tell(stamp, len(self._frames), missing, more)
 
     def _reset(self, _: Any, response: Any) -> Any:
         """Forget all frames and the verdict: the next frame is the first."""
         response.success, response.message = True, f'{len(self._frames)} frames forgotten'
         self._frames, self._new, self._repeated = {}, 0, 0
         self._restart()
+        self._tell_progress(0)
         return response
 
     def _restart(self) -> None:

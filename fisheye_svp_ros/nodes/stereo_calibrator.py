@@ -13,6 +13,7 @@ from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterE
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes.progress import Progress
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.set_collection import CollectedSet, make_set, scenario_of, table_of
 from fisheye_svp_ros.nodes.solver import SolverNode, exchange_reason, true_rig
@@ -40,6 +41,7 @@ class StereoCalibrator(SolverNode):
         self._position_error = self.announce(Vector3Stamped, '~/position_error')
         self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error')
         self._transforms = Transforms(self, self.settings.publish_tf, static=True)
+        self._progress = Progress(self)
         self._scenario: frozenset[tuple[str, str]] = frozenset()
         self._window: list[CollectedSet] = []
         self._found: SetSolutions[StereoCalibration] | None = None  # the latest
@@ -82,6 +84,8 @@ class StereoCalibrator(SolverNode):
         # Only now: a set that cannot be used must not spoil those to come.
         self._window, self._scenario, self._found = window, scenario, found
         self._publish(stamp, items, found)
+        fit = {name: float(found.metrics[name][0]) for name in ('points', 'rms_px')}
+        self._progress.tell(stamp, len(window), self.settings.views - len(window), fit)
 
     def _save(self, _: Any, response: Any) -> Any:
         """Write the latest rig to `output`."""
@@ -104,6 +108,7 @@ class StereoCalibrator(SolverNode):
         """Forget all views: the next set is the first."""
         response.success, response.message = True, f'{len(self._window)} views forgotten'
         self._window, self._found = [], None
+        self._progress.tell(0, 0, self.settings.views, {})
         return response
 
     def _publish(self, stamp: int, items: Items, found: SetSolutions[StereoCalibration]) -> None:

@@ -36,6 +36,7 @@ class Asked:
         self.graph, self.name = g, kind.NAME
         self.results = g.hear(DiagnosticArray, f'{kind.NAME}/result')
         self.reports = g.hear(DiagnosticArray, '/diagnostics')
+        self.progress = g.hear(DiagnosticArray, f'{kind.NAME}/progress')
         self.node = g.start(kind)
         self.landmarks = g.tell(PointCloud2, 'landmarks', LATCHED)
         self.points = {name: g.tell(PointCloud2, f'{name}image_points') for name in cameras}
@@ -76,12 +77,15 @@ def test_a_rig_is_saved_and_its_views_are_forgotten(
         asked.tell(frame)
         g.until(lambda count=frame + 1: len(asked.results) == count)
     asked.counts({'calibration: views': '2', 'calibration: views missing': '1'})
+    told = read_key_values(asked.progress[-1])
+    assert (told['views'], told['views_missing']) == ('2', '1') and float(told['rms_px']) < 1e-3
     answer = asked.ask('save')
     assert answer.success, answer.message
     assert answer.message == f'{file}: 2 views, 1 fewer than the parameter views'
     assert load_rig(str(file)).position == pytest.approx([-0.15, 0, 0], abs=1e-6)
     answer = asked.ask('reset')
     assert answer.success and answer.message == '2 views forgotten'
+    g.until(lambda: asked.progress[-1].status[0].message == '3 more views are needed')
     assert 'no rig yet' in asked.ask('save').message
     asked.tell(2)
     g.until(lambda: len(asked.results) == 3)
@@ -99,6 +103,11 @@ def test_a_critic_forgets_its_frames(graph: Callable[..., Graph], tmp_path: Path
     for frame in (0, 1):
         asked.tell(frame)
     g.until(lambda: len(asked.node._frames) == 2)
+    asked.tell(1)
+    g.until(
+        lambda: asked.progress and read_key_values(asked.progress[-1])['views_repeated'] == '1'
+    )
+    assert asked.progress[-1].status[0].message == '18 more views are needed'
     assert 'no diagnosis yet: 2 of 20 frames' in asked.ask('save').message
     assert asked.ask('reset').message == '2 frames forgotten'
     assert 'no diagnosis yet: 0 of 20 frames' in asked.ask('save').message
