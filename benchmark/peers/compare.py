@@ -162,7 +162,7 @@ def compared(data: Set, tools: Iterable[str] = tuple(TOOLS)) -> list[Row]:
         Row(
             'ours, `diagnose`: extended',
             figures.extended.heldout_rms_px,
-            _whole(found, data.test, found.offsets),
+            _whole(found, data.test, found.evaluation.offsets),
             count,
             np.nan,
             ours=True,
@@ -181,9 +181,10 @@ def _nominal(lens: fsvp.Lens, test: Observations, start: Localized) -> float:
 
 def _whole(found: Diagnosis, test: Observations, local: PredictedOffsets | None = None) -> float:
     """Return the rms of all held-out points, outliers among them."""
-    data, known = group_by_frame(test), found.model.data.observations.t
-    terms = tuple(t for t in found.model.state.terms if t.effect.holds_for(test.t, known))
-    solved = localize_frames(data, replace(found.model.state, terms=terms))
+    data, fit = group_by_frame(test), found.evaluation.fixed_model
+    known = fit.data.observations.t
+    terms = tuple(t for t in fit.state.terms if t.effect.holds_for(test.t, known))
+    solved = localize_frames(data, replace(fit.state, terms=terms))
     return predict_other_data(data, solved, local).rms
 
 

@@ -42,7 +42,7 @@ def trial(seed: int) -> Outcome:
     seen, truth = draw_set(seed)
     given, found = study.calibrated_and_diagnosed(seen, (WIDTH, HEIGHT), free_intrinsics=True)
     named = found.evaluation.extended_lenses(found.evaluation.null.linear.state)['']
-    shift, names = found.averaged_model.shifts, [cause.effect for cause in found.causes]
+    shift, names = found.evaluation.averaged_model.shifts, [cause.effect for cause in found.causes]
     written = getattr(found.lens.viewpoint_shift, 'e0', 0.0)
     return Outcome(
         truth.viewpoint_shift.e0,

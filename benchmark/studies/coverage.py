@@ -182,8 +182,9 @@ def pulls_of(found: Diagnosis, test: Observations) -> Array:
     Poses from the left and the right half of the points, and from the upper and the lower one.
     """
     data = group_by_frame(test)
-    state = localize_frames(data, found.model.state)
-    linear, pulls = Linearization(data, state, found.model.free), []
+    fit, errors = found.evaluation.fixed_model, found.evaluation.model_errors
+    state = localize_frames(data, fit.state)
+    linear, pulls = Linearization(data, state, fit.free), []
     for axis in (0, 1):
         middle = np.array(
             [
@@ -194,7 +195,7 @@ def pulls_of(found: Diagnosis, test: Observations) -> Array:
         first = data.views.uv[..., axis] < middle[:, None]
         sides = [side(data, state, mask) for mask in (first, ~first)]
         difference = sides[0][0].pose.difference(sides[1][0].pose)
-        pulls.append(_pulls(difference, found.errors.propagate(linear, sides[0][1] - sides[1][1])))
+        pulls.append(_pulls(difference, errors.propagate(linear, sides[0][1] - sides[1][1])))
     return np.concatenate(pulls)
 
 

@@ -51,12 +51,12 @@ def trial(number: int) -> Outcome:
     given, found = study.calibrated_and_diagnosed(seen, (WIDTH, HEIGHT), free_intrinsics=True)
     uv = typical_points(seen.uv)
     true = [study.ray_errors(lens, truth, uv) for lens in (given, found.lens)]
-    stated = found.conclusion.ray_error_mrad()
+    stated = found.ray_error_mrad()
     value, low, high = (
         np.array([[one[name] for one in stated[lens]] for lens in ('given', 'extended')])
         for name in ('value', 'low', 'high')
     )
-    offered = found.conclusion.decision['lens'].say in ('use_extended', 'recalibrate')
+    offered = found.decision['lens'].say in ('use_extended', 'recalibrate')
     return Outcome(bool(few), bool(size), offered, np.array(true), value, low, high)
 
 

@@ -46,7 +46,7 @@ def diagnosed(part: Part) -> Found:
         else np.array_split(table.frames, 2)[chosen]
     )
     given, found = study.calibrated_and_diagnosed(table.take(np.isin(table.frame, frames)), size)
-    stated = found.conclusion.ray_error['']
+    stated = found.ray_error['']
     at = [one.range_m for one in stated['given']].index(RANGE)
     assert found.lens is not None
     return given, found.lens, [stated[side][at] for side in ('given', 'extended')]

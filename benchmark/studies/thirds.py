@@ -52,7 +52,8 @@ def estimates(part: Part) -> Array:
     frames = np.random.default_rng(part.deal).permutation(table.frames)
     mine = np.isin(table.frame, frames[part.third :: 3])
     found = diagnosed(table.take(mine), part.size, part.causes)
-    known = {name: (one.after, one.after_stderr) for name, one in found.intrinsics.items()}
+    fitted = found.evaluation.intrinsics
+    known = {name: (one.after, one.after_stderr) for name, one in fitted.items()}
     shift = next(c for c in found.causes if c.effect == SHIFT).parameters['e0']
     known['e0'] = shift['value'], shift['stderr']
     return np.array([known[name] for name in NAMES])

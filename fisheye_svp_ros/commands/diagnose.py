@@ -181,7 +181,9 @@ def run(args: argparse.Namespace) -> None:
             else:
                 diagnosis = diagnose_against(observations, other, lens, **settings)
             progress('errors where the truth is known', 0.88)
-            known = known_errors(diagnosis.simulation, diagnosis.model, names)
+            known = known_errors(
+                diagnosis.evaluation.simulation, diagnosis.evaluation.fixed_model, names
+            )
         except (GeometryError, np.linalg.LinAlgError) as cause:
             raise _fit_error(args, cause) from cause
         wanted, impossible = _plan_next_views(args, diagnosis) if args.count else (None, None)
@@ -230,7 +232,12 @@ def _plan_next_views(
     room = None if args.room is None else view_limits(args.room)
     try:
         return next_photographs(
-            diagnosis.model, diagnosis.causes, diagnosis.noise_px, args.count, args.number, room
+            diagnosis.evaluation.fixed_model,
+            diagnosis.causes,
+            diagnosis.noise_px,
+            args.count,
+            args.number,
+            room,
         ), None
     except FisheyeSvpError as why:
         return None, why
@@ -281,7 +288,7 @@ def _print(
     from fisheye_svp_ros.reporting.next_steps import command_to_go_on
     from fisheye_svp_ros.reporting.terminal import print_lines, print_table
 
-    command = command_to_go_on(diagnosis, _inputs(args, bool(diagnosis.intrinsics)))
+    command = command_to_go_on(diagnosis, _inputs(args, bool(diagnosis.evaluation.intrinsics)))
     print_lines(
         [
             *terminal_lines(
@@ -348,7 +355,10 @@ def _write(
     from fisheye_svp_ros.reporting.diagnosis_report import write_report
     from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE, refusal_reason
 
-    folder, points = args.output, point_residuals(diagnosis.simulation, diagnosis.cause_fit)
+    folder, points = (
+        args.output,
+        point_residuals(diagnosis.evaluation.simulation, diagnosis.evaluation.cause_fit),
+    )
     truth = {name: compared.to_dict() for name, compared in known.items()}
     document = {**diagnosis_document(diagnosis), 'known_truth': truth}
     if wanted:
@@ -359,7 +369,9 @@ def _write(
     if diagnosis.rig_chain:
         cameras, rig = diagnosis.rig_chain
         save_rig(rig, folder / 'rig.yaml', cameras)
-    _write_residuals(folder / 'residuals.csv', points, diagnosis.model.data.observations)
+    _write_residuals(
+        folder / 'residuals.csv', points, diagnosis.evaluation.fixed_model.data.observations
+    )
     write_report(diagnosis, points, known, _inputs(args, free), wanted)
 
 

@@ -78,7 +78,7 @@ def judge_data(
         if not any(flaw.kind.is_misfit for flaw in flaws):
             flaws += _unknown_rays(evaluation, _scatter(components), ray_errors)
     flaws.sort(key=lambda flaw: flaw.kind.value)
-    table = evaluation.selection.problem.observations
+    table = evaluation.problem.observations
     known = {frame for frame, _, _ in table.photographs}
     names = [
         tuple(
@@ -269,7 +269,7 @@ def _unknown_rays(
     ray_errors: Mapping[str, Mapping[str, Sequence[RayError]]],
 ) -> Iterator[Flaw]:
     """Yield cameras whose rays are unknown even where there are points."""
-    lenses = evaluation.selection.problem.inputs.lenses
+    lenses = evaluation.problem.inputs.lenses
     for name, sides in ray_errors.items():
         error, point = sides['extended'][_NEAR_RANGE].value, scatter / lenses[name].fx
         if error > _MAX_RAY_RATIO * point:

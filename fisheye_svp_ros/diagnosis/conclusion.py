@@ -354,7 +354,7 @@ def conclude(
     contradicted: bool,
 ) -> Conclusion:
     """Return what to do; contradicted: whether the cameras of a rig disagree about the target."""
-    ray_errors, offset = find_lens_rays(evaluation, evaluation.selection.problem.inputs.lenses)
+    ray_errors, offset = find_lens_rays(evaluation, evaluation.problem.inputs.lenses)
     file, gain = compare_lens_files(evaluation), evaluation.gains['named']
     open_effects = _open_effects(evaluation, candidates)
     lens = decide_lens(
@@ -388,7 +388,7 @@ def conclude(
             scatter_px=2**0.5 * float(scatter),
             lens=lens.say,
             is_target_off=target.say == 'measure_again' and target.confidence is not None,
-            plannable=evaluation.selection.problem.plannable,
+            plannable=evaluation.problem.plannable,
             unit='view' if is_unpaired(evaluation.null.linear.data) else 'frame',
         )
     )

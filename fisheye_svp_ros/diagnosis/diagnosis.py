@@ -4,29 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.adequacy import Adequacy
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras
 from fisheye_svp_ros.diagnosis.checks.two_datasets import TwoDatasets
 from fisheye_svp_ros.diagnosis.conclusion import Advice, Conclusion
-from fisheye_svp_ros.diagnosis.decision import Decision, FileFigure, LensFacts, LensReason
+from fisheye_svp_ros.diagnosis.decision import LensFacts, LensReason
 from fisheye_svp_ros.diagnosis.evaluation import (
     MAX_RMS_RATIO,
     Evaluation,
     Figures,
-    Intrinsic,
 )
 from fisheye_svp_ros.diagnosis.findings import Finding
-from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
-from fisheye_svp_ros.diagnosis.model_errors import ModelErrors
 from fisheye_svp_ros.diagnosis.problem import Problem
 from fisheye_svp_ros.diagnosis.variance_budget import REPEATED_COMPONENT, Component, Structure
-from fisheye_svp_ros.diagnosis.written_lens import AveragedModel
 from fisheye_svp_ros.effects.target_map import BoardMap, board_maps
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -34,47 +29,35 @@ from fisheye_svp_ros.scene.observations import rig_cameras
 from fisheye_svp_ros.solve.hand_eye import HandEye
 from fisheye_svp_ros.solve.rig_calibration import connected_cameras
 from fisheye_svp_ros.solve.rig_checks import has_no_rig
-from fisheye_svp_ros.solve.rig_state import Linearization
-
-
-class SearchRecord(NamedTuple):
-    """What else was tried: steps, what could not be tested and why, outliers, cross-checks.
-
-    cameras: what each two cameras of a rig say of each other; against: what another data set says;
-    hand_eye: where the camera sits on the robot whose poses were given; turned: frames whose
-    board is numbered from another end.
-    """
-
-    trace: list[Finding]
-    untestable: dict[str, str]
-    gross: list[dict[str, Any]]
-    cameras: list[TwoCameras]
-    against: TwoDatasets | None = None
-    hand_eye: HandEye | None = None
-    turned: Sequence[TurnedFrame] = ()
 
 
 @dataclass(frozen=True)
-class Diagnosis:
-    """The answer: what was found, what remains, and the lenses with it.
+class Diagnosis(Conclusion):
+    """The answer: what to do, what was found, what remains, and the lenses with it.
 
-    causes: confirmed, those in the noise last.
+    noise_px: of a coordinate; causes: confirmed, those in the noise last; trace: what was tried,
+    and what came of it; untestable: effects that the data cannot test, and why; gross: outliers by
+    frame and landmark, the farthest first; cameras: what each two cameras of a rig say of each
+    other; turned: frames whose board is numbered from another end; against: what another data set
+    says; hand_eye: where the camera sits on the robot whose poses were given.
     """
 
+    problem: Problem
     evaluation: Evaluation
     figures: Figures
+    noise_px: float
     components: list[Component]
     causes: list[Cause]
     remaining: list[Structure]
     advice: list[Advice]
     lenses: dict[str, Lens]
-    record: SearchRecord
-    conclusion: Conclusion
-
-    @property
-    def problem(self) -> Problem:
-        """Data and simulation."""
-        return self.evaluation.selection.problem
+    trace: list[Finding]
+    untestable: dict[str, str]
+    gross: list[dict[str, Any]]
+    cameras: list[TwoCameras]
+    turned: Sequence[TurnedFrame]
+    against: TwoDatasets | None = None
+    hand_eye: HandEye | None = None
 
     @property
     def verdict(self) -> str:
@@ -99,16 +82,6 @@ class Diagnosis:
         return [one.effect for one in facts.likely_effects]
 
     @property
-    def decision(self) -> dict[str, Decision]:
-        """What to do about lens, target and photographs."""
-        return self.conclusion.decision
-
-    @property
-    def adequacy(self) -> Adequacy:
-        """What is wrong with the data."""
-        return self.conclusion.adequacy
-
-    @property
     def offers_extended(self) -> bool:
         """Whether the extended lens is expected to be better than the lens as given.
 
@@ -123,104 +96,14 @@ class Diagnosis:
         return self.decision['lens'].say == 'recalibrate'
 
     @property
-    def candidates(self) -> list[Finding]:
-        """Effects that are significant, and not confirmed."""
-        return self.conclusion.candidates
-
-    @property
-    def file(self) -> FileFigure:
-        """What the lens file is worth."""
-        return self.conclusion.file
-
-    @property
-    def noise_px(self) -> float:
-        """Standard deviation of the noise of one coordinate, px."""
-        return self.evaluation.noise_px
-
-    @property
     def frames(self) -> int:
         """How many frames there are."""
-        return self.model.data.frames
+        return self.evaluation.fixed_model.data.frames
 
     @property
     def observations(self) -> int:
         """How many observations there are."""
         return len(self.problem.observations)
-
-    @property
-    def intrinsics(self) -> dict[str, Intrinsic]:
-        """Free intrinsics before and after."""
-        return self.evaluation.intrinsics
-
-    @property
-    def offsets(self) -> PredictedOffsets:
-        """What the random effects of target, image and views are predicted to be."""
-        return self.evaluation.offsets
-
-    @property
-    def trace(self) -> list[Finding]:
-        """What was tried, and what came of it."""
-        return self.record.trace
-
-    @property
-    def untestable(self) -> dict[str, str]:
-        """Effects that the data cannot test, and why."""
-        return self.record.untestable
-
-    @property
-    def gross(self) -> list[dict[str, Any]]:
-        """Outliers by frame and landmark, the farthest first."""
-        return self.record.gross
-
-    @property
-    def simulation(self) -> Linearization:
-        """The simulation as it was fitted, for whoever draws it."""
-        return self.evaluation.simulation
-
-    @property
-    def model(self) -> Linearization:
-        """The extended model without random effects, for whoever draws it."""
-        return self.evaluation.fixed_model
-
-    @property
-    def cause_fit(self) -> Linearization:
-        """The named causes fitted as the simulation was, for residuals after and before them."""
-        return self.evaluation.cause_fit
-
-    @property
-    def written_model(self) -> Linearization:
-        """The model whose lenses are written: with the viewpoint shifts that may be there."""
-        return self.evaluation.written_model
-
-    @property
-    def averaged_model(self) -> AveragedModel:
-        """The viewpoint shifts that are written and not named."""
-        return self.evaluation.averaged_model
-
-    @property
-    def errors(self) -> ModelErrors:
-        """What is known of the errors of the model whose lenses are written."""
-        return self.evaluation.model_errors
-
-    @property
-    def uncertainty(self) -> dict[str, dict[str, float]]:
-        """How far off poses and image points are by the extended lenses: a summary."""
-        return self.evaluation.uncertainty
-
-    @property
-    def cameras(self) -> list[TwoCameras]:
-        """What each two cameras of a rig say of each other."""
-        return self.record.cameras
-
-    @property
-    def against(self) -> TwoDatasets | None:
-        """What another data set of the camera says."""
-        return self.record.against
-
-    @property
-    def hand_eye(self) -> HandEye | None:
-        """Where the camera sits on the robot, if the given poses are those of its flange."""
-        return self.record.hand_eye
 
     @property
     def lens(self) -> Lens:
@@ -230,7 +113,7 @@ class Diagnosis:
     @property
     def rig(self) -> tuple[tuple[str, str], Pose] | None:
         """The two cameras of a rig and the first in the second, by the extended lenses."""
-        data, rig = self.model.data, self.written_model.state.rig
+        data, rig = self.evaluation.fixed_model.data, self.evaluation.written_model.state.rig
         names = rig_cameras(data.observations.cameras)
         if names is None or has_no_rig(data):
             return None
@@ -245,7 +128,7 @@ class Diagnosis:
         """
         if self.rig is not None:
             return self.rig[0], (self.rig[1],)
-        data, place = self.model.data, self.written_model.state.rig
+        data, place = self.evaluation.fixed_model.data, self.evaluation.written_model.state.rig
         table = data.observations
         if data.cameras < 3 or has_no_rig(data) or len(connected_cameras(table)) > 1:
             return None
@@ -255,9 +138,9 @@ class Diagnosis:
 
     def board_maps(self, names: Sequence[str] = ()) -> list[BoardMap]:
         """Return how the target differs from what it is said to be; names: by these effects."""
-        state = self.model.state
+        state = self.evaluation.fixed_model.state
         terms = [term for term in state.terms if not names or term.name in names]
-        return board_maps(self.model.data.views, terms, state.lens)
+        return board_maps(self.evaluation.fixed_model.data.views, terms, state.lens)
 
     @property
     def scatter_px(self) -> float:

@@ -31,7 +31,7 @@ from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
 from fisheye_svp_ros.diagnosis.model_errors import ModelErrors, shared_names
 from fisheye_svp_ros.diagnosis.null_model import NullModel
-from fisheye_svp_ros.diagnosis.problem import extended_lenses
+from fisheye_svp_ros.diagnosis.problem import Problem, extended_lenses
 from fisheye_svp_ros.diagnosis.selection import Selection
 from fisheye_svp_ros.diagnosis.similar_views import similar_views
 from fisheye_svp_ros.diagnosis.uncertainty import (
@@ -132,9 +132,14 @@ class Evaluation:
         return self.selection.null
 
     @property
+    def problem(self) -> Problem:
+        """The data, and the simulation as it was fitted to them."""
+        return self.selection.problem
+
+    @property
     def free(self) -> tuple[str, ...]:
         """The intrinsics that were fitted."""
-        return self.selection.problem.free
+        return self.problem.free
 
     @property
     def names(self) -> list[str]:
@@ -163,7 +168,7 @@ class Evaluation:
 
     def extended_lenses(self, state: RigState) -> dict[str, Lens]:
         """Return the lenses of a state, with its effects, for every command and node."""
-        problem = self.selection.problem
+        problem = self.problem
         return extended_lenses(problem.inputs.lenses, state, problem.observations)
 
     @cached_property
@@ -174,7 +179,7 @@ class Evaluation:
     @cached_property
     def other_models(self) -> list[OtherModel]:
         """Other likely models; none of them with a shift that is averaged over."""
-        if self.selection.problem.options.quick:
+        if self.problem.options.quick:
             return []
         return likely_models(self.null, self.averaged_model.kinds)
 
@@ -186,7 +191,7 @@ class Evaluation:
     def _errors_of(self, null: NullModel, models: list[OtherModel] | None = None) -> Array:
         return (
             standard_errors(null, jackknife=False)
-            if self.selection.problem.options.quick
+            if self.problem.options.quick
             else total_errors(null, models)
         )
 
@@ -235,7 +240,7 @@ class Evaluation:
 
         None without such frames, or where the figure before is that of the lenses as written.
         """
-        test, problem = self.held_out, self.selection.problem
+        test, problem = self.held_out, self.problem
         if test is None or self.medium is not None or not self.free:
             return None
         data, lenses = problem.data, tuple(problem.inputs.lenses.values())
@@ -272,7 +277,7 @@ class Evaluation:
     @property
     def simulation(self) -> Linearization:
         """The simulation as it was fitted."""
-        return self.selection.problem.linear if self.medium is None else self.medium.air
+        return self.problem.linear if self.medium is None else self.medium.air
 
     @cached_property
     def fixed_model(self) -> Linearization:
@@ -327,7 +332,7 @@ class Evaluation:
         return FitQuality(float(np.sqrt(np.nanmean(squares))), self._given_prediction.rms, chi2)
 
     def _lens_quality(self) -> FitQuality:
-        linear = self.selection.problem.linear
+        linear = self.problem.linear
         if set(self._not_of_lens) < set(self.names):
             linear = self._adjust(fit_without_causes(self.null, self._not_of_lens, self.free))
         return FitQuality(rms_px(linear), self._lens_prediction.rms)
@@ -370,7 +375,7 @@ class Evaluation:
         causes = selected_causes(
             EffectTests(self.null), self.selection.causes, self.errors, shares, held_out
         )
-        if not self.selection.problem.options.quick:
+        if not self.problem.options.quick:
             refuting = refuting_blocks(self.null, self.fitted)
             causes = [
                 replace(cause, refuted_by_frames=refuting.get(cause.effect, ()))

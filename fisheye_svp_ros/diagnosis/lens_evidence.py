@@ -111,7 +111,7 @@ def _rig_response(null: NullModel, at: Index) -> Array:
 
 def _shared_values(evaluation: Evaluation) -> tuple[Array, Array]:
     """Return what is shared (K,), zeros for the rig, as it was found and as the lenses have it."""
-    null, problem = evaluation.null, evaluation.selection.problem
+    null, problem = evaluation.null, evaluation.problem
     start, free = 6 * (null.linear.data.cameras - 1), null.linear.free
     now = np.append(np.zeros(start), null.linear.state.shared_values(free))
     stated, given = stated_parameters(problem.inputs.lenses), now.copy()
@@ -201,13 +201,13 @@ def find_lens_rays(
     """
     if evaluation.medium is not None:
         return {}, None
-    quick = evaluation.selection.problem.options.quick
+    quick = evaluation.problem.options.quick
     known = LensCovariance.from_model(
         evaluation.null, evaluation.averaged_model, None if quick else evaluation.other_models
     )
     before = evaluation.extended_lenses(evaluation.simulation.state)
     views = known.linear.data.views
-    errors, offsets, asked = {}, [], evaluation.selection.problem.options.range_m
+    errors, offsets, asked = {}, [], evaluation.problem.options.range_m
     for number, (name, given) in enumerate(lenses.items()):
         mine = views.used & ((views.camera == number) | (len(lenses) == 1))[:, None]
         uv = typical_points(views.uv[mine])
@@ -232,7 +232,7 @@ def _is_of_these_data(evaluation: Evaluation, lens: Lens) -> bool:
 
     Generalized least squares keeps away from the fit without causes, and is not off for it.
     """
-    block, table = lens.calibration or {}, evaluation.selection.problem.observations
+    block, table = lens.calibration or {}, evaluation.problem.observations
     if block.get('frames') != len(table.frames):
         return False
     name = Path(str(block.get('source', ''))).name

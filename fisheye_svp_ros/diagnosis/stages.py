@@ -33,7 +33,7 @@ from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras, agree_on_ta
 from fisheye_svp_ros.diagnosis.checks.two_datasets import DatasetModel, compare_datasets
 from fisheye_svp_ros.diagnosis.conclusion import advice_on_lens, advise, conclude, turn_advice
 from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, cross_validate
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, SearchRecord
+from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.findings import Finding, Reason, Rival, Status
@@ -144,7 +144,7 @@ def diagnose_against(
     found = diagnose_one(observations, options, 0.0, 0.35, **settings)
     second = diagnose_one(other, options, 0.35, 0.7, 'the other set: ')
     progress('validating each data set by the other', 0.7)
-    models = [DatasetModel(one.simulation, one.evaluation.null) for one in (found, second)]
+    models = [DatasetModel(one.evaluation.simulation, one.evaluation.null) for one in (found, second)]
     datasets = compare_datasets(models[0], models[1], observations.source, other.source)
     gone = tuple(name for name in datasets.refuted_causes if name not in options.included)
     if gone:
@@ -160,7 +160,7 @@ def diagnose_against(
     given = next(iter(rig_lenses(observations, lens).values()))
     travel = measure_travel(second.evaluation.null.linear.data, given, found.lens)
     datasets = replace(datasets, travel=travel)
-    return replace(found, record=found.record._replace(against=datasets))
+    return replace(found, against=datasets)
 
 
 class _EvaluationResult(NamedTuple):
@@ -181,7 +181,7 @@ def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
     """Take checked inputs through all stages, twice where frames were in another order."""
     evaluated = _evaluate(inputs, progress)
     # The problem of a robot has no poses any more.
-    observations = evaluated.evaluation.selection.problem.inputs.observations
+    observations = evaluated.evaluation.problem.observations
     inputs, views = replace(inputs, observations=observations), evaluated.turned
     # Beside a large effect that is held back, offsets of landmarks are no sign of another order.
     turned = (
@@ -197,12 +197,12 @@ def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
     found = replace(
         found,
         advice=[*turn_advice(frames), *found.advice],
-        record=found.record._replace(turned=frames),
+        turned=frames,
     )
     if inputs.poses is None or not evaluated.of_robot:
         return found
-    hand_eye = find_hand_eye(found.model, inputs.poses)
-    return replace(found, record=found.record._replace(hand_eye=hand_eye))
+    hand_eye = find_hand_eye(found.evaluation.fixed_model, inputs.poses)
+    return replace(found, hand_eye=hand_eye)
 
 
 def _evaluate(inputs: Inputs, progress: Progress) -> _EvaluationResult:
@@ -267,20 +267,21 @@ def _conclude(
         lens = conclusion.with_ray_error(averaged.with_shift_entry(lens, name), name)
         lenses[name] = lens if field is None else field.add_to(lens, camera)
     return Diagnosis(
-        evaluation,
-        evaluation.figures,
-        components,
-        causes,
-        _remaining(evaluation, noise_causes, significant),
-        advice_on_lens(advice, conclusion),
-        lenses,
-        SearchRecord(
-            list(selection.trace),
-            EffectTests(selection.first).untestable,
-            _outliers(evaluation),
-            cameras,
-        ),
-        conclusion,
+        **vars(conclusion),
+        problem=problem,
+        evaluation=evaluation,
+        figures=evaluation.figures,
+        noise_px=evaluation.noise_px,
+        components=components,
+        causes=causes,
+        remaining=_remaining(evaluation, noise_causes, significant),
+        advice=advice_on_lens(advice, conclusion),
+        lenses=lenses,
+        trace=list(selection.trace),
+        untestable=EffectTests(selection.first).untestable,
+        gross=_outliers(evaluation),
+        cameras=cameras,
+        turned=(),
     )
 
 

@@ -129,10 +129,16 @@ def _diagnose_session(session: Session, table: Observations, lens: Lens) -> Sess
         names = cause.effect, *cause.indistinguishable_from
         if len(names) == 1 or _EFFECT.name not in names:
             continue
-        wanted = next_photographs(found.model, (cause,), found.noise_px, _VIEWS_AHEAD, room=room)
+        wanted = next_photographs(
+            found.evaluation.fixed_model, (cause,), found.noise_px, _VIEWS_AHEAD, room=room
+        )
         if wanted.answers[-1] > MIN_PROBABILITY and len(session.taken) < _MAX_UNDECIDED:
             return _session_state(
-                session, _model(found.model), wanted, named=(cause.effect,), alike=names[1:]
+                session,
+                _model(found.evaluation.fixed_model),
+                wanted,
+                named=(cause.effect,),
+                alike=names[1:],
             )
         # No photograph will tell: what is it, if it is what is asked for?
         alike = tuple(name for name in names if name != _EFFECT.name)
@@ -141,16 +147,16 @@ def _diagnose_session(session: Session, table: Observations, lens: Lens) -> Sess
         )
         break
     wanted = next_photographs(
-        found.model, found.causes, found.noise_px, _VIEWS_AHEAD, number, room
+        found.evaluation.fixed_model, found.causes, found.noise_px, _VIEWS_AHEAD, number, room
     )
-    value, stderr = _value(found.model, number), wanted.answers[0]
+    value, stderr = _value(found.evaluation.fixed_model, number), wanted.answers[0]
     for cause in found.causes:
         if number in cause.parameters:
             value = cause.parameters[number]['value']
             stderr = max(stderr, cause.parameters[number]['stderr'])
     return _session_state(
         session,
-        _model(found.model),
+        _model(found.evaluation.fixed_model),
         wanted,
         value,
         stderr,

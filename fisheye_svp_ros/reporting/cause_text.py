@@ -171,7 +171,7 @@ def budget_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str, str, str]
 
 def uncertainty_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
     """Yield what noise, parameters and remaining misfit make uncertain, and all together."""
-    for name, parts in diagnosis.uncertainty.items():
+    for name, parts in diagnosis.evaluation.uncertainty.items():
         label, factor, unit = _UNCERTAIN[name]
         sizes = (*parts.values(), math.hypot(*parts.values()))
         yield label, *(f'{factor * value:.3g}' for value in sizes), unit
@@ -179,7 +179,7 @@ def uncertainty_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
 
 def intrinsic_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str]]:
     """Yield each free intrinsic and its unit, before and after, with its standard error."""
-    for name, value in diagnosis.intrinsics.items():
+    for name, value in diagnosis.evaluation.intrinsics.items():
         unit = UNITS.get(name.rpartition('.')[2])
         yield (
             f'{name}, {unit}' if unit else name,

@@ -124,8 +124,8 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         'named': named,
         'lens': {
             **lens,
-            'ray_error_mrad': d.conclusion.ray_error_mrad(),
-            **d.averaged_model.to_dict(),
+            'ray_error_mrad': d.ray_error_mrad(),
+            **d.evaluation.averaged_model.to_dict(),
             **({} if field is None else {'image_field': field.to_dict()}),
         },
         'extended': extended,
@@ -143,11 +143,11 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         'remaining': {'structure': [s._asdict() for s in d.remaining]},
         'untestable': [{'effect': e, 'why': why} for e, why in d.untestable.items()],
         'gain': d.figures.gain.interval,
-        'intrinsics': {name: asdict(value) for name, value in d.intrinsics.items()},
-        'uncertainty': d.uncertainty,
+        'intrinsics': {name: asdict(value) for name, value in d.evaluation.intrinsics.items()},
+        'uncertainty': d.evaluation.uncertainty,
         'trace': [_step(one) for one in d.trace],
         **_external(d),
-        'turned': [asdict(one) for one in d.record.turned],
+        'turned': [asdict(one) for one in d.turned],
         **({'hand_eye': d.hand_eye.to_dict()} if d.hand_eye else {}),
     }
 

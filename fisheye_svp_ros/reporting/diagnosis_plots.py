@@ -89,9 +89,11 @@ class PlotData(NamedTuple):
         both = np.concatenate([points.before, points.after], axis=1)
         kept = ~points.outlier & np.isfinite(both).all(axis=1)
         shown = PointResiduals._make(array[kept] for array in points)
-        state = diagnosis.model.state
+        state = diagnosis.evaluation.fixed_model.state
         lenses = dict(zip(state.labels, state.lenses, strict=True))
-        return cls(shown, lenses, diagnosis.scatter_px, diagnosis.model.data.observations)
+        return cls(
+            shown, lenses, diagnosis.scatter_px, diagnosis.evaluation.fixed_model.data.observations
+        )
 
     def of_camera(self, camera: int) -> PointResiduals:
         """Return the points that were seen through one of the lenses."""

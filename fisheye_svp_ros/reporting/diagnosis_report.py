@@ -77,7 +77,7 @@ def write_report(
     draw_uncertainty(pictures[-1], diagnosis)
     if wanted is not None:
         pictures.append(inputs.folder / 'next.png')
-        state = diagnosis.model.state
+        state = diagnosis.evaluation.fixed_model.state
         shot_list.draw_shots(pictures[-1], ForwardModel(state.lens, state.terms), wanted)
     report = inputs.folder / 'report.html'
     write_text(
@@ -153,7 +153,10 @@ def _target_maps(diagnosis: Diagnosis) -> Iterator[tuple[str, BoardMap]]:
 
 
 def _free(inputs: ReportInputs, diagnosis: Diagnosis) -> str:
-    free = {'poses': diagnosis.model.data.poses is None, 'intrinsics': inputs.free_intrinsics}
+    free = {
+        'poses': diagnosis.evaluation.fixed_model.data.poses is None,
+        'intrinsics': inputs.free_intrinsics,
+    }
     return text.join_names([name for name, fitted in free.items() if fitted]) or 'nothing'
 
 

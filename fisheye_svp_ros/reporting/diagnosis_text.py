@@ -145,7 +145,7 @@ def frame_ranges(d: Diagnosis, ranges: Sequence[tuple[int, int]]) -> str:
 def count_frames(d: Diagnosis) -> str:
     """Return how many frames there are; of cameras that no rig holds together, how many views."""
     numbers, plural = d.problem.observations.frame, 's' * (d.frames > 1)
-    if is_unpaired(d.model.data):
+    if is_unpaired(d.evaluation.fixed_model.data):
         frames = len({*numbers.tolist()})
         return (
             f'{d.frames} view{plural} of {frames} frame{"s" * (frames > 1)} (each view with '
@@ -158,9 +158,13 @@ def count_frames(d: Diagnosis) -> str:
 def lens_contents(d: Diagnosis) -> str:
     """Return what the extended lens has that the lens as given has not."""
     field = d.evaluation.written_field
-    parts = ['intrinsics fitted to these data'] if d.intrinsics else []
+    parts = ['intrinsics fitted to these data'] if d.evaluation.intrinsics else []
     parts += [c.effect for c in d.causes if c.stage == 'lens']
-    parts += ['a viewpoint shift that is likely, not confirmed'] if d.averaged_model.shifts else []
+    parts += (
+        ['a viewpoint shift that is likely, not confirmed']
+        if d.evaluation.averaged_model.shifts
+        else []
+    )
     parts += ['an image field'] if field is not None and field.fields else []
     return f'with {join_names(parts)}' if parts else 'as it was fitted'
 
@@ -269,7 +273,9 @@ def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
             why = 'that is the noise' if times < _NOISE_RATIO else _poor_prediction(d, times)
         if d.causes:
             why = 'the cause is in the image points, not in the lens'
-        which = 'The lens, fitted to these data,' if d.intrinsics else 'The lens as it is'
+        which = (
+            'The lens, fitted to these data,' if d.evaluation.intrinsics else 'The lens as it is'
+        )
         text = f'{which} predicts held-out data to {before:.3g} px rms; {why}{local}'
         return text + (_file_clause(d) if d.offers_extended else '') + '.'
     if named >= before:

@@ -123,9 +123,9 @@ def _height_map(figure: Figure, axis: Axes, board: BoardMap) -> None:
 
 def draw_uncertainty(path: Path, diagnosis: Diagnosis) -> None:
     """Draw the standard deviation of a coordinate by noise, parameters and remaining misfit."""
-    linear = diagnosis.written_model
+    linear = diagnosis.evaluation.written_model
     data, state = linear.data, linear.state
-    parts = diagnosis.errors.of_points(linear)._asdict()
+    parts = diagnosis.evaluation.model_errors.of_points(linear)._asdict()
     uv = data.blocks(data.views.uv).reshape(-1, 2)
     through = np.broadcast_to(data.camera_of[:, None, None].astype(float), data.views.uv.shape)
     camera = data.blocks(through).reshape(-1, 2)[:, 0] * (len(state.lenses) > 1)

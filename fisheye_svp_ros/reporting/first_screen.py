@@ -180,9 +180,9 @@ def first_screen(
 def _reason(decision: Decision, d: Diagnosis) -> str:
     """Return why, with the photographs whose board is numbered from another end."""
     why = _capital(decision_reason(decision))
-    if decision is not d.decision['photographs'] or not d.record.turned:
+    if decision is not d.decision['photographs'] or not d.turned:
         return why
-    names = [one.photograph for one in d.record.turned]
+    names = [one.photograph for one in d.turned]
     more = f' and {len(names) - _MAX_NAMES} more' if len(names) > _MAX_NAMES else ''
     return f'{why}; numbered from another end of the board: {", ".join(names[:_MAX_NAMES])}{more}'
 
@@ -210,7 +210,7 @@ def _facts(d: Diagnosis, source: str) -> str:
     base, named, extended = (
         one.heldout_rms_px for one in (figures.base, figures.named, figures.extended)
     )
-    rays, near = d.conclusion.ray_error_mrad(), ''
+    rays, near = d.ray_error_mrad(), ''
     if rays and d.offers_extended:
         asked = d.problem.options.range_m or 1.0
         before, after = (
@@ -283,7 +283,7 @@ def _causes(d: Diagnosis) -> str:
 
 
 def _candidates(d: Diagnosis) -> str:
-    shifts = d.averaged_model.shifts
+    shifts = d.evaluation.averaged_model.shifts
     others = [one for one in d.candidates if not shifts or one.effect != 'viewpoint_shift']
     words = [
         f'{f"{one.camera} " if one.camera else ""}viewpoint_shift '

@@ -614,7 +614,7 @@ def test_intrinsics_are_told_with_their_unit():
 def test_a_single_frame_is_drawn(tmp_path):
     table, _ = seen({})
     found = diagnose(table.take((table.frame == 0) & (table.landmark < 6)), LENS)
-    points = point_residuals(found.simulation, found.cause_fit)
+    points = point_residuals(found.evaluation.simulation, found.evaluation.cause_fit)
     for name, draw, arguments in residual_pictures(PlotData.from_diagnosis(found, points)):
         draw(tmp_path / f'{name}.png', *arguments)
     assert len(list(tmp_path.glob('*.png'))) == 7
@@ -643,7 +643,8 @@ def test_each_camera_of_a_rig_has_pictures_of_its_own_image(tmp_path, monkeypatc
         {'left': LENS, 'right': larger},
         options=DiagnosisOptions(quick=True),
     )
-    shown = PlotData.from_diagnosis(found, point_residuals(found.simulation, found.cause_fit))
+    points = point_residuals(found.evaluation.simulation, found.evaluation.cause_fit)
+    shown = PlotData.from_diagnosis(found, points)
     named = {name: (draw, arguments) for name, draw, arguments in residual_pictures(shown)}
     draw, arguments = named['field']
     draw(tmp_path / 'field.png', *arguments)
@@ -674,10 +675,10 @@ def test_the_bow_of_a_board_is_measured_between_its_extremes():
     board = plane()
     poses = poses_around(board, 6, rng, widest=0.5)
     found = diagnose(simulate(ForwardModel(LENS), board, poses, 0.1, rng), LENS)
-    effect = TargetShapeEffect.candidates(found.model.scene)[0]
+    effect = TargetShapeEffect.candidates(found.evaluation.fixed_model.scene)[0]
     bow = np.array([0.002, 0.0, 0.0])
-    state = replace(found.model.state, terms=(ModelTerm(effect, bow),))
-    (one,) = board_maps(found.model.data.views, state.terms, state.lens)
+    state = replace(found.evaluation.fixed_model.state, terms=(ModelTerm(effect, bow),))
+    (one,) = board_maps(found.evaluation.fixed_model.data.views, state.terms, state.lens)
     assert len(one.height) == len(board.ids)
     x = one.place[:, 0] / np.abs(one.place[:, 0]).max()
     expected = 0.002 * x**2
@@ -697,14 +698,15 @@ def test_the_depth_of_a_rig_gains_too():
     table = simulate_stereo(model, model, landmarks(), rig, poses, 0.05, rng)
     found = diagnose(table, LENS)
     assert [cause.effect for cause in found.causes] == ['viewpoint_shift']
-    known = known_errors(found.simulation, found.model, ())
+    before, after = found.evaluation.simulation, found.evaluation.fixed_model
+    known = known_errors(before, after, ())
     assert set(known) == {'depth_error_m'}
     depth = known['depth_error_m']
     assert 0 < depth.after < depth.before
     assert depth.low <= depth.value <= depth.high
     # With cameras that stand elsewhere by the time the second exposes, a rig alone says nothing.
-    late = with_effect(found.model.state, StereoTimeOffsetEffect(), np.array([0.01]))
-    assert known_errors(found.simulation, Linearization(found.model.data, late, ()), ()) == {}
+    late = with_effect(after.state, StereoTimeOffsetEffect(), np.array([0.01]))
+    assert known_errors(before, Linearization(after.data, late, ()), ()) == {}
 
 
 @pytest.mark.parametrize(

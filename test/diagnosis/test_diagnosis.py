@@ -223,7 +223,7 @@ def test_near_points_that_a_cause_explains_are_no_gross_errors():
     assert abs(error['value'] - 0.004) < 3 * error['stderr'] < 0.0004
     left = [(g['frame'], g['landmark']) for g in found.gross]
     assert left == [(11, int(table.landmark[wrong]))]
-    assert found.model.data.views.used.sum() == len(table) - 1
+    assert found.evaluation.fixed_model.data.views.used.sum() == len(table) - 1
 
 
 def test_points_that_say_themselves_how_unsure_they_are_are_no_gross_errors():
@@ -428,7 +428,7 @@ def test_a_lens_that_is_fitted_is_that_of_the_mean_session():
     table = table_of(22, 24, terms=[ModelTerm(step, np.array([0.004, 1.0, -2.0]))])
     found = diagnose(table, first, free_intrinsics=True)
     assert [cause.effect for cause in found.causes] == ['session_step']
-    cx, cy, fx = (found.intrinsics[name] for name in ('cx', 'cy', 'fx'))
+    cx, cy, fx = (found.evaluation.intrinsics[name] for name in ('cx', 'cy', 'fx'))
     assert abs(cx.after - first.cx - 0.5) < 3 * cx.after_stderr
     assert abs(cy.after - first.cy + 1.0) < 3 * cy.after_stderr
     assert abs(fx.after / first.fx - 1.002) < 3 * fx.after_stderr / first.fx
@@ -535,7 +535,7 @@ def test_each_camera_of_a_rig_has_causes_of_its_own():
     skew = CATALOGUE['skew']()
     table, lenses = rig_table(26, [ModelTerm(skew, np.array([0.002]))], 10)
     found = diagnose(table, lenses, free_intrinsics=True)
-    models = [found.model.state.model.camera(camera) for camera in (0, 1)]
+    models = [found.evaluation.fixed_model.state.model.camera(camera) for camera in (0, 1)]
     assert [model.lens.name for model in models] == ['fish214', 'right']
     assert [cause.effect for cause in found.causes] == ['skew']
     assert list(found.causes[0].parameters) == ['right.shear']
@@ -543,7 +543,7 @@ def test_each_camera_of_a_rig_has_causes_of_its_own():
     assert not found.lenses['left'].corrections
     assert set(found.lenses['right'].corrections) == {'skew'}
     assert found.lenses['right'].fx == pytest.approx(395.0, abs=1.0)
-    assert {'left.fx', 'right.fx'} <= set(found.intrinsics)
+    assert {'left.fx', 'right.fx'} <= set(found.evaluation.intrinsics)
     again = diagnose(table, found.lenses)
     assert again.verdict == 'adequate' and not again.causes
 

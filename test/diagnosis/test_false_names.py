@@ -184,7 +184,8 @@ def test_a_rig_that_bends_anew_in_every_frame_is_no_image_that_moves(alone):
     off = (value - turns + turns.mean(axis=0)) / error
     assert 0.7 < np.sqrt((off**2).mean()) < 1.3
     # Where the rig stood in a frame that was left out is not known.
-    assert 'depth_error_m' not in known_errors(found.simulation, found.model, ())
+    fits = found.evaluation.simulation, found.evaluation.fixed_model
+    assert 'depth_error_m' not in known_errors(*fits, ())
 
 
 def test_one_frame_that_gains_most_is_no_reason_for_doubt_nor_for_trust():

@@ -44,7 +44,8 @@ def test_a_warp_is_written_and_brings_the_rays_nearer_to_the_truth(
     assert written == found.lens
     assert written.image_field is not None and written.image_field.stderr is not None
     assert 0 < np.median(written.image_field.stderr) < 0.3
-    uv = found.model.data.views.uv[found.model.data.views.used]
+    views = found.evaluation.fixed_model.data.views
+    uv = views.uv[views.used]
     far = true_directions(uv, length)
     off = [errors_px(lens, far, uv) for lens in (replace(written, image_field=None), written)]
     assert off[1] < 0.75 * off[0]

@@ -61,11 +61,11 @@ def diagnosed(table: Observations) -> Diagnosis:
 
 def test_reversed_photographs_are_named_and_put_in_order() -> None:
     found, right = (diagnosed(photographs(1, 0.2, hidden)) for hidden in (HIDDEN, ()))
-    assert [one.frame for one in found.record.turned] == list(HIDDEN)
+    assert [one.frame for one in found.turned] == list(HIDDEN)
     for one in diagnosis_document(found)['turned']:
         assert one['photograph'] == f'left{one["frame"]:02d}.png'
         assert one['corrected'] and one['degrees'] == 180 and one['odds'] > 1e3
-    assert not right.record.turned
+    assert not right.turned
     assert found.figures.extended.rms_px == pytest.approx(right.figures.extended.rms_px, rel=1e-6)
     (advice,) = (one for one in found.advice if one.kind == TURNED)
     assert 'left03.png' in advice.photographs
@@ -82,14 +82,14 @@ def test_reversed_photographs_are_named_and_put_in_order() -> None:
 
 @pytest.mark.parametrize('seed', [2, 3])
 def test_nothing_is_reported_where_offsets_are_too_small_to_tell(seed: int) -> None:
-    assert not diagnosed(photographs(seed, 0.0, HIDDEN)).record.turned
+    assert not diagnosed(photographs(seed, 0.0, HIDDEN)).turned
 
 
 def test_frames_that_show_several_boards_are_left_alone() -> None:
     """No frame shows one board alone: there is nothing to compare."""
     table = photographs(1, 0.2)
     two = replace(table, board=(table.landmark % 9 > 4).astype(np.int64))
-    assert not diagnosed(two).record.turned
+    assert not diagnosed(two).turned
 
 
 def test_turns_carry_a_board_onto_itself() -> None:
@@ -116,8 +116,8 @@ def test_turns_carry_a_board_onto_itself() -> None:
 def test_reversed_photographs_are_found_where_no_row_has_a_corner() -> None:
     hidden, right = photographs(1, 0.2, HIDDEN), photographs(1, 0.2)
     found, right = (diagnosed(one.take(one.landmark > 0)) for one in (hidden, right))
-    assert [one.frame for one in found.record.turned] == list(HIDDEN)
-    assert all(one.corrected for one in found.record.turned)
+    assert [one.frame for one in found.turned] == list(HIDDEN)
+    assert all(one.corrected for one in found.turned)
     assert found.figures.extended.rms_px == pytest.approx(right.figures.extended.rms_px, rel=0.02)
 
 

@@ -64,8 +64,8 @@ def test_reversed_views_are_put_in_the_order_of_the_other_camera():
     seen = pair(replace(SMALL, reversed_frames=2), 3)
     found = diagnose(seen.table, seen.lenses, options=DiagnosisOptions(quick=True))
     assert [one['frame'] for one in diagnosis_document(found)['turned']] == seen.reversed_frames
-    assert all(one.corrected and one.degrees == 180 for one in found.record.turned)
-    assert [one.photograph for one in found.record.turned] == [
+    assert all(one.corrected and one.degrees == 180 for one in found.turned)
+    assert [one.photograph for one in found.turned] == [
         f'frame {frame}' for frame in seen.reversed_frames
     ]
     assert not torn_frames(found) and found.figures.extended.rms_px < 0.11
@@ -267,7 +267,7 @@ def test_cameras_without_a_common_frame():
     assert 'too few frames are shared' in sections(found)[0].sentence
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        assert known_errors(found.simulation, found.model, ()) == {}
+        assert known_errors(found.evaluation.simulation, found.evaluation.fixed_model, ()) == {}
 
 
 def test_a_wrong_lens_is_no_rig_that_moves():
@@ -329,9 +329,9 @@ def test_lenses_before_predict_held_out_frames_with_their_own_rig(longer):
     train, test = halves(longer)
     found = diagnose(train, longer.lenses, held_out=test, options=DiagnosisOptions(quick=True))
     data = found.evaluation.held_out.data
-    posed = Linearization(data, localize_frames(data, found.simulation.state), ())
+    posed = Linearization(data, localize_frames(data, found.evaluation.simulation.state), ())
     assert found.figures.base.heldout_rms_px == pytest.approx(rms_px(posed), rel=1e-3)
-    trained, (left, right) = found.simulation.data, longer.lenses.values()
+    trained, (left, right) = found.evaluation.simulation.data, longer.lenses.values()
     written = adjust(trained, initial_state(trained, left, [right]), ())
     posed = Linearization(data, localize_frames(data, written), ())
     assert found.evaluation.as_given_px == pytest.approx(rms_px(posed), rel=1e-3)

@@ -83,7 +83,7 @@ def test_poses_scatter_as_the_remaining_misfit_says():
 
 def test_a_diagnosis_tells_how_far_off_poses_may_be():
     options = DiagnosisOptions(quick=True)
-    found = diagnose(displaced(6, 0), AIR, options=options).uncertainty
+    found = diagnose(displaced(6, 0), AIR, options=options).evaluation.uncertainty
     assert found['position_m']['misfit'] > found['position_m']['noise'] > 0
     assert found['image_px']['noise'] == pytest.approx(0.02, rel=0.5)
 
@@ -135,7 +135,7 @@ def test_cameras_without_a_common_frame_have_poses_of_their_own():
     apart = replace(seen, frame=seen.frame + 100 * seen.camera)
     lenses, quick = {'left': lens(), 'right': lens()}, DiagnosisOptions(quick=True)
     rig, own = (
-        diagnose(one, lenses, options=quick, free_intrinsics=True).uncertainty
+        diagnose(one, lenses, options=quick, free_intrinsics=True).evaluation.uncertainty
         for one in (seen, apart)
     )
     for name in ('position_m', 'rotation_rad'):

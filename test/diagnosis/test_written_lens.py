@@ -32,7 +32,7 @@ def diagnosed(e0: float, noise: float, seed: int = 0, **settings: object) -> Dia
 def test_a_shift_that_is_likely_and_not_named_is_written_in_part() -> None:
     found = diagnosed(0.004, 0.1)
     assert not found.causes
-    (shift,) = found.averaged_model.shifts
+    (shift,) = found.evaluation.averaged_model.shifts
     assert PRIOR_ODDS / (1 + PRIOR_ODDS) < shift.weight < 1
     written = found.lens.viewpoint_shift
     assert isinstance(written, Gennery) and written.e0 == pytest.approx(shift.e0)
@@ -62,26 +62,26 @@ def test_the_mean_is_that_of_two_models_weighed_by_their_evidence() -> None:
     )
     logs = np.linalg.slogdet(information)[1] - np.linalg.slogdet(alone)[1] + 2 * np.log(size)
     odds = PRIOR_ODDS * np.exp((gain - logs) / 2)
-    (shift,) = found.averaged_model.shifts
+    (shift,) = found.evaluation.averaged_model.shifts
     assert shift.weight == pytest.approx(odds / (1 + odds), rel=1e-4)
     estimate = np.linalg.solve(information, score) / null.scale[both]
     assert shift.e0 == pytest.approx(shift.weight * estimate[-1], rel=1e-4)
-    moved = found.averaged_model.linear.state.lens.fx - null.linear.state.lens.fx
+    moved = found.evaluation.averaged_model.linear.state.lens.fx - null.linear.state.lens.fx
     base = np.linalg.solve(alone, score[:-1]) / null.scale[both[:-1]]
     assert moved == pytest.approx(shift.weight * (estimate[0] - base[0]), rel=1e-3)
 
 
 def test_nothing_is_added_where_the_data_speak_against_a_shift_or_the_user_does() -> None:
-    assert not diagnosed(0.0, 0.05).averaged_model.shifts
+    assert not diagnosed(0.0, 0.05).evaluation.averaged_model.shifts
     assert diagnosed(0.0, 0.05).lens.viewpoint_shift is None
     options = DiagnosisOptions(left_out=('viewpoint_shift',))
-    assert not diagnosed(0.004, 0.1, options=options).averaged_model.shifts
+    assert not diagnosed(0.004, 0.1, options=options).evaluation.averaged_model.shifts
 
 
 def test_a_named_shift_is_written_as_it_is_named() -> None:
     found = diagnosed(0.004, 0.05)
     assert [cause.effect for cause in found.causes] == ['viewpoint_shift']
-    assert not found.averaged_model.shifts
+    assert not found.evaluation.averaged_model.shifts
     named = found.causes[0].parameters['e0']['value']
     written = found.lens.viewpoint_shift
     assert isinstance(written, Gennery) and written.e0 == pytest.approx(named)
@@ -95,11 +95,11 @@ def test_ray_errors_file_figure_and_summary_are_of_the_lens_that_is_written() ->
     rays = find_lens_rays(found.evaluation, found.lenses)[0]['']
     for one, other in zip(rays['given'], rays['extended'], strict=True):
         assert one.value == pytest.approx(other.value, rel=1e-6)  # no difference to itself
-    known, bare = (d.uncertainty['image_px'] for d in (found, closed))
+    known, bare = (d.evaluation.uncertainty['image_px'] for d in (found, closed))
     assert known['parameters'] > bare['parameters']
     assert LensErrors.from_lens(found.lens).model.names[-1] == 'e0'
     assert found.lens.uncertainty is not None
-    assert found.lens.uncertainty['ray_error_mrad'] == found.conclusion.ray_error_mrad()
+    assert found.lens.uncertainty['ray_error_mrad'] == found.ray_error_mrad()
 
 
 def test_a_refuted_shift_is_not_written() -> None:
@@ -113,7 +113,7 @@ def test_a_refuted_shift_is_not_written() -> None:
 def test_ray_errors_are_stated_at_the_range_that_is_asked_for() -> None:
     found = diagnosed(0.004, 0.05, options=DiagnosisOptions(range_m=0.5))
     assert found.offers_extended
-    rays = found.conclusion.ray_error['']
+    rays = found.ray_error['']
     assert [one.range_m for one in rays['given']] == [0.3, 1.0, 5.0, 0.5]
     near, far, _, asked = (one.value for one in rays['extended'])
     assert min(near, far) * 0.8 < asked < max(near, far) * 1.1
@@ -127,4 +127,4 @@ def test_a_shift_that_no_lens_can_have_is_not_written(monkeypatch: pytest.Monkey
     found = diagnosed(0.006, 0.02, options=DiagnosisOptions(quick=True))
     reasons = {one.effect: one.reason for one in found.candidates}
     assert reasons['viewpoint_shift'] is Reason.IMPLAUSIBLE
-    assert found.lens.viewpoint_shift is None and not found.averaged_model.shifts
+    assert found.lens.viewpoint_shift is None and not found.evaluation.averaged_model.shifts

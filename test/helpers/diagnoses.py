@@ -2,17 +2,10 @@
 
 from dataclasses import replace
 
-from fisheye_svp_ros.diagnosis.diagnosis import SearchRecord
 from fisheye_svp_ros.diagnosis.evaluation import Figures
 
 
 def with_changes(found, **changes):
-    """Return a diagnosis with other fields, those of its figures and its record among them."""
+    """Return a diagnosis with other fields, those of its figures among them."""
     figures = {name: changes.pop(name) for name in Figures._fields if name in changes}
-    record = {name: changes.pop(name) for name in SearchRecord._fields if name in changes}
-    return replace(
-        found,
-        figures=found.figures._replace(**figures),
-        record=found.record._replace(**record),
-        **changes,
-    )
+    return replace(found, figures=found.figures._replace(**figures), **changes)

@@ -111,7 +111,7 @@ def test_the_headline_says_that_the_target_is_imperfect_too(found: Diagnosis) ->
 
 def _deciding(found: Diagnosis, about: str, **changes: object) -> Diagnosis:
     decided = {**found.decision, about: replace(found.decision[about], **changes)}
-    return replace(found, conclusion=replace(found.conclusion, decision=decided))
+    return replace(found, decision=decided)
 
 
 def _tilt(value: float, error: float) -> Cause:
@@ -171,12 +171,7 @@ def test_only_an_extended_lens_that_is_offered_is_warned_of(
 ) -> None:
     """Beside "Keep the lens" stood that the error rises with a lens nobody was to use."""
     worse = _deciding(found, 'lens', say=say)
-    worse = replace(
-        worse,
-        conclusion=replace(
-            worse.conclusion, file=found.file._replace(given_px=0.1, extended_px=0.2)
-        ),
-    )
+    worse = replace(worse, file=found.file._replace(given_px=0.1, extended_px=0.2))
     assert ('extended lens on one target' in first_screen(worse, 'table').warning) == warned
 
 
@@ -327,7 +322,7 @@ def test_the_report_of_a_likely_shift_claims_no_causes(found: Diagnosis, tmp_pat
     likely = with_changes(_deciding(found, 'lens', say='use_extended'), causes=[], gross=gross)
     write_report(
         likely,
-        point_residuals(found.simulation, found.cause_fit),
+        point_residuals(found.evaluation.simulation, found.evaluation.cause_fit),
         {},
         ReportInputs('obs.csv', ('l.yaml',), None, None, tmp_path, False),
     )
@@ -375,12 +370,10 @@ def test_evidence_tells_what_was_not_confirmed_in_the_end(
     """The table ended with "predicts better"; the first screen, "held-out frames refute it"."""
     refuted = Finding('sensor_tilt', Reason.REFUTED_BY_FRAMES, 1e-9, 1e-9)
     step = Finding('sensor_tilt', Reason.PREDICTS_BETTER, 1e-9, 1e-9, 99.0, 2, 93.0, 27.0)
-    table = with_changes(
-        found, causes=[], trace=[step], conclusion=replace(found.conclusion, candidates=[refuted])
-    )
+    table = with_changes(found, causes=[], trace=[step], candidates=[refuted])
     write_report(
         table,
-        point_residuals(found.simulation, found.cause_fit),
+        point_residuals(found.evaluation.simulation, found.evaluation.cause_fit),
         {},
         ReportInputs('obs.csv', ('l.yaml',), None, None, tmp_path, False),
     )
@@ -391,19 +384,9 @@ def test_evidence_tells_what_was_not_confirmed_in_the_end(
 def test_an_extended_lens_that_held_out_frames_refute_is_not_offered(found: Diagnosis) -> None:
     """Beside "use the extended lenses" a warning said that their held-out error is larger."""
     off = _deciding(found, 'lens', say='recalibrate')
-    better = replace(
-        off,
-        conclusion=replace(
-            off.conclusion, file=found.file._replace(given_px=0.2, extended_px=0.1)
-        ),
-    )
+    better = replace(off, file=found.file._replace(given_px=0.2, extended_px=0.1))
     assert headline(better).endswith('calibrate again, or use extended_lens.yaml.')
-    worse = replace(
-        off,
-        conclusion=replace(
-            off.conclusion, file=found.file._replace(given_px=0.1, extended_px=0.2)
-        ),
-    )
+    worse = replace(off, file=found.file._replace(given_px=0.1, extended_px=0.2))
     assert headline(worse).endswith('Do not use the lens as given; calibrate again.')
     assert not first_screen(worse, 'table').warning and 'held-out frames' in refusal_reason(worse)
     inputs = ReportInputs('a.csv', ('l.yaml',), None, None, Path('out'), True)
