@@ -20,7 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from fisheye_svp_ros.detect.tags import find_tags
-from fisheye_svp_ros.effects.forward import ForwardModel, back_project, project
+from fisheye_svp_ros.effects.forward import ForwardModel, back_project_corrected, project_corrected
 from fisheye_svp_ros.io.files import write_json
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.tag_maps import TagMap, write_tag_map
@@ -89,7 +89,7 @@ class Renderer:
             np.broadcast_arrays(step[:, None, None], step[:, None])[::-1], axis=-1
         ).reshape(1, FINE, 1, FINE, 2)
         uv = np.asarray(uv.reshape(FINE * LENS.height, FINE * LENS.width, 2))
-        rays = back_project(LENS, uv.reshape(-1, 2))
+        rays = back_project_corrected(LENS, uv.reshape(-1, 2))
         self._rays = np.where(rays.valid[:, None], rays.direction, np.nan).reshape(
             (*uv.shape[:2], 3)
         )
@@ -108,7 +108,7 @@ class Renderer:
             sheet = pose.transform(
                 0.8 * SIZE * np.array([[x, y, 0.0] for x in (-1, 1) for y in (-1, 1)])
             )
-            image = project(LENS, camera.into_body(sheet))
+            image = project_corrected(LENS, camera.into_body(sheet))
             if not image.valid.all() or pose.into_body(camera.position[None])[0, 2] < 0:
                 continue
             low = np.floor(np.clip(image.uv.min(axis=0) - 20, 0, None)).astype(int) * FINE

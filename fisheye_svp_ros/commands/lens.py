@@ -12,7 +12,7 @@ from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import note_reader_limit, say
 from fisheye_svp_ros.commands.outputs import output_file
 from fisheye_svp_ros.effects.extension import LANDMARKS
-from fisheye_svp_ros.effects.forward import project
+from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file, save_lens
@@ -183,10 +183,10 @@ def _print_loss(lens: Lens, written: Lens, ranges: Sequence[float], as_it_stands
     )
     distance = np.minimum(ranges, MAX_RANGE)
     points = distance[:, None, None] * around[:, None]
-    uv = project(lens, points).uv
+    uv = project_corrected(lens, points).uv
     half = np.array([lens.width, lens.height]) / 2
     inside = (np.abs(uv + 0.5 - half) <= half).all(axis=-1)
-    off = np.linalg.norm(uv - project(written, points).uv, axis=-1)
+    off = np.linalg.norm(uv - project_corrected(written, points).uv, axis=-1)
     worst = np.fmax.reduce(np.where(inside, off, np.nan), axis=-1)
     if np.fmax.reduce(worst, axis=None) > _VISIBLE_PX:
         print_table(

@@ -23,7 +23,6 @@ from fisheye_svp_ros.mixed_model import project_out, pseudo_inverse
 from fisheye_svp_ros.scene.observations import Observations, photograph_entry
 from fisheye_svp_ros.solve.outliers import Outliers
 from fisheye_svp_ros.solve.port_fit import MEDIUM_INDEX, THICKNESS
-from fisheye_svp_ros.solve.rig_state import rms_px
 
 # An effect is confounded with another unless, with it in the model, the other is still needed.
 CONFOUNDED_P = 0.002
@@ -197,7 +196,7 @@ def _error_of_imitation(tests: EffectTests, true: Index, columns: Index) -> floa
     both = flat_rows(project_out(both, linear.frame_columns))
     fitted, moved = both[:, :-1], both[:, -1]
     remaining = moved - fitted @ (pseudo_inverse(fitted.T @ fitted) @ (fitted.T @ moved))
-    return rms_px(linear, remaining.reshape(linear.residual.shape)) / linear.state.lens.focal
+    return linear.rms_px_of(remaining.reshape(linear.residual.shape)) / linear.state.lens.focal
 
 
 def parameters_of(term: ModelTerm, errors: Array) -> dict[str, dict[str, Any]]:

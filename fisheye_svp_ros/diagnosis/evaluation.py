@@ -52,7 +52,7 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.rig_state import Linearization, RigState, is_shared, rms_px
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, is_shared
 
 MAX_RMS_RATIO = 1.01  # a rise by less is none: noise that grows with the angle has weights
 
@@ -313,7 +313,7 @@ class Evaluation:
     @cached_property
     def figures(self) -> Figures:
         """How well each model describes the data it was fitted to and the data held out."""
-        named = FitQuality(rms_px(self.cause_fit), self._cause_predictions[-1].rms)
+        named = FitQuality(self.cause_fit.rms_px, self._cause_predictions[-1].rms)
         return Figures(
             self._base_quality(),
             named,
@@ -335,12 +335,14 @@ class Evaluation:
         linear = self.problem.linear
         if set(self._not_of_lens) < set(self.names):
             linear = self._adjust(fit_without_causes(self.null, self._not_of_lens, self.free))
-        return FitQuality(rms_px(linear), self._lens_prediction.rms)
+        return FitQuality(linear.rms_px, self._lens_prediction.rms)
 
     def _extended_quality(self) -> FitQuality:
         residuals = self.fitted.residuals()
         chi2 = float((residuals**2).sum()) / self._noise_square / self.null.full.rows
-        return FitQuality(rms_px(self.null.linear, residuals), self._extended_prediction.rms, chi2)
+        return FitQuality(
+            self.null.linear.rms_px_of(residuals), self._extended_prediction.rms, chi2
+        )
 
     @property
     def frames(self) -> int:

@@ -59,7 +59,6 @@ from fisheye_svp_ros.solve.rig_state import (
     RigViews,
     free_parameters,
     group_by_frame,
-    rms_px,
     with_effect,
 )
 from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
@@ -199,7 +198,7 @@ class Problem:
             data = unpair_cameras(data)
             base = adjust(data, initial_state(data, lenses[0], lenses[1:]), inputs.free)
         step, options = quantization_step(inputs.observations.uv), inputs.options
-        rms = rms_px(Linearization(data, base, inputs.free))
+        rms = Linearization(data, base, inputs.free).rms_px
         if step / np.sqrt(6) > _STEP_OVER_NOISE * rms:
             options = options.leave_out(*QuantisationEffect.hides)
         else:

@@ -144,7 +144,9 @@ def diagnose_against(
     found = diagnose_one(observations, options, 0.0, 0.35, **settings)
     second = diagnose_one(other, options, 0.35, 0.7, 'the other set: ')
     progress('validating each data set by the other', 0.7)
-    models = [DatasetModel(one.evaluation.simulation, one.evaluation.null) for one in (found, second)]
+    models = [
+        DatasetModel(one.evaluation.simulation, one.evaluation.null) for one in (found, second)
+    ]
     datasets = compare_datasets(models[0], models[1], observations.source, other.source)
     gone = tuple(name for name in datasets.refuted_causes if name not in options.included)
     if gone:

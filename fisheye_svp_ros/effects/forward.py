@@ -323,12 +323,12 @@ class ForwardModel:
         return moved if self._target is None else moved + self._target.displacement(scene, stage)
 
 
-def project(lens: Lens, points: Array) -> Image:
+def project_corrected(lens: Lens, points: Array) -> Image:
     """Project points (..., 3), m, in the camera frame through a lens with its corrections."""
     return ForwardModel(lens).project(points)
 
 
-def back_project(lens: Lens, uv: Array) -> Rays:
+def back_project_corrected(lens: Lens, uv: Array) -> Rays:
     """Return the rays of image points (..., 2), px, through a lens with its corrections."""
     rays = ForwardModel(lens).back_project(uv.reshape(1, -1, 2))
     return rays.reshape(uv.shape[:-1])

@@ -100,12 +100,12 @@ def project(lens: AnyLens, points: Array) -> Image:
     # Beyond, squares overflow; the image is that of the direction long before.
     largest = np.abs(points).max(axis=-1, keepdims=True)
     scale = np.where(largest > _MAX_DISTANCE, largest / _MAX_DISTANCE, 1.0)
-    return forward.project(load_lens(lens), points / scale)
+    return forward.project_corrected(load_lens(lens), points / scale)
 
 
 def back_project(lens: AnyLens, uv: Array) -> Rays:
     """Return the rays of image points (..., 2), px: origin (0, 0, s(theta)), unit direction."""
-    return forward.back_project(load_lens(lens), _check_last_axis(2, uv, 'uv'))
+    return forward.back_project_corrected(load_lens(lens), _check_last_axis(2, uv, 'uv'))
 
 
 def _by_frame(poses: AnyPoses) -> dict[int, Pose]:

@@ -195,14 +195,16 @@ def kannala_brandt_equivalent(lens: Lens) -> Lens:
     if exact is not None:
         return replace(bare, image_height=exact)
     theta = np.linspace(0.0, lens.max_incidence, _SAMPLES)
-    scaled = theta / lens.max_incidence
-    powers = np.arange(1, 10, 2)
-    height, _ = curve.value_and_slope(theta)
-    fitted = np.linalg.lstsq(scaled[:, None] ** powers, height, rcond=None)[0]
-    scale, *k = fitted / lens.max_incidence**powers
-    return replace(
-        bare,
-        fx=lens.fx * float(scale),
-        fy=lens.fy * float(scale),
-        image_height=KannalaBrandt(*(float(value / scale) for value in k)),
-    )
+    scale, fitted = fit_kannala_brandt(theta, curve.value_and_slope(theta)[0])
+    return replace(bare, fx=lens.fx * scale, fy=lens.fy * scale, image_height=fitted)
+
+
+def fit_kannala_brandt(theta: Array, height: Array) -> tuple[float, KannalaBrandt]:
+    """Return the curve and its scale, by least squares, of image heights (N,) at angles (N,), rad.
+
+    The angles ascend; the height is the scale times the curve.
+    """
+    powers, limit = np.arange(1, 10, 2), theta[-1]
+    fitted = np.linalg.lstsq((theta / limit)[:, None] ** powers, height, rcond=None)[0]
+    scale, *k = (fitted / limit**powers).tolist()
+    return scale, KannalaBrandt(*(value / scale for value in k))

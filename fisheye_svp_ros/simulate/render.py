@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.forward import back_project, project
+from fisheye_svp_ros.effects.forward import back_project_corrected, project_corrected
 from fisheye_svp_ros.optics.camera import Rays
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
@@ -161,7 +161,7 @@ def render(
 
 def pixel_rays(lens: Lens) -> Rays:
     """Return the rays of all pixels (H, W), camera frame."""
-    return back_project(lens, _pixels(lens))
+    return back_project_corrected(lens, _pixels(lens))
 
 
 def _pixels(lens: Lens) -> Array:
@@ -181,7 +181,7 @@ def _window(lens: Lens, boards: Sequence[BoardPose], camera: Pose) -> tuple[slic
         sheet *= printed.size
         height = np.zeros(sheet.shape[:2]) if printed.bow is None else printed.bow(sheet)
         points = np.concatenate([sheet, height[..., None]], axis=-1).reshape(-1, 3)
-        image = project(lens, camera.into_body(place.transform(points)))
+        image = project_corrected(lens, camera.into_body(place.transform(points)))
         if not image.valid.all():
             return slice(None), slice(None)
         low, high = np.minimum(low, image.uv.min(axis=0)), np.maximum(high, image.uv.max(axis=0))
@@ -205,7 +205,9 @@ def _of_board(
         for _ in range(3):
             # The image of a place is moved: look where the unmoved image of what is seen lies.
             unmoved = uv - moved(_is_near_sheet(places, board.printed))
-            places = _board_xy(lens, board, camera, exposure, unmoved, back_project(lens, unmoved))
+            places = _board_xy(
+                lens, board, camera, exposure, unmoved, back_project_corrected(lens, unmoved)
+            )
     return _light(board.printed, places) - np.float32(_ROOM)
 
 

@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.forward import project
+from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
@@ -53,7 +53,7 @@ def visible(lens: Lens, boards: tuple[BoardPose, ...], camera: Pose) -> tuple[Ar
     uv, seen = [], []
     for board in boards:
         points = board.true_corners()
-        image = project(lens, camera.into_body(points))
+        image = project_corrected(lens, camera.into_body(points))
         front = board.pose.into_body(camera.position[None])[0, 2] < 0
         inside = (image.uv > -0.5).all(axis=-1) & (
             image.uv < np.array([lens.width, lens.height]) - 0.5
@@ -168,7 +168,7 @@ def _facing(sight: Array, rng: np.random.Generator) -> Array:
 
 
 def _contains(lens: Lens, points: Array, printed: Print) -> bool:
-    image = project(lens, points)
+    image = project_corrected(lens, points)
     if not image.valid.all():
         return False
     uv = image.uv

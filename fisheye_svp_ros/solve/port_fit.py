@@ -16,7 +16,7 @@ from fisheye_svp_ros.optics.ports import MEDIA, FlatGlass
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.outliers import Outliers, find_outliers
-from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, rms_px
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
 PORT_PLACE = ('port_distance', 'port_tilt_x', 'port_tilt_y')
 MEDIUM_INDEX, THICKNESS = 'port_medium_index', 'port_thickness'
@@ -70,7 +70,7 @@ def fit_port(
     there = is_glass(freed.lens.parameters[THICKNESS])
     if there and gain > np.log(2 * len(data.observations)):
         state, names = freed, (*names, THICKNESS)
-    if rms_px(Linearization(data, state, ())) > LOST_PX:
+    if Linearization(data, state, ()).rms_px > LOST_PX:
         return None
     return data, outliers, state, names
 

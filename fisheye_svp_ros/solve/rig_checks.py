@@ -19,7 +19,6 @@ from fisheye_svp_ros.solve.rig_state import (
     RigState,
     RigViews,
     free_parameters,
-    rms_px,
     with_effect,
 )
 
@@ -57,7 +56,7 @@ def rig_differs(test: RigViews, state: RigState) -> bool:
         return False
     alone = unpair_cameras(test)
     together, own = (
-        rms_px(Linearization(data, localize_frames(data, state), ())) for data in (test, alone)
+        Linearization(data, localize_frames(data, state), ()).rms_px for data in (test, alone)
     )
     return together > MAX_RIG_RATIO * own
 
@@ -91,7 +90,7 @@ def rig_is_inconsistent(
 
     def misfits(free: Sequence[str], together: RigState) -> tuple[float, float]:
         posed = adjust(alone, initial_state(alone, lenses[0], lenses[1:]), free)
-        return rms_px(Linearization(data, together, ())), rms_px(Linearization(alone, posed, ()))
+        return Linearization(data, together, ()).rms_px, Linearization(alone, posed, ()).rms_px
 
     whole, own = misfits(free, base)
     if whole < MAX_RIG_RATIO * own:
@@ -109,4 +108,4 @@ def rig_is_inconsistent(
         except Untestable:
             continue
         base = with_effect(base, effect, np.zeros(len(effect.parameters)))
-    return rms_px(Linearization(data, adjust(data, base, every), ())) > _EXPLAINED_RATIO * own
+    return Linearization(data, adjust(data, base, every), ()).rms_px > _EXPLAINED_RATIO * own

@@ -253,6 +253,16 @@ class Linearization:
         return float((self.residual**2).sum())
 
     @property
+    def rms_px(self) -> float:
+        """Root mean square of the 2-D norm of the residuals, px."""
+        return self.rms_px_of(self.residual)
+
+    def rms_px_of(self, whitened: Array) -> float:
+        """Return the root mean square of the 2-D norm, px, of whitened residuals (F, M)."""
+        used = self.row_mask
+        return float(np.sqrt(2 * np.mean((whitened[used] / self.row_weight[used]) ** 2)))
+
+    @property
     def residual_px(self) -> Array:
         """Residuals (S, N, 2), px, measured minus predicted, NaN for padding."""
         views = self.data.views
@@ -359,13 +369,3 @@ def transfer_values(term: ModelTerm, new: Effect) -> Array:
     """Return start values of a form of an effect from another form's, by parameter name."""
     known = dict(zip((p.name for p in term.effect.parameters), term.values, strict=True))
     return np.array([known.get(parameter.name, 0.0) for parameter in new.parameters])
-
-
-def rms_px(linear: Linearization, whitened: Array | None = None) -> float:
-    """Return the root mean square of the 2-D norm, px, of whitened residuals (F, M).
-
-    Without any: of those of the fit itself.
-    """
-    weight, used = linear.row_weight, linear.row_mask
-    rows = linear.residual if whitened is None else whitened
-    return float(np.sqrt(2 * np.mean((rows[used] / weight[used]) ** 2)))

@@ -8,14 +8,14 @@ import pytest
 from benchmark.studies.averaging import Outcome, report
 from benchmark.studies.boards import draw_lens, draw_set, image_points
 from benchmark.study import ray_error
-from fisheye_svp_ros.effects.forward import project
+from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.optics.curves import Gennery
 
 
 def test_points_are_imaged_as_by_the_package() -> None:
     lens = draw_lens(np.random.default_rng(5)).with_shift(Gennery(0.0, 0.004, 0.001))
     points = np.random.default_rng(6).normal([0.0, 0.0, 0.25], 0.1, (50, 3))
-    theirs = project(lens, points)
+    theirs = project_corrected(lens, points)
     uv, _ = image_points(lens, points)
     assert uv[theirs.valid] == pytest.approx(theirs.uv[theirs.valid], abs=1e-6)
 

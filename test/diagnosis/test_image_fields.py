@@ -12,7 +12,7 @@ from helpers.water import AIR, photographs
 
 from fisheye_svp_ros.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.diagnosis.written_lens import MIN_GAIN
-from fisheye_svp_ros.effects.forward import back_project, project
+from fisheye_svp_ros.effects.forward import back_project_corrected, project_corrected
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
@@ -69,16 +69,16 @@ def true_directions(uv: np.ndarray, length: float) -> np.ndarray:
     ideal = uv
     for _ in range(30):
         ideal = uv - warp(ideal, 0.3, length)
-    return back_project(AIR, ideal).direction
+    return back_project_corrected(AIR, ideal).direction
 
 
 def errors_px(lens: object, directions: np.ndarray, uv: np.ndarray) -> float:
     """Return the rms, px, of image points of far points, a turn of the camera taken out."""
-    off = project(lens, 1e3 * directions).uv - uv
+    off = project_corrected(lens, 1e3 * directions).uv - uv
     turns = np.stack(
         [
-            project(lens, 1e3 * (directions + 1e-6 * np.cross(axis, directions))).uv
-            - project(lens, 1e3 * directions).uv
+            project_corrected(lens, 1e3 * (directions + 1e-6 * np.cross(axis, directions))).uv
+            - project_corrected(lens, 1e3 * directions).uv
             for axis in np.eye(3)
         ],
         axis=-1,

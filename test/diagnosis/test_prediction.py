@@ -10,7 +10,7 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.mixed_model import project_out
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame, rms_px, with_effect
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame, with_effect
 
 FREE = ('fx', 'fy', 'cx', 'cy')
 
@@ -27,7 +27,7 @@ def test_without_a_cause_the_rest_is_fitted_anew_however_large_it_is(size):
     without = fit_without_causes(null, ['decentering'], FREE)
     assert not without.terms
     best = adjust(data, initial_state(data, lens()), FREE)
-    rms = [rms_px(Linearization(data, one, ())) for one in (adjust_poses(data, without), best)]
+    rms = [Linearization(data, one, ()).rms_px for one in (adjust_poses(data, without), best)]
     assert rms[0] == pytest.approx(rms[1], rel=1e-3)
 
 

@@ -36,7 +36,7 @@ from fisheye_svp_ros.solve.initial_rig import initial_state, localize_frames
 from fisheye_svp_ros.solve.measured_poses import posable_observations
 from fisheye_svp_ros.solve.outliers import FRAME, find_outliers
 from fisheye_svp_ros.solve.rig_checks import rig_is_inconsistent
-from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame, rms_px
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 from fisheye_svp_ros.study.trust import known_errors
 
 pytestmark = pytest.mark.usefixtures('undrawn')
@@ -330,12 +330,12 @@ def test_lenses_before_predict_held_out_frames_with_their_own_rig(longer):
     found = diagnose(train, longer.lenses, held_out=test, options=DiagnosisOptions(quick=True))
     data = found.evaluation.held_out.data
     posed = Linearization(data, localize_frames(data, found.evaluation.simulation.state), ())
-    assert found.figures.base.heldout_rms_px == pytest.approx(rms_px(posed), rel=1e-3)
+    assert found.figures.base.heldout_rms_px == pytest.approx(posed.rms_px, rel=1e-3)
     trained, (left, right) = found.evaluation.simulation.data, longer.lenses.values()
     written = adjust(trained, initial_state(trained, left, [right]), ())
     posed = Linearization(data, localize_frames(data, written), ())
-    assert found.evaluation.as_given_px == pytest.approx(rms_px(posed), rel=1e-3)
-    said = f'held-out error {rms_px(posed):.3g} px as given, with intrinsics refitted '
+    assert found.evaluation.as_given_px == pytest.approx(posed.rms_px, rel=1e-3)
+    said = f'held-out error {posed.rms_px:.3g} px as given, with intrinsics refitted '
     assert said in first_screen(found, 'table').facts
 
 

@@ -9,7 +9,6 @@ from fisheye_svp_ros.diagnosis import DiagnosisOptions
 from fisheye_svp_ros.diagnosis.problem import Inputs, Problem
 from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
 from fisheye_svp_ros.effects.terms import ModelTerm
-from fisheye_svp_ros.solve.rig_state import rms_px
 
 SIGMA = 0.2
 
@@ -48,4 +47,4 @@ def test_points_that_no_place_explains_are_rejected_by_the_name_of_their_landmar
     problem = prepared(replace(table, uv=uv))
     assert [landmark.number for landmark in problem.outliers.landmarks] == [5]
     assert set(mine) == set(problem.outliers.rows)
-    assert rms_px(problem.linear) < 2 * SIGMA
+    assert problem.linear.rms_px < 2 * SIGMA

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fisheye_svp_ros.effects.forward import project
+from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.pose import rotation_from_vector
 from fisheye_svp_ros.scene.observations import make_observations
 from helpers.water import AIR
@@ -26,7 +26,9 @@ def photographs(seed, sag, bend=0.0, frames=16, noise=0.05):
         turn = rotation_from_vector(rng.normal(size=3) * [0.5, 0.5, 0.3])
         off = (bend + sag * turn[1, 2]) * middle  # gravity is along y
         bent = board + np.outer(off, [0.0, 0.0, 1.0])
-        image = project(AIR, bent @ turn.T + np.exp(rng.uniform(-0.7, 0.4)) * np.array(way))
+        image = project_corrected(
+            AIR, bent @ turn.T + np.exp(rng.uniform(-0.7, 0.4)) * np.array(way)
+        )
         seen = np.flatnonzero(
             image.valid
             & (image.uv > 0).all(axis=1)

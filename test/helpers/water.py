@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fisheye_svp_ros.effects.forward import ForwardModel, project
+from fisheye_svp_ros.effects.forward import ForwardModel, project_corrected
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.optics.ports import Port
@@ -50,7 +50,7 @@ def photographs(
             [np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)]
         )
         pose = Pose(rotation_from_vector(rng.normal(size=3) * [0.4, 0.4, 1.0]), place).inverse()
-        if project(wet, pose.into_body(board)).valid.mean() > 0.7:
+        if project_corrected(wet, pose.into_body(board)).valid.mean() > 0.7:
             poses.append(pose)
     landmarks = Landmarks(np.arange(len(board)), board)
     return simulate(ForwardModel(wet), landmarks, Pose.stack(poses), noise, rng)

@@ -13,7 +13,7 @@ import pytest
 from helpers.data import DATA
 
 from fisheye_svp_ros import cli
-from fisheye_svp_ros.effects.forward import project
+from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, read_lens_file, save_lens
 from fisheye_svp_ros.io.rig_files import load_rig
@@ -93,7 +93,7 @@ def rays(limit: float) -> np.ndarray:
 def off(lens: Lens, points: np.ndarray, uv: np.ndarray) -> float:
     """Return the largest deviation, px, of image points in the image."""
     inside = ((uv > -0.5) & (uv < [lens.width - 0.5, lens.height - 0.5])).all(axis=1)
-    seen = project(lens, points)
+    seen = project_corrected(lens, points)
     inside &= seen.valid
     assert inside.sum() > 100
     return float(np.abs(seen.uv - uv)[inside].max())
@@ -107,7 +107,7 @@ def test_every_camera_of_colmap_as_colmap_projects_it(
     assert worst < 0.6
     exact = ('FISHEYE' in model and 'PRISM' not in model) or 'PINHOLE' in model
     assert (worst == 0) == exact
-    assert np.abs(project(lens, SEEN).uv + 0.5 - uv).max() < 1.05 * worst + 3e-4
+    assert np.abs(project_corrected(lens, SEEN).uv + 0.5 - uv).max() < 1.05 * worst + 3e-4
 
 
 def test_the_cameras_of_a_file_of_colmap(tmp_path: Path) -> None:
@@ -454,8 +454,8 @@ def test_the_skew_of_a_camera_matrix_is_kept(
             == 0
         )
         assert 'left out' not in capsys.readouterr().out
-        assert project(load_lens(tmp_path / form), points).uv == pytest.approx(
-            project(lens, points).uv, abs=1e-6, nan_ok=True
+        assert project_corrected(load_lens(tmp_path / form), points).uv == pytest.approx(
+            project_corrected(lens, points).uv, abs=1e-6, nan_ok=True
         )
     assert (
         cli.main(
@@ -612,7 +612,7 @@ def test_the_rational_model_is_read_alike_from_every_tool(form: str, tmp_path: P
     assert worst == pytest.approx(1.78, abs=0.05)
     matrix = np.array([[300, 0, 320], [0, 310, 240], [0, 0, 1.0]])
     right = cv2.projectPoints(SEEN, np.zeros(3), np.zeros(3), matrix, np.array(_OPENCV8))[0]
-    assert np.abs(project(lens, SEEN).uv - right[:, 0]).max() < worst
+    assert np.abs(project_corrected(lens, SEEN).uv - right[:, 0]).max() < worst
 
 
 @pytest.mark.parametrize('count', [0, 4, 5])
@@ -630,4 +630,4 @@ def test_perspective_models_of_mrcal_are_those_of_opencv(count: int, tmp_path: P
     )
     matrix = np.array([[300, 0, 320], [0, 310, 240], [0, 0, 1.0]])
     right = cv2.projectPoints(SEEN, np.zeros(3), np.zeros(3), matrix, np.array(values))[0]
-    assert np.abs(project(lens, SEEN).uv - right[:, 0]).max() < 1.05 * worst + 1e-6 < 1.5
+    assert np.abs(project_corrected(lens, SEEN).uv - right[:, 0]).max() < 1.05 * worst + 1e-6 < 1.5

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fisheye_svp_ros import cli
-from fisheye_svp_ros.effects.forward import back_project, project
+from fisheye_svp_ros.effects.forward import back_project_corrected, project_corrected
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.lens_formats import write_foreign
@@ -58,7 +58,7 @@ def points_in_image(lens: Lens, count: int = 40) -> tuple[np.ndarray, np.ndarray
         np.meshgrid(np.linspace(5, lens.width - 6, count), np.linspace(5, lens.height - 6, count)),
         axis=-1,
     ).reshape(-1, 2)
-    rays = back_project(lens, uv)
+    rays = back_project_corrected(lens, uv)
     return uv[rays.valid], rays.direction[rays.valid]
 
 
@@ -70,8 +70,8 @@ def test_an_image_field_is_a_splined_model_of_mrcal(tmp_path: Path) -> None:
     back = load_lens(path)
     uv, points = points_in_image(own)
     assert len(uv) > 1000
-    assert np.abs(project(back, points).uv - uv).max() < 0.01
-    assert np.abs(project(replace(own, image_field=None), points).uv - uv).max() > 0.4
+    assert np.abs(project_corrected(back, points).uv - uv).max() < 0.01
+    assert np.abs(project_corrected(replace(own, image_field=None), points).uv - uv).max() > 0.4
     again = tmp_path / 'again.yaml'
     save_lens(back, again)
     assert load_lens(again).image_field == back.image_field
@@ -95,7 +95,7 @@ def test_a_splined_model_as_mrcal_writes_it(tmp_path: Path) -> None:
     path.write_text(text)
     lens = load_lens(path)
     expected = np.array(MRCAL_POINTS)
-    found = project(
+    found = project_corrected(
         lens,
         np.array(
             [

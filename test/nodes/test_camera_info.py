@@ -209,7 +209,7 @@ def test_every_model_as_opencv_projects_it(model: str, d: tuple[float, ...]) -> 
     matrix = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1.0]])
     through = cv2.fisheye.projectPoints if model == 'equidistant' else cv2.projectPoints
     uv, _ = through(rays[:, None], np.zeros(3), np.zeros(3), matrix, np.array(d or [0.0] * 4))
-    seen = forward.project(lens, rays)
+    seen = forward.project_corrected(lens, rays)
     assert seen.valid.sum() > 100
     off = np.abs(seen.uv - uv[:, 0])[seen.valid].max()
     assert off < max(1.05 * worst, 1e-5) and worst <= 0.2
@@ -241,4 +241,4 @@ def test_a_skew_is_taken_over_from_message_and_file(
     )
     wanted = plane[:, 0] @ matrix[:2, :2].T + matrix[:2, 2]
     for lens in (lens_of(*model, 'camera', 'camera_info')[0], load_lens(file)):
-        assert forward.project(lens, rays).uv == pytest.approx(wanted, abs=1e-5)
+        assert forward.project_corrected(lens, rays).uv == pytest.approx(wanted, abs=1e-5)

@@ -15,7 +15,7 @@ from helpers.graph import Graph
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 from geometry_msgs.msg import PoseWithCovarianceStamped  # isort: skip
 
-from fisheye_svp_ros.effects.forward import project
+from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.decoding import read_pose
 from fisheye_svp_ros.io.lens_files import load_lens
@@ -41,7 +41,7 @@ CAMERA = Pose(rotation_from_vector(np.array([0.1, -0.2, 0.3])), np.array([0.05, 
 def corners() -> np.ndarray:
     """Return the corners (T, 4, 2), px, that the camera sees."""
     points = CAMERA.into_body(TAGS.corners.reshape(-1, 3))
-    return np.asarray(project(LENS, points).uv.reshape(-1, 4, 2))
+    return np.asarray(project_corrected(LENS, points).uv.reshape(-1, 4, 2))
 
 
 def apriltags(kinds: Any, stamp: int = 10**9) -> Any:

@@ -9,7 +9,7 @@ import pytest
 from helpers.lenses import HEIGHTS, KITA, SHIFTS, make_lens
 from helpers.photographs import LENS
 
-from fisheye_svp_ros.effects.forward import project
+from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
@@ -24,7 +24,7 @@ def image_error(lens: Lens, svp: Lens, range_m: float) -> float:
     points = range_m * np.stack(
         [np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)], axis=-1
     )
-    off = project(lens, points).uv - project(svp, points).uv
+    off = project_corrected(lens, points).uv - project_corrected(svp, points).uv
     return float(np.sqrt(np.nanmean(np.sum(off**2, axis=-1))))
 
 

@@ -45,7 +45,7 @@ from fisheye_svp_ros.solve.port_fit import (
     is_glass,
     start_port,
 )
-from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, is_shared, rms_px
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, is_shared
 
 _SUSPICIOUS_PX = 1.0  # px: less than this is no third of the image
 _MIN_MAGNIFICATION = 1.1  # than in air: what looks so much larger may be seen through a flat port
@@ -280,7 +280,7 @@ def find_medium(problem: Problem, progress: Progress) -> Medium | None:
     ):
         return None
     air = problem.linear
-    if not (_is_magnified(air, lens, air) if free else rms_px(air) > _SUSPICIOUS_PX):
+    if not (_is_magnified(air, lens, air) if free else air.rms_px > _SUSPICIOUS_PX):
         return None
     progress('testing for another medium in front of the camera', 0.02)
     curve = Linearization(data, fit_free_curve(data, base), ())
@@ -379,7 +379,7 @@ def _leaves_room_for_port(air: Linearization, curve: Linearization) -> bool:
 
     Where the curve explains little of a misfit in air, that is noise or lies elsewhere.
     """
-    rms = rms_px(curve)
+    rms = curve.rms_px
     explains = curve.sum_of_squares < _CURVE_SHARE * air.sum_of_squares
     return rms > LOST_PX or (rms > _SUSPICIOUS_PX and (explains or bool(air.free)))
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.effects.forward import back_project
+from fisheye_svp_ros.effects.forward import back_project_corrected
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -129,7 +129,7 @@ def read_foreign(path: str | Path, text: str) -> Foreign | None:
 def share_beyond_90_deg(lens: Lens) -> float:
     """Return the share of the image, within the field of view, from 90 degrees off the axis on."""
     across, down = (np.linspace(0, side - 1, _GRID) for side in (lens.width, lens.height))
-    rays = back_project(lens, np.stack(np.meshgrid(across, down), axis=-1))
+    rays = back_project_corrected(lens, np.stack(np.meshgrid(across, down), axis=-1))
     beyond = rays.direction[rays.valid][:, 2] <= 0
     return float(beyond.mean()) if len(beyond) else 0.0
 

@@ -14,12 +14,12 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Scene
-from fisheye_svp_ros.effects.forward import project
+from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.effects.image_effects import DecenteringEffect, SensorTiltEffect, SkewEffect
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_formats.fields import MAX_NUMBER
 from fisheye_svp_ros.optics.curve_base import ViewpointShift
-from fisheye_svp_ros.optics.curves import KannalaBrandt, Perspective
+from fisheye_svp_ros.optics.curves import KannalaBrandt, Perspective, fit_kannala_brandt
 from fisheye_svp_ros.optics.lens import Lens, field_of_view
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.observations import views_of
@@ -236,7 +236,7 @@ def _fit_corrections(
     if any(map(any, distortion.prism)):
         # A thin prism is both: (r^2, 0) = (3 x^2 + y^2, 2 x y) - 2 (x^2, x y).
         effects.append(SensorTiltEffect())
-    ideal = project(lens, points).uv
+    ideal = project_corrected(lens, points).uv
     scene = Scene(views_of(points[None], uv[None]), lens, identity(1), ideal[None])
     columns = np.concatenate([effect.columns(scene) for effect in effects], axis=-1)[0]
     found = np.linalg.lstsq(columns.reshape(len(points) * 2, -1), (uv - ideal).ravel(), rcond=None)
@@ -247,7 +247,7 @@ def _fit_corrections(
             effect.name: effect.to_dict(part) for effect, part in zip(effects, parts, strict=True)
         },
     )
-    return lens, float(np.abs(project(lens, points).uv - uv).max())
+    return lens, float(np.abs(project_corrected(lens, points).uv - uv).max())
 
 
 def kannala_brandt(
@@ -316,16 +316,16 @@ def fit_curve(
     # Denser to the end, so that the worst deviation is near the least that there can be
     theta = theta[inside][-1] * np.sin(np.linspace(0.0, np.pi / 2, _GRID)[1:])
     heights = curve(theta)
-    powers = theta[:, None] ** np.arange(1, 10, 2)
-    scale, *rest = np.linalg.lstsq(powers, heights, rcond=None)[0].tolist()
+    scale, fitted = fit_kannala_brandt(theta, heights)
     if not scale > 0:
         raise LensError(f'{where}: no fisheye curve fits the projection')
-    worst = float(np.abs(powers @ [scale, *rest] - heights).max() * max(fx, fy))
+    off = scale * fitted.value_and_slope(theta)[0] - heights
+    worst = float(np.abs(off).max() * max(fx, fy))
     lens = kannala_brandt(
         name,
         size,
         (scale * fx, scale * fy, cx, cy),
-        [value / scale for value in rest],
+        fitted.coefficients,
         where,
         shift,
     )

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.forward import back_project
+from fisheye_svp_ros.effects.forward import back_project_corrected
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_formats import Foreign, models
 from fisheye_svp_ros.optics.curves import Gennery, Stereographic
@@ -237,7 +237,7 @@ def _fit_nodes(lens: Lens, columns: int) -> tuple[str, ImageField, float]:
         np.meshgrid(np.linspace(0, lens.width - 1, count), np.linspace(0, lens.height - 1, count)),
         axis=-1,
     ).reshape(-1, 2)
-    rays = back_project(lens, uv)
+    rays = back_project_corrected(lens, uv)
     uv, way = uv[rays.valid], rays.direction[rays.valid]
     # tan(theta / 2) = sin / (1 + cos)
     plane = 2 * way[:, :2] / (1 + way[:, 2:])
