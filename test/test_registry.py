@@ -110,7 +110,7 @@ from fisheye_svp_ros.simulate.simulation import simulate
 
 engines.use(sys.argv[1])
 lens = fsvp.load_lens('lens.yaml')
-assert 'trefoil' in CATALOGUE and len(CATALOGUE) == 24
+assert list(CATALOGUE)[-1] == 'trefoil'
 fsvp.save_lens(lens, 'again.yaml')
 assert replace(fsvp.load_lens('again.yaml'), name=lens.name) == lens
 points = fsvp.back_project(lens, fsvp.project(lens, np.array([[0.3, 0.2, 0.5]])).uv)

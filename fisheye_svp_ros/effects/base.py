@@ -137,6 +137,7 @@ class Effect(ABC):
     target_map: ClassVar[str] = ''
     when_untestable: ClassVar[str] = ''  # what to do where frames differ and it cannot be tested
     meaning: ClassVar[str] = ''  # what it is, as a sentence
+    headline: ClassVar[str] = ''  # the same, shorter, without a stop; '' for the meaning
     signature: ClassVar[str]
     to_separate: ClassVar[str]
 

@@ -16,6 +16,7 @@ class FocalLengthEffect(PlaneEffect):
     """A relative change of the focal length."""
 
     name = 'focal_length'
+    headline = 'The focal length is wrong'
     meaning = 'The focal length differs from the one assumed.'
     signature = 'residuals along the radius in proportion to the image height'
     to_separate = 'landmarks over the whole field of view; a calibration of this very camera'
@@ -38,6 +39,7 @@ class PrincipalPointEffect(Effect):
     """A shift of the whole image."""
 
     name = 'principal_point'
+    headline = 'The principal point is wrong'
     meaning = 'The principal point differs from the one assumed.'
     stage = 'image'
     signature = 'residuals with a constant part that no rotation of the camera absorbs'
@@ -57,6 +59,7 @@ class AspectEffect(PlaneEffect):
     """A relative difference between fx and fy, their mean kept."""
 
     name = 'aspect'
+    headline = 'The aspect of the pixels is wrong'
     meaning = 'The pixels are not square.'
     signature = 'residuals outward along one image axis and inward along the other'
     to_separate = 'views turned about the axis by 45 and 90 degrees'
@@ -79,6 +82,7 @@ class SkewEffect(PlaneEffect):
     """A shear: u grows with v."""
 
     name = 'skew'
+    headline = 'The image axes are not at right angles'
     meaning = 'The pixel axes are not square to each other.'
     signature = (
         'residuals like a shear of the image: outward along one diagonal, inward along the other'
@@ -98,6 +102,7 @@ class DecenteringEffect(PlaneEffect):
     """Brown and Conrady p1, p2, in image points over the focal length."""
 
     name = 'decentering'
+    headline = 'The lens is decentered'
     meaning = 'Lens elements are not centered on one axis.'
     signature = (
         'residuals that grow with the square of the image height, strongest along one diameter'
@@ -119,6 +124,7 @@ class SensorTiltEffect(PlaneEffect):
     """Tilts about the image axes; first order, with the focal length as the image distance."""
 
     name = 'sensor_tilt'
+    headline = 'The sensor is tilted'
     meaning = 'The sensor is not square to the optical axis.'
     signature = (
         'residuals along the radius, outward on one side of the image and inward on the other'

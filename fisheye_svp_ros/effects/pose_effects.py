@@ -16,6 +16,7 @@ class RollingShutterEffect(Effect):
     """The read-out time from the first row to the last; motion from neighbours without a pause."""
 
     name = 'rolling_shutter'
+    headline = 'Rows are exposed one after the other'
     meaning = 'The rows of the image are exposed one after the other while the camera moves.'
     stage = 'pose'
     of_motion = True
@@ -73,6 +74,7 @@ class RigFlexEffect(Effect):
     frames: tuple[int, ...] = field(default=(), metadata={'key': False})
 
     name = 'rig_flex'
+    headline = 'The rig bends'
     meaning = 'The rig bends: the pose of its second camera changes.'
     stage = 'pose'
     of_recording = True

@@ -27,6 +27,7 @@ class ViewpointShiftEffect(Effect):
     order: int = 1
 
     name = 'viewpoint_shift'
+    headline = 'The viewpoint of the lens shifts with the angle'
     meaning = 'The viewpoint moves along the axis with the incidence angle.'
     stage = 'ray'
     signature = 'residuals along the radius that grow with the angle and with 1 / range'
@@ -68,6 +69,7 @@ class RadialProfileEffect(Effect):
     first: int = field(default=1, metadata={'key': False})
 
     name = 'radial_profile'
+    headline = 'The image-height curve of the lens is wrong'
     meaning = 'The image-height curve differs from the one assumed.'
     stage = 'ray'
     signature = 'residuals along the radius that depend on the angle alone, not on the range'
@@ -160,6 +162,7 @@ class FlatPortEffect(Effect):
     refractive_index: float = 1.5
 
     name = 'flat_port'
+    headline = 'The camera looks through a port'
     meaning = 'The lens looks through a plane window, with air or another medium behind it.'
     stage = 'ray'
     rarer_than = 'viewpoint_shift'
@@ -200,6 +203,7 @@ class DomePortEffect(PlaneEffect):
     glass_index: float = 1.5
 
     name = 'dome_port'
+    headline = 'The camera is beside the center of its dome'
     meaning = 'The lens looks through a dome, away from its center.'
     signature = (
         'residuals that grow with the square of the angle, strongest along one diameter, at all '

@@ -40,6 +40,7 @@ class FocalDriftEffect(PlaneEffect):
     means: tuple[float, ...] = field(default=(), metadata={'key': False})
 
     name = 'focal_drift'
+    headline = 'The focal length drifts'
     meaning = 'The focal length drifts smoothly with time (temperature).'
     of_recording = True
     of_frames = True
@@ -89,6 +90,7 @@ class SessionStepEffect(Effect):
     means: tuple[float, ...] = field(default=(), metadata={'key': False})
 
     name = 'session_step'
+    headline = 'The intrinsics jump between groups of frames'
     meaning = 'The intrinsics jump between two groups of frames (a knock, a refocus).'
     stage = 'image'
     # A step after the first few frames is hardly more than intrinsics that are wrong throughout.

@@ -29,6 +29,7 @@ class LandmarkSurveyEffect(Effect):
     everywhere: bool = False
 
     name = 'landmark_survey'
+    headline = 'Single landmarks are displaced'
     meaning = 'Single landmarks are displaced.'
     stage = 'target'
     target_map = 'single'
@@ -96,6 +97,7 @@ class LandmarkScaleEffect(Effect):
     plane: tuple[float, ...] = field(default=(), metadata={'key': False})
 
     name = 'landmark_scale'
+    headline = 'The scale of the target is wrong'
     meaning = 'The target is larger or smaller than stated, or stretched.'
     stage = 'target'
     signature = (
@@ -212,6 +214,7 @@ class BoardPoseEffect(Effect):
     boards: tuple[tuple[float, ...], ...] = field(default=(), metadata={'key': False})
 
     name = 'board_pose'
+    headline = 'The relative poses of the boards are wrong'
     meaning = 'The relative poses of the boards of one target are wrong.'
     stage = 'target'
     signature = (

@@ -76,25 +76,6 @@ PHOTOGRAPHS = {
 }
 _INADEQUATE_PHOTOGRAPHS = {'more': 'Take more', 'retake': 'Do not use them together'}
 NO_CONFIRMED_ERROR = 'no model error is confirmed in these data'
-_HEADLINES = {
-    'viewpoint_shift': 'The viewpoint of the lens shifts with the angle',
-    'radial_profile': 'The image-height curve of the lens is wrong',
-    'focal_length': 'The focal length is wrong',
-    'principal_point': 'The principal point is wrong',
-    'aspect': 'The aspect of the pixels is wrong',
-    'skew': 'The image axes are not at right angles',
-    'decentering': 'The lens is decentered',
-    'sensor_tilt': 'The sensor is tilted',
-    'flat_port': 'The camera looks through a port',
-    'dome_port': 'The camera is beside the center of its dome',
-    'focal_drift': 'The focal length drifts',
-    'session_step': 'The intrinsics jump between groups of frames',
-    'landmark_survey': 'Single landmarks are displaced',
-    'landmark_scale': 'The scale of the target is wrong',
-    'board_pose': 'The relative poses of the boards are wrong',
-    'rolling_shutter': 'Rows are exposed one after the other',
-    'rig_flex': 'The rig bends',
-}
 
 
 class Photo(NamedTuple):
@@ -454,7 +435,7 @@ def _statement(d: Diagnosis, cause: Cause) -> str:
         several = len(np.unique(d.problem.observations.board)) > 1
         which = f'Board {worst.board}' if several else 'The board'
         return f'{which} is bent by {1e3 * worst.peak_to_valley:.2g} mm'
-    words = _HEADLINES.get(cause.effect, _capital(describe_effect(cause.effect)))
+    words = cause.effect_class.headline or _capital(describe_effect(cause.effect))
     if cause.effect == 'landmark_scale' and 'relative' not in cause.parameters:
         words = 'The target is stretched'
     # Of several parameters, the most significant one.

@@ -66,16 +66,16 @@ def forms(name, scene_):
 
 
 def test_catalogue_holds_the_names_of_the_design():
-    assert set(CATALOGUE) == DESIGN_NAMES
+    assert set(CATALOGUE) >= DESIGN_NAMES  # files and commands have them
 
 
-@pytest.mark.parametrize('name', sorted(DESIGN_NAMES))
+@pytest.mark.parametrize('name', sorted(CATALOGUE))
 def test_words_say_what_to_look_for_and_what_to_do(name):
     kind = CATALOGUE[name]
     assert kind.signature and kind.to_separate
 
 
-@pytest.mark.parametrize('name', sorted(DESIGN_NAMES))
+@pytest.mark.parametrize('name', sorted(CATALOGUE))
 def test_columns_are_the_derivatives_of_the_prediction(name, linearised):
     model, pose, views, linear, scene_ = linearised
     for effect in forms(name, scene_):
@@ -98,7 +98,7 @@ def test_columns_are_the_derivatives_of_the_prediction(name, linearised):
             )
 
 
-@pytest.mark.parametrize('name', sorted(DESIGN_NAMES))
+@pytest.mark.parametrize('name', sorted(CATALOGUE))
 def test_lens_file_keeps_effects(name, linearised, tmp_path):
     model, pose, views, _, scene_ = linearised
     rng = np.random.default_rng(1)
@@ -140,7 +140,7 @@ def test_a_stretch_of_an_older_lens_file_is_read():
     assert effect.axes == 2 and not effect.plane and values.tolist() == [0.01]
 
 
-@pytest.mark.parametrize('name', sorted(DESIGN_NAMES))
+@pytest.mark.parametrize('name', sorted(CATALOGUE))
 def test_no_views_are_no_trouble(name, linearised):
     model, pose, views, _, scene_ = linearised
     for effect in forms(name, scene_):
