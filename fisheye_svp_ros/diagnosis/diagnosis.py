@@ -20,7 +20,6 @@ from fisheye_svp_ros.diagnosis.evaluation import (
     Figures,
 )
 from fisheye_svp_ros.diagnosis.findings import Finding
-from fisheye_svp_ros.diagnosis.problem import Problem
 from fisheye_svp_ros.diagnosis.variance_budget import REPEATED_COMPONENT, Component, Structure
 from fisheye_svp_ros.effects.target_map import BoardMap, board_maps
 from fisheye_svp_ros.optics.lens import Lens
@@ -42,7 +41,6 @@ class Diagnosis(Conclusion):
     says; hand_eye: where the camera sits on the robot whose poses were given.
     """
 
-    problem: Problem
     evaluation: Evaluation
     figures: Figures
     noise_px: float
@@ -103,7 +101,7 @@ class Diagnosis(Conclusion):
     @property
     def observations(self) -> int:
         """How many observations there are."""
-        return len(self.problem.observations)
+        return len(self.evaluation.problem.observations)
 
     @property
     def lens(self) -> Lens:

@@ -270,7 +270,6 @@ def _conclude(
         lenses[name] = lens if field is None else field.add_to(lens, camera)
     return Diagnosis(
         **vars(conclusion),
-        problem=problem,
         evaluation=evaluation,
         figures=evaluation.figures,
         noise_px=evaluation.noise_px,

@@ -136,7 +136,9 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         'reached_deg': degrees(d.adequacy.reached),
         'photographs': [
             {'frame': frame, 'camera': camera, 'name': name}
-            for (frame, camera), name in photograph_names(d.problem.observations).items()
+            for (frame, camera), name in photograph_names(
+                d.evaluation.problem.observations
+            ).items()
         ],
         'gross': d.gross,
         'advice': [_advice(one) for one in d.advice],

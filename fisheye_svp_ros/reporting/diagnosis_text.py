@@ -138,20 +138,20 @@ def verdict_sentences(
 
 def frame_ranges(d: Diagnosis, ranges: Sequence[tuple[int, int]]) -> str:
     """Return what the first and the last frames of ranges are called; '' for none."""
-    table = d.problem.observations
+    table = d.evaluation.problem.observations
     return join_names([' to '.join(frame_name(table, one) for one in ends) for ends in ranges])
 
 
 def count_frames(d: Diagnosis) -> str:
     """Return how many frames there are; of cameras that no rig holds together, how many views."""
-    numbers, plural = d.problem.observations.frame, 's' * (d.frames > 1)
+    numbers, plural = d.evaluation.problem.observations.frame, 's' * (d.frames > 1)
     if is_unpaired(d.evaluation.fixed_model.data):
         frames = len({*numbers.tolist()})
         return (
             f'{d.frames} view{plural} of {frames} frame{"s" * (frames > 1)} (each view with '
             'its own pose)'
         )
-    pictures = d.problem.observations.photographs and len(d.lenses) == 1
+    pictures = d.evaluation.problem.observations.photographs and len(d.lenses) == 1
     return f'{d.frames} {"photograph" if pictures else "frame"}{plural}'
 
 
@@ -251,7 +251,7 @@ def _name(d: Diagnosis, cause: Cause) -> str:
 
 def is_assumed(d: Diagnosis, cause: Cause) -> bool:
     """Say whether a cause was not tested, since the user said that it is there."""
-    return cause.effect in d.problem.options.included
+    return cause.effect in d.evaluation.problem.options.included
 
 
 def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
@@ -312,7 +312,7 @@ def _poor_prediction(d: Diagnosis, times: float) -> str:
         return f'{times:.1f} times the noise: landmarks are displaced'
     if d.decision['photographs'].say == 'enough':
         return f'{times:.1f} times the noise'
-    how = '; --next N lists the photographs to take' if d.problem.plannable else ''
+    how = '; --next N lists the photographs to take' if d.evaluation.problem.plannable else ''
     return f'{times:.1f} times the noise: these frames constrain the lens poorly{how}'
 
 

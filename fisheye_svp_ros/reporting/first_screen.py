@@ -193,7 +193,7 @@ def _facts(d: Diagnosis, source: str) -> str:
     )
     rays, near = d.ray_error_mrad(), ''
     if rays and d.offers_extended:
-        asked = d.problem.options.range_m or 1.0
+        asked = d.evaluation.problem.options.range_m or 1.0
         before, after = (
             next(one['value'] for one in rays[side] if one['range_m'] == asked)
             for side in ('given', 'extended')
@@ -293,7 +293,7 @@ def _bound_text(decision: Decision) -> str:
 
 
 def _paths(d: Diagnosis) -> dict[str, str]:
-    table = d.problem.observations
+    table = d.evaluation.problem.observations
     by = {(frame, camera): path for frame, camera, path in table.photographs}
     return {name: by[key] for key, name in photograph_names(table).items()}
 
@@ -432,7 +432,7 @@ def _sentence(d: Diagnosis, cause: Cause) -> str:
 def _statement(d: Diagnosis, cause: Cause) -> str:
     if cause.effect == 'target_shape':
         worst = max(d.board_maps((cause.effect,)), key=lambda one: one.peak_to_valley)
-        several = len(np.unique(d.problem.observations.board)) > 1
+        several = len(np.unique(d.evaluation.problem.observations.board)) > 1
         which = f'Board {worst.board}' if several else 'The board'
         return f'{which} is bent by {1e3 * worst.peak_to_valley:.2g} mm'
     words = cause.effect_class.headline or _capital(describe_effect(cause.effect))

@@ -38,7 +38,11 @@ def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
         files['observations'],
         [shlex.join(['--lens', lens]) for lens in inputs.lens],
     )
-    if d.decision['lens'].say == 'undecided' and d.problem.plannable and not inputs.planned:
+    if (
+        d.decision['lens'].say == 'undecided'
+        and d.evaluation.problem.plannable
+        and not inputs.planned
+    ):
         words = [
             'fisheye-svp diagnose',
             observations,

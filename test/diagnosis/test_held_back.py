@@ -13,8 +13,8 @@ from fisheye_svp_ros.diagnosis.findings import Reason
 @pytest.mark.parametrize('reason', [Reason.IMPLAUSIBLE, Reason.NO_GAIN])
 def test_no_frame_is_renumbered_beside_an_implausible_shift(reason, monkeypatch):
     asked = []
-    problem = SimpleNamespace(inputs=SimpleNamespace(observations=None))
-    evaluation = SimpleNamespace(selection=SimpleNamespace(problem=problem), null=0, fitted=0)
+    problem = SimpleNamespace(observations=None)
+    evaluation = SimpleNamespace(problem=problem, null=0, fitted=0)
     evaluated = SimpleNamespace(
         evaluation=evaluation,
         candidates=[SimpleNamespace(reason=reason)],
@@ -26,8 +26,7 @@ def test_no_frame_is_renumbered_beside_an_implausible_shift(reason, monkeypatch)
     monkeypatch.setattr(stages, 'replace', lambda one, **_: one)
     monkeypatch.setattr(stages, 'turn_advice', lambda _: [])
     monkeypatch.setattr(stages, 'find_turned_frames', lambda *_: asked.append(1) or [])
-    record = SimpleNamespace(_replace=lambda **_: None)
-    monkeypatch.setattr(stages, '_conclude', lambda *_: SimpleNamespace(advice=[], record=record))
+    monkeypatch.setattr(stages, '_conclude', lambda *_: SimpleNamespace(advice=[]))
     stages._run_stages(SimpleNamespace(poses=None), lambda *_: None)
     assert bool(asked) == (reason is not Reason.IMPLAUSIBLE)
 

@@ -86,7 +86,7 @@ def test_a_lens_of_the_same_table_is_not_to_be_calibrated_again():
 
     def is_same(source, frames=frames, rms_px=0.2):
         evaluation = SimpleNamespace(
-            selection=SimpleNamespace(problem=SimpleNamespace(observations=table)),
+            problem=SimpleNamespace(observations=table),
             figures=SimpleNamespace(base=SimpleNamespace(rms_px=0.2)),
         )
         block = {'source': source, 'frames': frames, 'rms_px': rms_px}

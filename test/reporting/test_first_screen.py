@@ -279,7 +279,7 @@ def test_the_command_to_go_on_solves_the_same_problem(found: Diagnosis) -> None:
         decision=lens_open,
         lenses={'': None},
         offers_extended=False,
-        problem=SimpleNamespace(plannable=True),
+        evaluation=SimpleNamespace(problem=SimpleNamespace(plannable=True)),
         is_lens_off=False,
         adequacy=SimpleNamespace(is_misfit=False),
     )
@@ -294,7 +294,7 @@ def test_the_command_to_go_on_solves_the_same_problem(found: Diagnosis) -> None:
 
 def test_no_plan_is_promised_that_the_target_does_not_allow(found: Diagnosis) -> None:
     """The command that the report printed ended with "the target is not one flat board"."""
-    assert not found.problem.plannable
+    assert not found.evaluation.problem.plannable
     inputs = ReportInputs('a.csv', ('l.yaml',), None, None, Path('out'), True)
     assert '--next' not in command_to_go_on(_deciding(found, 'lens', say='undecided'), inputs)
 
