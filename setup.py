@@ -47,6 +47,7 @@ setup(
         'setuptools',
         'numpy>=1.26',
         'scipy>=1.11',
+        'pandas>=2.1',
         'PyYAML>=6.0',
         'matplotlib>=3.6',
         'rich>=13.0',

@@ -23,6 +23,7 @@ from fisheye_svp_ros import __version__
 ROSDEP = {
     'numpy': 'python3-numpy',
     'scipy': 'python3-scipy',
+    'pandas': 'python3-pandas',
     'PyYAML': 'python3-yaml',
     'matplotlib': 'python3-matplotlib',
     'rich': 'python3-rich',

@@ -16,7 +16,7 @@ from fisheye_svp_ros.commands.processes import Processes, missing_rclpy
 from fisheye_svp_ros.commands.record import TOPICS
 from fisheye_svp_ros.errors import OutputError
 from fisheye_svp_ros.io.bags import Bag
-from fisheye_svp_ros.io.columns import write_columns
+from fisheye_svp_ros.io.columns import write_table
 from fisheye_svp_ros.io.files import write_json, write_text, write_together
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.recording import (
@@ -90,18 +90,18 @@ def run(args: argparse.Namespace) -> None:
         print(
             f'  ROS 2 is missing ({reason}): the same scenarios run in one process, without nodes.'
         )
-        columns, fields = compute_demo(lenses, radii)
+        table, fields = compute_demo(lenses, radii)
     else:
         with progress('running the nodes'):
             record(bag, args.output / 'logs', lenses, radii)
-        columns = tabulate(Bag(bag).records(is_tabulated))
+        table = tabulate(Bag(bag).records(is_tabulated))
         fields = residual_fields(Bag(bag).records(has_residuals))
-    rows = demo_rows(columns, lenses, radii)
+    rows = demo_rows(table, lenses, radii)
     with progress('rectifying a pair'):
         pair, images = rectified_pair(load_lens(lens_path(lenses[0])))
         apart = rows_left(pair)
     with write_together():
-        write_columns(args.output / 'table', columns)
+        write_table(args.output / 'table', table)
         write_json(
             args.output / 'demo.json',
             {

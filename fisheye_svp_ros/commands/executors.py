@@ -1,28 +1,29 @@
-"""Who works on a sweep: this process, local processes, or an existing Dask cluster."""
+"""Who works on a sweep: processes of this machine, or an existing Dask cluster."""
 
 from __future__ import annotations
 
 import logging
 import multiprocessing
 import os
-import pickle
 import signal
-import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
+    FIRST_COMPLETED,
     BrokenExecutor,
     CancelledError,
     Executor,
     Future,
     ProcessPoolExecutor,
+    wait,
 )
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 from fisheye_svp_ros.errors import SweepError
-from fisheye_svp_ros.study.sweep import InProcess
+
+T = TypeVar('T')
+R = TypeVar('R')
 
 _TASKS_PER_WORKER = 3  # tasks under way for each worker: none waits for the next
 _PATIENCE = 10  # s for a scheduler to answer, and for its first worker
@@ -35,62 +36,48 @@ class Workers(NamedTuple):
     ahead: int
 
 
+def completed(
+    work: Callable[[T], R], tasks: Iterable[T], workers: Workers
+) -> Iterator[tuple[T, R]]:
+    """Yield tasks and what work makes of them, as they are done; few are under way at once."""
+    under_way: dict[Future[R], T] = {}
+
+    def finished() -> Iterator[tuple[T, R]]:
+        for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+            yield under_way.pop(future), future.result()
+
+    for task in tasks:
+        under_way[workers.executor.submit(work, task)] = task
+        if len(under_way) >= workers.ahead:
+            yield from finished()
+    while under_way:
+        yield from finished()
+
+
 @contextmanager
 def process_pool(count: int) -> Iterator[Workers]:
-    """Yield processes here, 0: this one itself; raise SweepError when one of them dies."""
-    if not count:
-        yield Workers(InProcess(), 1)
-        return
-    with tempfile.TemporaryDirectory(prefix='fisheye_svp_') as folder:
-        executor = _Processes(count, folder)
-        try:
-            yield Workers(executor, _TASKS_PER_WORKER * count)
-        except BrokenExecutor as cause:
-            raise SweepError(
-                'a worker process died (out of memory?); finished parts are kept; '
-                'continue with --resume and fewer --workers'
-            ) from cause
-        except (KeyboardInterrupt, SystemExit):
-            # Nobody waits any longer for what they are at.
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
-        finally:
-            executor.shutdown(cancel_futures=True)
+    """Yield processes here; raise SweepError when one of them dies.
 
-
-class _Processes(ProcessPoolExecutor):
-    """Processes whose results come in files of a folder.
-
-    All write to one pipe.  One that is killed in the middle of a long result would leave this
-    program waiting for the rest of it; the name of a file is written at once or not at all.
+    Their results share one pipe: a long one of a process that is killed meanwhile would leave
+    this program waiting for its rest, so what a task makes should go to a file of its own.
     """
-
-    def __init__(self, count: int, folder: str) -> None:
-        super().__init__(count, multiprocessing.get_context('spawn'), initializer=_end_with_parent)
-        self._folder = folder
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Return the future result of a function."""
-        result: Future[Any] = Future()
-
-        def pass_on(written: Future[Path]) -> None:
-            try:
-                path = written.result()
-                value = pickle.loads(path.read_bytes())
-                path.unlink()
-                result.set_result(value)
-            except Exception as error:
-                result.set_exception(error)
-
-        super().submit(_written, self._folder, fn, *args, **kwargs).add_done_callback(pass_on)
-        return result
-
-
-def _written(folder: str, fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Path:
-    with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
-        pickle.dump(fn(*args, **kwargs), file)
-    return Path(file.name)
+    executor = ProcessPoolExecutor(
+        count, multiprocessing.get_context('spawn'), initializer=_end_with_parent
+    )
+    try:
+        yield Workers(executor, _TASKS_PER_WORKER * count)
+    except BrokenExecutor as cause:
+        raise SweepError(
+            'a worker process died (out of memory?); finished parts are kept; '
+            'continue with --resume and fewer --workers'
+        ) from cause
+    except (KeyboardInterrupt, SystemExit, GeneratorExit):
+        # Nobody waits any longer for what they are at.
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)
 
 
 @contextmanager

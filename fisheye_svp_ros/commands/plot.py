@@ -10,7 +10,7 @@ from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.errors import OutputError
 from fisheye_svp_ros.io.bags import Bag
-from fisheye_svp_ros.io.columns import read_columns
+from fisheye_svp_ros.io.columns import read_table
 from fisheye_svp_ros.io.files import write_together
 from fisheye_svp_ros.io.recording import (
     NAMESPACE,
@@ -47,13 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Draw what the source is good for."""
-    from fisheye_svp_ros.reporting.sweep_plots import draw_table
+    from fisheye_svp_ros.reporting.sweep_plots import draw_table, is_drawn
 
     table = _table_in(args.source)
     with write_together():
         if table:
             with progress('drawing'):
-                files = draw_table(read_columns(table), args.output)
+                files = draw_table(read_table(table, is_drawn), args.output)
         else:
             files = _of_bag(args)
     if not files:
@@ -77,21 +77,14 @@ def _of_bag(args: argparse.Namespace) -> list[Path]:
 
     bag = Bag(args.source)
     with progress('reading', 2 * bag.size) as passed:
-        columns = tabulate(bag.records(is_tabulated, passed))
+        table = tabulate(bag.records(is_tabulated, passed))
         found = residual_sets(bag.records(has_residuals, passed))
     if bag.damage:
         say(f'{args.source}: {bag.damage}')
     with progress('drawing'):
         # Rows of the namespace with most of them: others have other metrics.
-        names = columns[NAMESPACE]
-        most = max(set(names), key=names.count, default=None)
-        files = draw_table(
-            {
-                name: [cell for cell, of in zip(cells, names, strict=True) if of == most]
-                for name, cells in columns.items()
-            },
-            args.output,
-        )
+        most = table[NAMESPACE].mode()[:1]
+        files = draw_table(table[table[NAMESPACE].isin(most)], args.output)
         if found:
             files.append(args.output / 'residuals.png')
             draw_residuals(

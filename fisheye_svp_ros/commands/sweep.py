@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import shutil
-from collections.abc import Mapping
+from collections.abc import Generator, Sequence
+from contextlib import closing
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.commands.executors import dask, process_pool
+from fisheye_svp_ros.commands.executors import completed, dask, process_pool
 from fisheye_svp_ros.commands.node_sweeps import read_sweep
 from fisheye_svp_ros.commands.notes import counted, note_formats, say
 from fisheye_svp_ros.commands.outputs import output_folder
@@ -25,7 +27,18 @@ from fisheye_svp_ros.io.share import sweep_path
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.reporting.terminal import print_table, progress
 from fisheye_svp_ros.study.solutions import summarise
-from fisheye_svp_ros.study.sweep import Plan, column_types, fingerprint, solve_sweep, tasks, work
+from fisheye_svp_ros.study.sweep import (
+    Plan,
+    column_types,
+    fingerprint,
+    solve_rows,
+    tasks,
+    work,
+    write_rows,
+)
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _MAX_SCENARIOS = 1_000_000  # scenarios; more are rather a slip in the file than meant
 _PARTS, _SUMMARY = 'parts', 'sweep.json'
@@ -130,21 +143,44 @@ def _solve(args: argparse.Namespace, plan: Plan, parts: TableParts, engine: str)
     if count < len(plan.sweep):
         say(f'{len(plan.sweep) - count} of {len(plan.sweep)} scenarios are already done')
     with (
-        dask(args.dask) if args.dask else process_pool(args.workers) as workers,
         progress('sweeping', count) as advance,
+        closing(_written(args, plan, remaining, parts, engine)) as written,
     ):
-        for numbers, columns in solve_sweep(plan, remaining, engine, *workers):
-            parts.write(numbers.start, columns)
+        for numbers in written:
             advance(len(numbers))
+
+
+def _written(
+    args: argparse.Namespace,
+    plan: Plan,
+    remaining: Sequence[range],
+    parts: TableParts,
+    engine: str,
+) -> Generator[range]:
+    """Yield tasks as their parts are written: by whoever solves them, but on a cluster."""
+    write = partial(write_rows, parts, engine, plan)
+    if args.dask:
+        with dask(args.dask) as workers:
+            for numbers, rows in completed(partial(solve_rows, engine, plan), remaining, workers):
+                parts.write(numbers.start, rows)
+                yield numbers
+    elif args.workers:
+        with process_pool(args.workers) as workers:
+            for numbers, _ in completed(write, remaining, workers):
+                yield numbers
+    else:
+        for numbers in remaining:
+            write(numbers)
+            yield numbers
 
 
 def _metrics(plan: Plan) -> list[str]:
     return [name for name, kind in column_types(plan).items() if kind is float and '.' in name]
 
 
-def _report(path: Path, folder: Path, plan: Plan, mine: str, metrics: Mapping[str, Array]) -> None:
+def _report(path: Path, folder: Path, plan: Plan, mine: str, metrics: DataFrame) -> None:
     """Print and write what came out, metric by metric."""
-    found = {name: summarise(values) for name, values in metrics.items()}
+    found = {name: summarise(metrics[name].to_numpy()) for name in metrics}
     count = len(plan.sweep)
     print_table(
         f'{path}: {counted(count, "scenario")}',

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fisheye_svp_ros.commands.notes import note_formats, say
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.bags import Bag
-from fisheye_svp_ros.io.columns import write_columns
+from fisheye_svp_ros.io.columns import plain_columns, write_table
 from fisheye_svp_ros.io.files import write_json, write_together
-from fisheye_svp_ros.io.recording import STAMP, Columns, is_tabulated, tabulate
+from fisheye_svp_ros.io.recording import STAMP, is_tabulated, tabulate
 from fisheye_svp_ros.reporting.terminal import console, print_table, progress
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 Cells = dict[str, list[str]]  # by column
 _MAX_ROWS = 40  # rows for people
@@ -37,8 +40,8 @@ def run(args: argparse.Namespace) -> None:
     """Join the error topics by stamp, print what varies, write all of it."""
     bag = Bag(args.bag)
     with progress('reading', bag.size) as passed:
-        columns = tabulate(bag.records(is_tabulated, passed))
-    rows = len(columns[STAMP])
+        table = tabulate(bag.records(is_tabulated, passed))
+    rows = len(table)
     if bag.damage:
         say(f'{args.bag}: {bag.damage}')
     if not rows:
@@ -46,34 +49,35 @@ def run(args: argparse.Namespace) -> None:
             f'{args.bag}: it holds neither scenarios nor results; record them with '
             '`fisheye-svp record` or `ros2 bag record`'
         )
-    _print(args.bag, columns)
+    _print(args.bag, table)
     if args.output:
         with write_together():
-            write_columns(args.output / 'table', columns)
+            write_table(args.output / 'table', table)
             write_json(
                 args.output / 'table.json',
                 {
                     'bag': str(args.bag),
                     'rows': rows,
-                    'columns': list(columns),
+                    'columns': list(table),
                     'damage': bag.damage,
                 },
             )
         note_formats()
 
 
-def _print(bag: str, columns: Columns) -> None:
+def _print(bag: str, table: DataFrame) -> None:
     """Print the columns that differ from row to row; the others once, above the table."""
-    varying = [name for name, cells in columns.items() if len(set(cells)) > 1] or list(columns)
+    varying = [name for name in table if table[name].nunique(dropna=False) > 1] or list(table)
+    columns = plain_columns(table.head(_MAX_ROWS))
     for name in columns:
         if name not in varying:
             print(f'  {name}: {_cell(columns[name][0])}')
-    rows = len(columns[STAMP])
+    rows = len(table)
     print(f'{bag}: {rows} rows' + (f', the first {_MAX_ROWS}' if rows > _MAX_ROWS else ''))
     tags, metrics = dict[str, list[str]](), dict[str, list[str]]()
     for name in varying:
         to = metrics if '.' in name else tags
-        to[name] = [_cell(value) for value in columns[name][:_MAX_ROWS]]
+        to[name] = [_cell(value) for value in columns[name]]
     if len(tags) > 1:
         tags.pop(STAMP, None)  # the scenario says it more readably
     for block in _blocks(tags, metrics):

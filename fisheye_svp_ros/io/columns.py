@@ -1,35 +1,32 @@
-"""Tables for scripts: columns as CSV, and as Parquet where pyarrow is there; whole or in parts."""
+"""Tables for scripts: pandas frames as CSV, and as Parquet where pyarrow is; whole or in parts.
+
+An empty cell is a missing value.  pandas is imported where a table is made: that takes longer
+than most commands need to start.
+"""
 
 from __future__ import annotations
 
-import csv
-import json
-import re
-import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from importlib import import_module
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.errors import ObservationError, OutputError
-from fisheye_svp_ros.io.csv_files import CsvTable
-from fisheye_svp_ros.io.files import read_bytes, read_json, replacing, write_text
+from fisheye_svp_ros.errors import OutputError
+from fisheye_svp_ros.io.files import open_bytes, read_bytes, replacing
+
+if TYPE_CHECKING:
+    from pandas import DataFrame, Series
 
 _ROWS = 1 << 16  # of a row group
 _MOST_CELLS = 100_000_000
 _MIN_PYARROW = 15  # of pyarrow: from there on pages have checksums
-_MAX_INTEGER = 2**63 - 1  # whole number of a Parquet table
-_NAMES = b'fisheye_svp_ros: CRC of the names'  # the foot of a Parquet file has no checksum
-
-_INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
-_NUMBER = re.compile(r'[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|nan|inf)', re.IGNORECASE)
-
-Columns = Mapping[str, Sequence[Any]]
+_KINDS: Mapping[type, Any] = {int: np.int64, float: np.float64, str: object}
+_EXACT_BY_DEFAULT = (3, 1)  # pandas, from where on numbers read back to the same bits
 
 
 @cache
@@ -45,13 +42,44 @@ def arrow() -> tuple[Any, str]:
     return pyarrow, ''
 
 
-def write_columns(path: Path, columns: Columns) -> list[Path]:
-    """Write columns of equal length to `path`.csv and `path`.parquet; None is an empty cell.
+def make_table(columns: Mapping[str, Sequence[Any]]) -> DataFrame:
+    """Return columns of plain values, None where nothing is known, as a table."""
+    from pandas import DataFrame
+
+    return DataFrame({name: _series(cells) for name, cells in columns.items()})
+
+
+def _series(cells: Sequence[Any]) -> Series:
+    """Return cells as whole numbers, as numbers, or as what they are."""
+    from pandas import Series
+
+    kinds = {type(cell) for cell in cells} - {type(None)}
+    if kinds == {int} and all(abs(cell or 0) < 2**63 for cell in cells):
+        return Series(cells, dtype='Int64' if None in cells else np.int64)
+    return Series(cells, dtype=np.float64 if kinds and kinds <= {int, float} else object)
+
+
+def plain_columns(table: DataFrame) -> dict[str, list[Any]]:
+    """Return the columns of a table as lists of plain values, None where nothing is known."""
+    return {
+        str(name): [
+            None if missing else cell
+            for cell, missing in zip(column.tolist(), column.isna(), strict=True)
+        ]
+        for name, column in table.items()
+    }
+
+
+def write_table(path: Path, table: DataFrame) -> list[Path]:
+    """Write a table to `path`.csv and `path`.parquet.
 
     Numbers in the CSV read back to the same bits; there is no Parquet file where `arrow` says so.
     Returns the files; raises OutputError where one cannot be written.
     """
-    return _write(path, list(columns), None, [columns])
+    with _writing(path) as (text, write_parquet, files):
+        _to_csv(table, text)
+        write_parquet(table)
+    return files
 
 
 class TableParts:
@@ -66,161 +94,143 @@ class TableParts:
 
     def numbers(self) -> set[int]:
         """Return which parts are there."""
-        return {int(path.stem) for path in self.folder.glob('[0-9]*.json')}
+        return {int(path.stem) for path in self.folder.glob('[0-9]*.csv')}
 
-    def write(self, number: int, columns: Columns) -> None:
+    def write(self, number: int, table: DataFrame) -> None:
         """Write a part; raise OutputError where that is impossible."""
-        write_text(
-            self._path(number),
-            json.dumps(
-                {name: list(columns[name]) for name in self._types}, default=np.generic.item
-            ),
-        )
+        with replacing(self._path(number)) as path, path.open('wb') as stream:
+            _to_csv(table, stream)
 
-    def join(self, path: Path, numbers: Sequence[str] = ()) -> dict[str, Array]:
-        """Write all parts in order as `write_columns` does; return some columns, NaN = empty.
+    def join(self, path: Path, names: Sequence[str] = ()) -> DataFrame:
+        """Write all parts in order as `write_table` does; return the columns of some names.
 
-        No more than one part is held, and those columns (N,).  Raises OutputError for a bad part.
+        No more than one part is held, and those columns.  Raises OutputError for a bad part.
         """
-        kept: dict[str, list[Array]] = {name: [] for name in numbers}
+        from pandas import DataFrame, concat
 
-        def parts() -> Iterator[Columns]:
+        kept = [DataFrame({name: np.empty(0) for name in names})]
+        with _writing(path) as (text, write_parquet, _):
             for number in sorted(self.numbers()):
-                part = self._read(number)
-                for name, found in kept.items():
-                    found.append(np.array(part[name], dtype=float))
-                yield part
+                data = read_bytes(self._path(number), OutputError)
+                part = self._parse(number, data)
+                text.write(data[data.index(b'\n') + 1 :] if text.tell() else data)
+                write_parquet(part)
+                kept.append(part[[*names]])
+        return concat(kept[1:] or kept, ignore_index=True)
 
-        _write(path, list(self._types), self._types, parts())
-        return {name: np.concatenate([*found, np.empty(0)]) for name, found in kept.items()}
-
-    def _read(self, number: int) -> Columns:
-        path = self._path(number)
+    def _parse(self, number: int, data: bytes) -> DataFrame:
+        kinds = {name: _KINDS[kind] for name, kind in self._types.items()}
         try:
-            part: dict[str, list[Any]] = read_json(path, OutputError)
-            if {*part} != {*self._types} or len({*map(len, part.values())}) != 1:
-                raise ValueError('its columns differ')
-            for name, kind in self._types.items():
-                if not all(type(cell) in (kind, type(None)) for cell in part[name]):
-                    raise ValueError(f'{name} holds other values than {kind.__name__}')
-                if kind is int and any(abs(cell or 0) > _MAX_INTEGER for cell in part[name]):
-                    raise ValueError(f'{name} holds a number above {_MAX_INTEGER}')
-        except (OutputError, ValueError, TypeError) as cause:
+            part = _read_csv(BytesIO(data), dtype=kinds)
+            if [*part] != [*kinds] or not data.endswith(b'\n'):
+                raise ValueError('it is cut off, or its columns differ')
+        except Exception as cause:  # whatever pandas makes of what is damaged
             raise OutputError(
-                f'{path}: a part of the table is damaged ({cause}); remove it and compute it again'
+                f'{self._path(number)}: a part of the table is damaged ({_brief(cause)}); remove '
+                'it and compute it again'
             ) from cause
         return part
 
     def _path(self, number: int) -> Path:
-        return self.folder / f'{number:09}.json'
+        return self.folder / f'{number:09}.csv'
 
 
-def _checksum(names: Sequence[str]) -> bytes:
-    return b'%08x' % zlib.crc32('\0'.join(names).encode())
-
-
-def read_columns(path: Path) -> dict[str, list[Any]]:
-    """Return the columns of a CSV or Parquet table, None = empty cell; raise OutputError."""
-    if path.suffix == '.csv':
-        try:
-            return {name: parse_cells(cells) for name, cells in CsvTable(path, ()).items()}
-        except ObservationError as cause:
-            raise OutputError(str(cause)) from cause
+def read_table(path: Path, wanted: Callable[[str], bool] = lambda _: True) -> DataFrame:
+    """Return the wanted columns of a CSV or Parquet table; raise OutputError."""
     pyarrow, problem = arrow()
-    if pyarrow is None:
+    if path.suffix != '.csv' and pyarrow is None:
         raise OutputError(f'{path}: {problem}; give the .csv file next to it')
-    data = read_bytes(path, OutputError)
-    try:
-        file = pyarrow.parquet.ParquetFile(
-            pyarrow.BufferReader(data), page_checksum_verification=True
-        )
-        about, names = file.metadata, file.schema_arrow.names
-        if about.num_rows * about.num_columns > _MOST_CELLS:
-            raise ValueError(f'more than {_MOST_CELLS} cells')
-        if (about.metadata or {}).get(_NAMES, _checksum(names)) != _checksum(names):
-            raise ValueError('the names of its columns are not those that were written')
-        columns = {name: _to_python(pyarrow, file.read([name]).column(name)) for name in names}
-        rows = sum(about.row_group(i).num_rows for i in range(about.num_row_groups))
-        if {about.num_rows, rows, *map(len, columns.values())} != {rows}:
-            raise ValueError('its columns differ in length from what was written')
-        return columns
-    except Exception as cause:  # whatever pyarrow makes of what is damaged
-        raise OutputError(f'{path}: not a table ({cause or type(cause).__name__})') from cause
+    with open_bytes(path, OutputError) as stream:
+        try:
+            if path.suffix == '.csv':
+                return _read_csv(stream, usecols=wanted, low_memory=False)
+            return _read_parquet(pyarrow, stream, wanted)
+        except Exception as cause:  # whatever pandas or pyarrow makes of what is damaged
+            raise OutputError(f'{path}: not a table ({_brief(cause)})') from cause
 
 
-def _to_python(pyarrow: Any, column: Any) -> list[Any]:
-    """Return a column of numbers or text; None is an empty cell."""
-    kinds = pyarrow.types
-    if not any(
-        test(column.type)
-        for test in (
-            kinds.is_integer,
-            kinds.is_floating,
-            kinds.is_string,
-            kinds.is_large_string,
-            kinds.is_boolean,
-            kinds.is_null,
-        )
-    ):
-        raise ValueError(f'a column of {column.type}; numbers and text are read')
-    cells: list[Any] = column.to_pylist()
-    return cells
+def _read_csv(stream: IO[bytes], **options: Any) -> DataFrame:
+    """Read numbers to the same bits; a text is what it says, be it "NA"."""
+    import pandas
+
+    if tuple(map(int, pandas.__version__.split('.')[:2])) < _EXACT_BY_DEFAULT:
+        options['float_precision'] = 'round_trip'
+    return pandas.read_csv(stream, keep_default_na=False, na_values=[''], **options)
 
 
-def parse_cells(cells: Sequence[str | None]) -> list[Any]:
-    """Return whole numbers or numbers where every cell is one or empty; the text otherwise."""
-    for kind, form in ((int, _INTEGER), (float, _NUMBER)):
-        if all(not cell or form.fullmatch(cell) for cell in cells):
-            return [kind(cell) if cell else None for cell in cells]
-    return list(cells)
+def _brief(cause: Exception) -> str:
+    return (str(cause) or type(cause).__name__).splitlines()[0]
 
 
-def _write(
-    path: Path, names: Sequence[str], types: Mapping[str, type] | None, parts: Iterable[Columns]
-) -> list[Path]:
+def _read_parquet(pyarrow: Any, stream: IO[bytes], wanted: Callable[[str], bool]) -> DataFrame:
+    file = pyarrow.parquet.ParquetFile(stream, page_checksum_verification=True)
+    about, schema = file.metadata, file.schema_arrow
+    if about.num_rows * about.num_columns > _MOST_CELLS:
+        raise ValueError(f'more than {_MOST_CELLS} cells')
+    for field in schema:
+        if pyarrow.types.is_nested(field.type) or pyarrow.types.is_binary(field.type):
+            raise ValueError(f'a column of {field.type}; numbers and text are read')
+    table = file.read([name for name in schema.names if wanted(name)])
+    if {table.num_rows, sum(about.row_group(i).num_rows for i in range(about.num_row_groups))} != {
+        about.num_rows
+    }:
+        raise ValueError('its columns differ in length from what was written')
+    return table.to_pandas()
+
+
+def _to_csv(table: DataFrame, stream: IO[bytes]) -> None:
+    table.to_csv(stream, index=False, lineterminator='\n')
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[tuple[IO[bytes], Callable[[DataFrame], None], list[Path]]]:
+    """Yield the stream of a CSV, what takes tables for the Parquet file, and both files."""
     files = [path.with_name(f'{path.name}.csv'), path.with_name(f'{path.name}.parquet')]
     pyarrow, _ = arrow()
     with ExitStack() as stack:
-        text = stack.enter_context(replacing(files[0]))
-        stream = stack.enter_context(text.open('w', encoding='utf-8', newline=''))
-        lines = csv.writer(stream, lineterminator='\n')
-        lines.writerow(names)
-        parts = _to_csv(lines, names, parts)
+        stream = stack.enter_context(stack.enter_context(replacing(files[0])).open('wb'))
         if pyarrow is None:
-            for _ in parts:
-                pass
-            return files[:1]
-        _to_parquet(pyarrow, stack.enter_context(replacing(files[1])), types, parts)
-    return files
+            yield stream, lambda _: None, files[:1]
+        else:
+            target = stack.enter_context(replacing(files[1]))
+            yield stream, stack.enter_context(_parquet(pyarrow, target)), files
 
 
-def _to_csv(lines: Any, names: Sequence[str], parts: Iterable[Columns]) -> Iterator[Columns]:
-    """Write parts as they pass."""
-    for part in parts:
-        lines.writerows(zip(*(part[name] for name in names), strict=True))
-        yield part
-
-
-def _to_parquet(
-    pyarrow: Any, path: Path, types: Mapping[str, type] | None, parts: Iterable[Columns]
-) -> None:
+@contextmanager
+def _parquet(pyarrow: Any, path: Path) -> Iterator[Callable[[DataFrame], None]]:
     """Write row groups of a fixed size, so that a table does not show how it was made."""
-    kinds = {int: pyarrow.int64(), float: pyarrow.float64(), str: pyarrow.string()}
-    schema = pyarrow.schema([(n, kinds[t]) for n, t in types.items()]) if types else None
     pending: list[Any] = []
     writer = None
-    for part in parts:
-        pending.append(pyarrow.table(dict(part), schema=schema))
+
+    def add(table: DataFrame) -> None:
+        nonlocal pending, writer
+        schema = pending[0].schema if pending else None
+        pending.append(_arrow_table(pyarrow, table, schema))
         if writer is None:
-            names = pending[0].schema.names
-            schema = pending[0].schema.with_metadata({_NAMES: _checksum(names)})
-            writer = pyarrow.parquet.ParquetWriter(path, schema, write_page_checksum=True)
+            writer = pyarrow.parquet.ParquetWriter(
+                path, pending[0].schema, write_page_checksum=True
+            )
         if sum(map(len, pending)) >= _ROWS:
-            table = pyarrow.concat_tables(pending)
-            whole = len(table) // _ROWS * _ROWS
-            writer.write_table(table.slice(0, whole), row_group_size=_ROWS)
-            pending = [table.slice(whole)]
-    writer = writer or pyarrow.parquet.ParquetWriter(path, schema)
-    with writer:
-        if pending:
+            joined = pyarrow.concat_tables(pending)
+            whole = len(joined) // _ROWS * _ROWS
+            writer.write_table(joined.slice(0, whole), row_group_size=_ROWS)
+            pending = [joined.slice(whole)]
+
+    yield add
+    if writer is not None:
+        with writer:
             writer.write_table(pyarrow.concat_tables(pending))
+
+
+def _arrow_table(pyarrow: Any, table: DataFrame, schema: Any) -> Any:
+    """Return a table of numbers and text: text also where no cell of a column has any."""
+    if schema is None:
+        fields = pyarrow.Schema.from_pandas(table, preserve_index=False)
+        kinds = (pyarrow.string() if _is_text(pyarrow, one.type) else one.type for one in fields)
+        schema = pyarrow.schema(zip(fields.names, kinds, strict=True))
+    found = pyarrow.Table.from_pandas(table, schema, preserve_index=False)
+    return found.replace_schema_metadata(None)
+
+
+def _is_text(pyarrow: Any, kind: Any) -> bool:
+    return bool(pyarrow.types.is_null(kind) or pyarrow.types.is_large_string(kind))

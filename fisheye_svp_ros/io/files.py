@@ -20,7 +20,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import IO, Any, ClassVar
 
 import numpy as np
 import yaml
@@ -42,21 +42,27 @@ _BaseDumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 _INT, _FLOAT, _TIMESTAMP = (f'tag:yaml.org,2002:{kind}' for kind in ('int', 'float', 'timestamp'))
 
 
-def read_bytes(path: str | Path, error: type[FisheyeSvpError], most: int = MAX_BYTES) -> bytes:
-    """Return what a regular file holds; raise `error` for any other, and above `most` bytes."""
+@contextmanager
+def open_bytes(path: str | Path, error: type[FisheyeSvpError]) -> Iterator[IO[bytes]]:
+    """Yield the stream of a regular file; raise `error` for any other."""
     try:
         # Unlike Path.open, this does not wait for whoever writes into a pipe.
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), 'rb') as stream:
-            found = os.fstat(stream.fileno())
-            if not stat.S_ISREG(found.st_mode):
+            if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
                 raise error(f'{path}: it must be a regular file')
-            size, data = found.st_size, bytearray()
-            while size <= most and (piece := stream.read(_BLOCK_BYTES)):
-                data += piece
-                size = max(size, len(data))
+            yield stream
     except (OSError, ValueError) as cause:
         reason = getattr(cause, 'strerror', None) or cause
         raise error(f'{path}: cannot be read ({reason}); check the path') from cause
+
+
+def read_bytes(path: str | Path, error: type[FisheyeSvpError], most: int = MAX_BYTES) -> bytes:
+    """Return what a regular file holds; raise `error` for any other, and above `most` bytes."""
+    with open_bytes(path, error) as stream:
+        size, data = os.fstat(stream.fileno()).st_size, bytearray()
+        while size <= most and (piece := stream.read(_BLOCK_BYTES)):
+            data += piece
+            size = max(size, len(data))
     if size > most:
         raise error(f'{path}: above {most / (1 << 20):g} MB, the largest size that is read')
     return bytes(data)

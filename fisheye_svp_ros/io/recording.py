@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.bags import Bag
-from fisheye_svp_ros.io.columns import parse_cells
+from fisheye_svp_ros.io.columns import make_table
 from fisheye_svp_ros.io.decoding import (
     ImagePoints,
     Points,
@@ -28,20 +28,26 @@ from fisheye_svp_ros.io.decoding import (
 )
 from fisheye_svp_ros.scene.observations import Landmarks, Observations, make_observations
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
 STAMP = 'stamp_ns'
 NAMESPACE = 'namespace'
 
-Columns = dict[str, list[Any]]
 _CLOUD = 'sensor_msgs/msg/PointCloud2'
 _IMAGES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 _NAMES = ('landmarks', 'image_points')
+_INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
+_DECIMAL = re.compile(
+    r'[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|nan|inf)', re.IGNORECASE
+)
 _FRAME = re.compile(r'^frame \d+ ')
 _NUMBER = re.compile(r'\d[\d.]*(e[-+]?\d+)?(?<!\.)')
 _LIST = re.compile(r'# \(# px\)(, # \(# px\))*|#(, #)+(, \.\.\.)?')
 
 
 class ResidualSet(NamedTuple):
-    """Residuals of one localization: clouds.RESIDUALS; tags of its scenario, empty for none."""
+    """Residuals of one localization (RESIDUALS); tags of its scenario, empty for none."""
 
     topic: str
     stamp: int
@@ -55,7 +61,7 @@ def is_tabulated(topic: str, typename: str) -> bool:
     return name in ('scenario', 'result') and typename == 'diagnostic_msgs/msg/DiagnosticArray'
 
 
-def tabulate(records: Iterable[Any]) -> Columns:
+def tabulate(records: Iterable[Any]) -> DataFrame:
     """Join scenarios and results by stamp: columns of equal length, None where nothing is known.
 
     Metrics carry the name of the node, below the namespace of its scenario, before theirs.  Rows
@@ -86,7 +92,7 @@ def tabulate(records: Iterable[Any]) -> Columns:
         prefix = node.removeprefix(f'{base}/')
         row = rows.setdefault((base, stamp), {})
         row.update({f'{prefix}.{key}': value for key, value in values.items()})
-    return _columns(rows)
+    return _join_rows(rows)
 
 
 def note_of_set(reason: str) -> str:
@@ -104,16 +110,24 @@ def _warning(text: str) -> dict[str, str]:
     return {'warning': words, **({'warning_number': number[0]} if number else {})}
 
 
-def _columns(rows: Mapping[tuple[str, int], Mapping[str, str]]) -> Columns:
+def _join_rows(rows: Mapping[tuple[str, int], Mapping[str, str]]) -> DataFrame:
     order = sorted(rows)
     names = dict.fromkeys(name for key in order for name in rows[key])
-    columns: Columns = {
+    columns: dict[str, list[Any]] = {
         NAMESPACE: [base or '/' for base, _ in order],
         STAMP: [stamp for _, stamp in order],
     }
     for name in names:
         columns[name] = parse_cells([rows[key].get(name) for key in order])
-    return columns
+    return make_table(columns)
+
+
+def parse_cells(cells: Sequence[str | None]) -> list[Any]:
+    """Return whole numbers or numbers where every cell is one or empty; the text otherwise."""
+    for kind, form in ((int, _INTEGER), (float, _DECIMAL)):
+        if all(not cell or form.fullmatch(cell) for cell in cells):
+            return [kind(cell) if cell else None for cell in cells]
+    return list(cells)
 
 
 def has_residuals(topic: str, typename: str) -> bool:

@@ -18,6 +18,7 @@ from fisheye_svp_ros.effects import forward
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io import lens_files
+from fisheye_svp_ros.io.columns import plain_columns
 from fisheye_svp_ros.io.csv_files import FramePoses
 from fisheye_svp_ros.io.files import as_read
 from fisheye_svp_ros.io.parameters import SWEEP, rows, with_values
@@ -326,7 +327,7 @@ def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swep
     plan = sweeps.plan_sweep(parameters)
     if idle := sweeps.idle_solvers(plan, nodes):
         raise ParameterError(f'{idle[0]}; choose that, or leave it out')
-    return Swept(sweeps.sweep_rows(plan, range(len(plan.sweep))))
+    return Swept(plain_columns(sweeps.sweep_rows(plan, range(len(plan.sweep)))))
 
 
 @limit_threads

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Self, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Self, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -19,12 +19,15 @@ from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
 _BRIEF = 60  # characters of a value in a repr
 _KIND_KEY = 'result'
 
 
 class Columns(dict[str, list[Any]]):
-    """Rows by column, of plain Python values; pandas.DataFrame and pyarrow.table take it."""
+    """Rows by column, of plain Python values, None where nothing is known."""
 
     def __init__(self, columns: Mapping[str, Any]) -> None:
         super().__init__(
@@ -42,9 +45,15 @@ class Columns(dict[str, list[Any]]):
 
     def save(self, path: str | Path) -> list[Path]:
         """Write PATH.csv and PATH.parquet; return both."""
-        from fisheye_svp_ros.io.columns import write_columns
+        from fisheye_svp_ros.io.columns import write_table
 
-        return write_columns(Path(path), self)
+        return write_table(Path(path), self.to_dataframe())
+
+    def to_dataframe(self) -> DataFrame:
+        """Return the rows as a pandas.DataFrame."""
+        from fisheye_svp_ros.io.columns import make_table
+
+        return make_table(self)
 
     def __str__(self) -> str:
         cells = [

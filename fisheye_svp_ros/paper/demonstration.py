@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import BagError
-from fisheye_svp_ros.io.recording import NAMESPACE, Columns, ResidualSet, residual_sets
+from fisheye_svp_ros.io.columns import plain_columns
+from fisheye_svp_ros.io.recording import NAMESPACE, ResidualSet, residual_sets
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.paper.tables import (
     CALIBRATION,
@@ -32,6 +33,9 @@ from fisheye_svp_ros.simulate.scenario import Scenario, model_of, scalars, simul
 from fisheye_svp_ros.study.settings import LocalizerSettings
 from fisheye_svp_ros.study.solutions import localize_sets, residual_points
 from fisheye_svp_ros.study.sweep import CAMERA, plan_sweep, sweep_rows
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 # Poses of the right camera for depth, x, y, z, qx, qy, qz, qw: one a lens (section 5).
 DEPTH_POSES = [[0.0, 0.0, RIGHT_CAMERA_Z.get(lens, 0.0), 1.0, 0.0, 0.0, 0.0] for lens in LENSES]
@@ -120,25 +124,21 @@ def camera_parameters(task: Task, lenses: Sequence[str], radii: Sequence[float])
 
 def compute_demo(
     lenses: Sequence[str], radii: Sequence[float]
-) -> tuple[Columns, list[ResidualSet]]:
+) -> tuple[DataFrame, list[ResidualSet]]:
     """Return what the recording of the node graph would tell, computed offline: no stamps."""
+    from pandas import concat
+
     parts = []
     for task in TASKS:
         plan = plan_sweep({CAMERA: camera_parameters(task, lenses, radii)})
         plan = plan._replace(solvers={task.node: plan.solvers[task.node]})
-        part = sweep_rows(plan, range(len(plan.sweep)))
-        count = len(part['set'])
-        parts.append((count, {NAMESPACE: [f'/{task.name}'] * count, **part}))
-    names = dict.fromkeys(name for _, part in parts for name in part)
-    columns = {
-        name: [cell for count, part in parts for cell in part.get(name, [None] * count)]
-        for name in names
-    }
+        parts.append(sweep_rows(plan, range(len(plan.sweep))))
+        parts[-1].insert(0, NAMESPACE, f'/{task.name}')
     fields = [
         _residual_field(Scenario(lens=lens, radius=radius))
         for lens, radius in itertools.product(lenses, radii)
     ]
-    return columns, fields
+    return concat(parts, ignore_index=True), fields
 
 
 def _residual_field(scenario: Scenario) -> ResidualSet:
@@ -149,12 +149,13 @@ def _residual_field(scenario: Scenario) -> ResidualSet:
     return ResidualSet('/localization/localizer/residuals', 0, points, tags)
 
 
-def demo_rows(columns: Columns, lenses: Sequence[str], radii: Sequence[float]) -> list[DemoRow]:
+def demo_rows(table: DataFrame, lenses: Sequence[str], radii: Sequence[float]) -> list[DemoRow]:
     """Return the rows of the demo from its table, as `tabulate` or `compute_demo` make it.
 
     Raises BagError where a scenario is missing or is listed twice.
     """
     found: dict[tuple[str, str, float, str], dict[str, Any]] = {}
+    columns = plain_columns(table)
     for cells in zip(*columns.values(), strict=True):
         row = dict(zip(columns, cells, strict=True))
         task = next((t for t in TASKS if row[NAMESPACE] == f'/{t.name}'), None)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.colors import LogNorm
@@ -17,9 +17,8 @@ from fisheye_svp_ros.io.parameters import rows
 from fisheye_svp_ros.io.recording import STAMP
 from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, legend_below, picture
 from fisheye_svp_ros.reporting.wording.metrics import metric_text
-from fisheye_svp_ros.simulate.scenario import Scenario
+from fisheye_svp_ros.simulate.scenario import SCALARS, Scenario
 from fisheye_svp_ros.study.dependence import (
-    SweptTable,
     curves,
     grid,
     is_number,
@@ -28,12 +27,16 @@ from fisheye_svp_ros.study.dependence import (
     value_text,
 )
 from fisheye_svp_ros.study.solutions import DRAWN_METRICS
-from fisheye_svp_ros.study.sweep import SOLVERS
+from fisheye_svp_ros.study.sweep import SCENARIO_COLUMNS, SOLVERS
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _COLOURS = 'viridis'
 _HUES, _LINES = 4, ('-', '--')  # what can be told apart in one picture
 _COLUMNS = 4  # axes beside each other
 _TICKS, _LABELS = 12, 6
+_SPREAD = ('noise_px', 'localizer.rms_px', 'localizer.points')
 _CLOUD = 20_000  # points in a scatter plot
 _UNITS = {row.name: row.unit for row in rows(Scenario)}
 _NAMES = {
@@ -52,7 +55,7 @@ class PlottedMetric(NamedTuple):
     factor: float
 
 
-def _plotted_metrics(table: SweptTable) -> list[PlottedMetric]:
+def _plotted_metrics(table: DataFrame) -> list[PlottedMetric]:
     """Return those of the solvers of a sweep that a table has."""
     return [
         PlottedMetric(
@@ -64,7 +67,17 @@ def _plotted_metrics(table: SweptTable) -> list[PlottedMetric]:
     ]
 
 
-def draw_table(table: SweptTable, folder: Path) -> list[Path]:
+def is_drawn(column: str) -> bool:
+    """Say whether a column is any use to `draw_table`."""
+    metric = column.rpartition('.')[2]
+    return (
+        column in (*SCALARS, *SCENARIO_COLUMNS, STAMP, *_SPREAD)
+        or metric in DRAWN_METRICS
+        or metric == 'views'
+    )
+
+
+def draw_table(table: DataFrame, folder: Path) -> list[Path]:
     """Draw whatever a table is good for; return the files."""
     files = []
     metrics = _plotted_metrics(table)
@@ -74,16 +87,16 @@ def draw_table(table: SweptTable, folder: Path) -> list[Path]:
         files.append(folder / f'error_against_{x}.png')
         _draw_curves(table, metrics, x, [name for name in swept if name != x], files[-1])
     if len(numbers) >= 2 and metrics:
-        y, x = sorted(sorted(numbers, key=lambda n: -len(set(table[n])))[:2], key=numbers.index)
+        y, x = sorted(sorted(numbers, key=lambda n: -table[n].nunique())[:2], key=numbers.index)
         files.append(folder / f'heat_map_{y}_{x}.png')
         others = [name for name in swept if name not in (x, y)]
         _draw_grids(table, metrics, x, y, others, files[-1])
-    if {'localizer.rms_px', 'localizer.points'} <= {*table} and any(table.get('noise_px', ())):
+    if {*_SPREAD} <= {*table} and table['noise_px'].any():
         files.append(folder / 'residuals_and_noise.png')
         others = [name for name in swept if name != 'noise_px']
-        few = [name for name in others if len(set(table[name])) <= 2 * _HUES]
+        few = [name for name in others if table[name].nunique() <= 2 * _HUES]
         _draw_spreads(
-            table, min(few, key=lambda name: len(set(table[name])), default=None), files[-1]
+            table, min(few, key=lambda name: table[name].nunique(), default=None), files[-1]
         )
     return files + draw_runs(table, folder / 'runs.png')
 
@@ -100,12 +113,12 @@ def _axes(path: Path, count: int, width: float, height: float) -> Iterator[Any]:
 
 
 def _draw_curves(
-    table: SweptTable, metrics: Sequence[PlottedMetric], x: str, others: Sequence[str], path: Path
+    table: DataFrame, metrics: Sequence[PlottedMetric], x: str, others: Sequence[str], path: Path
 ) -> None:
     """Draw an error over x: the colour tells one other parameter, the line style a second."""
-    by = sorted(others, key=lambda name: -len(set(table[name])))[-2:]
+    by = sorted(others, key=lambda name: -table[name].nunique())[-2:]
     looks = [
-        _pick_evenly(list(dict.fromkeys(table[name])), most)
+        _pick_evenly(table[name].dropna().unique().tolist(), most)
         for name, most in zip(by, (_HUES, len(_LINES)), strict=False)
     ]
     merged = [name for name in others if name not in by]
@@ -141,7 +154,7 @@ def _draw_curves(
         thinned = [
             f'{len(values)} of {count} values of {name}'
             for name, values in zip(by, looks, strict=True)
-            if len(values) < (count := len(set(table[name])))
+            if len(values) < (count := table[name].nunique())
         ]
         figure.suptitle('; '.join([what, *thinned]), x=0.01, ha='left', fontsize=8)
 
@@ -153,7 +166,7 @@ def _pick_evenly(values: list[Any], most: int) -> list[Any]:
 
 
 def _draw_grids(
-    table: SweptTable,
+    table: DataFrame,
     metrics: Sequence[PlottedMetric],
     x: str,
     y: str,
@@ -180,7 +193,7 @@ def _draw_grids(
         figure.suptitle(f'median of the magnitude{over}', x=0.01, ha='left', fontsize=8)
 
 
-def _draw_spreads(table: SweptTable, by: str | None, path: Path) -> None:
+def _draw_spreads(table: DataFrame, by: str | None, path: Path) -> None:
     spreads = noise_spreads(table, by)
     with _axes(path, len(spreads), 4.0, 2.8) as (figure, axes):
         for axis, spread in zip(axes, spreads, strict=True):
@@ -272,27 +285,27 @@ def _label(name: str) -> str:
     return ', '.join(filter(None, (_NAMES.get(name, name), _UNITS.get(name))))
 
 
-def draw_runs(columns: Mapping[str, Sequence[Any]], path: Path) -> list[Path]:
+def draw_runs(table: DataFrame, path: Path) -> list[Path]:
     """Draw over time the errors that several localizers publish, from a tabulated recording.
 
     Returns the file; none where there are no two localizers to compare.
     """
-    posed = [c.rpartition('.')[0] for c in columns if c.endswith('.axis_error_rad')]
-    localizers = [name for name in posed if f'{name}.views' not in columns]  # no calibrator
+    posed = [c.rpartition('.')[0] for c in table if c.endswith('.axis_error_rad')]
+    localizers = [name for name in posed if f'{name}.views' not in table]  # no calibrator
     runs = {
         name: found
         for name in DRAWN_METRICS
-        if len(found := [c for n in localizers if (c := f'{n}.{name}') in columns]) > 1
+        if len(found := [c for n in localizers if (c := f'{n}.{name}') in table]) > 1
     }
-    if not runs or STAMP not in columns:
+    if not runs or STAMP not in table:
         return []
-    stamp = np.array(columns[STAMP], dtype=float) / 1e9
+    stamp = table[STAMP].to_numpy(float) / 1e9
     with picture(path, 9.2, 0.8 + 2.1 * len(runs)) as figure:
         axes = figure.subplots(len(runs), 1, sharex=True, squeeze=False)[:, 0]
         for axis, (name, nodes) in zip(axes, runs.items(), strict=True):
             text = metric_text(name)
             for node in nodes:
-                values = text.factor * np.array(columns[node], dtype=float)
+                values = text.factor * table[node].to_numpy(float, na_value=np.nan)
                 mean = float(np.nanmean(values))
                 axis.plot(
                     stamp - stamp.min(),

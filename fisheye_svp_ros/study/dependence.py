@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy import special
@@ -11,7 +11,8 @@ from scipy import special
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.simulate.scenario import SCALARS
 
-SweptTable = Mapping[str, Sequence[Any]]
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 _REPEATS = ('seed',)  # differ so that the noise does
 _BAND = (5.0, 95.0)  # percent
@@ -50,21 +51,21 @@ class ResidualRatio(NamedTuple):
     density: Array
 
 
-def swept_parameters(table: SweptTable) -> list[str]:
+def swept_parameters(table: DataFrame) -> list[str]:
     """Return the parameters that differ between rows, but for those that only redraw noise."""
     return [
         name
         for name in SCALARS
-        if name in table and name not in _REPEATS and len(set(table[name])) > 1
+        if name in table and name not in _REPEATS and table[name].nunique() > 1
     ]
 
 
-def is_number(table: SweptTable, name: str) -> bool:
+def is_number(table: DataFrame, name: str) -> bool:
     """Say whether a column holds numbers."""
-    return all(isinstance(value, int | float) for value in table[name])
+    return str(table[name].dtype.kind) in 'iuf'
 
 
-def curves(table: SweptTable, metric: str, x: str, by: Sequence[str]) -> list[Curve]:
+def curves(table: DataFrame, metric: str, x: str, by: Sequence[str]) -> list[Curve]:
     """Return an error over parameter x, a curve a combination of the parameters `by`."""
     values, places = _numbers(table, metric), _slots(table, x)
     groups: dict[tuple[Any, ...], Any] = {(): np.arange(len(values))}
@@ -87,7 +88,7 @@ def curves(table: SweptTable, metric: str, x: str, by: Sequence[str]) -> list[Cu
     return found
 
 
-def grid(table: SweptTable, metric: str, x: str, y: str) -> Grid:
+def grid(table: DataFrame, metric: str, x: str, y: str) -> Grid:
     """Return the median of the magnitude of an error over two parameters."""
     values, columns, lines = np.abs(_numbers(table, metric)), _slots(table, x), _slots(table, y)
     median = np.full((len(lines), len(columns)), np.nan)
@@ -99,7 +100,7 @@ def grid(table: SweptTable, metric: str, x: str, y: str) -> Grid:
     return Grid(list(columns), list(lines), median)
 
 
-def noise_spreads(table: SweptTable, by: str | None) -> list[ResidualRatio]:
+def noise_spreads(table: DataFrame, by: str | None) -> list[ResidualRatio]:
     """Return the residuals of localizations beside what their noise alone would leave.
 
     N image points of noise sigma in u and in v leave, after a pose is fitted to them, a sum of
@@ -132,21 +133,19 @@ def _density_of_chi2(x: Array, freedom: float) -> Array:
     return np.asarray(np.exp(logs))
 
 
-def _numbers(table: SweptTable, name: str) -> Array:
+def _numbers(table: DataFrame, name: str) -> Array:
     """Return a column, NaN = empty; of calibrations only those from all sets of a scenario."""
-    cells = np.array([np.nan if v is None else v for v in table[name]], dtype=float)
+    cells: Array = table[name].to_numpy(float, na_value=np.nan, copy=True)
     if name.startswith('stereo_calibrator.') and {'set', 'sets'} <= {*table}:
-        cells[np.add(table['set'], 1) != table['sets']] = np.nan
+        cells[(table['set'] + 1 != table['sets']).to_numpy(bool)] = np.nan
     return cells
 
 
-def _slots(table: SweptTable, name: str) -> dict[Any, Any]:
+def _slots(table: DataFrame, name: str) -> dict[Any, Any]:
     """Return the rows of each value of a column: numbers ascend, names are as they come."""
-    cells = table[name]
-    values = dict.fromkeys(cells)
-    order = sorted(values) if is_number(table, name) else list(values)
-    column = np.array(cells, dtype=object)
-    return {value: np.flatnonzero(column == value) for value in order}
+    rows = table.groupby(name, sort=False).indices
+    values = table[name].dropna().unique().tolist()
+    return {value: rows[value] for value in (sorted(values) if is_number(table, name) else values)}
 
 
 def value_text(value: Any) -> str:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -14,6 +13,7 @@ from fisheye_svp_ros import __version__
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ParameterError
+from fisheye_svp_ros.io.columns import TableParts
 from fisheye_svp_ros.io.parameters import SWEEP, Sweep, rows, sweep_of, with_values
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.pose import Pose
@@ -51,7 +51,7 @@ from fisheye_svp_ros.study.solutions import (
 )
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.io.recording import Columns
+    from pandas import DataFrame
 
 _SETS_PER_SOLVE = 512  # sets solved at once: more take more memory and no less time
 
@@ -298,58 +298,31 @@ def work(plan: Plan) -> int:
     return len(plan.sweep) * sets * cameras * len(scenario_landmarks(scenario).ids) * _EVALUATIONS
 
 
-def sweep_rows(plan: Plan, numbers: range) -> Columns:
-    """Return the rows of some scenarios, one a set, in their order; None where nothing is known.
+def sweep_rows(plan: Plan, numbers: range) -> DataFrame:
+    """Return the rows of some scenarios, one a set, in their order; NaN where nothing is known.
 
     Raises FisheyeSvpError for a scenario that cannot be simulated.
     """
+    from pandas import concat
+
     scenarios = [_scenario(plan, number) for number in numbers]
     parts = [
-        _columns(plan, scenarios, numbers.start, batch)
+        _rows(plan, scenarios, numbers.start, batch)
         for batch in simulate_batches(scenarios, numbers.start)
     ]
-    whole = {name: [cell for part in parts for cell in part[name]] for name in column_types(plan)}
-    order = np.lexsort((whole['set'], whole['scenario']))
-    return {name: [cells[i] for i in order] for name, cells in whole.items()}
+    whole = concat(parts) if len(parts) > 1 else parts[0]
+    return whole.sort_values(['scenario', 'set'], ignore_index=True)[[*column_types(plan)]]
 
 
-def solve_sweep(
-    plan: Plan, remaining: Iterable[range], engine: str, executor: Executor, ahead: int
-) -> Iterator[tuple[range, Columns]]:
-    """Yield tasks and their rows as they are done; no more than `ahead` are under way at once.
-
-    engine: the one that all rows come from, whoever works on them.
-    """
-    under_way: dict[Future[Columns], range] = {}
-
-    def completed_tasks() -> Iterator[tuple[range, Columns]]:
-        for future in wait(under_way, return_when=FIRST_COMPLETED).done:
-            yield under_way.pop(future), future.result()
-
-    for numbers in remaining:
-        under_way[executor.submit(_rows_of, engine, plan, numbers)] = numbers
-        if len(under_way) >= ahead:
-            yield from completed_tasks()
-    while under_way:
-        yield from completed_tasks()
-
-
-def _rows_of(engine: str, plan: Plan, numbers: range) -> Columns:
+def solve_rows(engine: str, plan: Plan, numbers: range) -> DataFrame:
+    """Return rows as `sweep_rows` does, by the engine that all rows of a sweep come from."""
     engines.use(engine)
     return sweep_rows(plan, numbers)
 
 
-class InProcess(Executor):
-    """An executor that does each task where and when it is submitted."""
-
-    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Return a future that is done."""
-        future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
+def write_rows(parts: TableParts, engine: str, plan: Plan, numbers: range) -> None:
+    """Write rows as a part of the table, in the process that made them."""
+    parts.write(numbers.start, solve_rows(engine, plan, numbers))
 
 
 def fingerprint(plan: Plan) -> str:
@@ -374,22 +347,22 @@ def _scenario(plan: Plan, number: int) -> Scenario:
     return replace(plan.base, **plan.sweep.point(number))
 
 
-def _columns(plan: Plan, scenarios: list[Scenario], first: int, batch: Batch) -> Columns:
-    sets = batch.uv[0].shape[1]
-    columns: Columns = {
-        'scenario': [first + int(row) for row in batch.row for _ in range(sets)],
-        'scenarios': [len(plan.sweep)] * (sets * len(batch.row)),
-        'set': list(range(sets)) * len(batch.row),
-        'sets': [sets] * (sets * len(batch.row)),
-    }
+def _rows(plan: Plan, scenarios: list[Scenario], first: int, batch: Batch) -> DataFrame:
+    from pandas import DataFrame
+
+    kinds, sets = column_types(plan), batch.uv[0].shape[1]
     tags = [scalars(scenarios[row]) for row in batch.row]
-    columns |= {name: [tag[name] for tag in tags for _ in range(sets)] for name in SCALARS}
+    columns: dict[str, Any] = {
+        'scenario': np.repeat(first + np.asarray(batch.row), sets),
+        'scenarios': len(plan.sweep),
+        'set': np.tile(np.arange(sets), len(tags)),
+        'sets': sets,
+    }
+    for name in SCALARS:
+        kind = object if kinds[name] is str else kinds[name]
+        columns[name] = np.repeat(np.array([tag[name] for tag in tags], dtype=kind), sets)
     for node, settings in plan.solvers.items():
         outcome = SOLVERS[node].solve(batch, settings)
-        notes = outcome.note.tolist()
-        for name, values in outcome.metrics.items():
-            columns[f'{node}.{name}'] = [
-                None if note else v for v, note in zip(values.tolist(), notes, strict=True)
-            ]
-        columns[f'{node}.note'] = [note or None for note in notes]
-    return columns
+        columns |= {f'{node}.{name}': values for name, values in outcome.metrics.items()}
+        columns[f'{node}.note'] = [note or None for note in outcome.note]
+    return DataFrame(columns)

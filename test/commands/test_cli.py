@@ -547,7 +547,7 @@ class TestCommandLine:
         code = (
             'import sys\nfrom fisheye_svp_ros.cli import main\n'
             'try:\n    main(["--help"])\nexcept SystemExit:\n    pass\n'
-            'print(sorted({"numpy", "rich", "cv2", "scipy", "yaml", "matplotlib"}'
+            'print(sorted({"numpy", "rich", "cv2", "scipy", "yaml", "matplotlib", "pandas"}'
             ' & set(sys.modules)))'
         )
         said = printed(code)
@@ -560,7 +560,7 @@ class TestCommandLine:
             'import sys\nfrom fisheye_svp_ros.cli import COMMANDS, main\n'
             'for name in COMMANDS:\n'
             '    try:\n        main([name, "--help"])\n    except SystemExit:\n        pass\n'
-            'print(sorted({"matplotlib", "scipy", "numba"} & set(sys.modules)))'
+            'print(sorted({"matplotlib", "scipy", "numba", "pandas"} & set(sys.modules)))'
         )
         assert printed(code).splitlines()[-1] == '[]'
 

@@ -13,20 +13,22 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from fisheye_svp_ros.cli import main
-from fisheye_svp_ros.io.columns import arrow, write_columns
+from fisheye_svp_ros.io.columns import arrow, make_table, write_table
 from fisheye_svp_ros.io.decoding import RESIDUALS, structured_array
 from fisheye_svp_ros.reporting.sweep_plots import draw_residuals, draw_table
 from fisheye_svp_ros.study.dependence import curves, grid, noise_spreads, swept_parameters
 from fisheye_svp_ros.study.solutions import DRAWN_METRICS
 from fisheye_svp_ros.study.sweep import SOLVERS, plan_sweep, sweep_rows
 
-TABLE = {
-    'radius': [1.0, 1.0, 2.0, 2.0, 1.0, 2.0],
-    'environment': ['a', 'a', 'a', 'a', 'b', 'b'],
-    'seed': [0, 1, 0, 1, 0, 0],
-    'shift_scale': [1.0] * 6,
-    'localizer.rms_px': [1.0, 3.0, 5.0, None, -7.0, 8.0],
-}
+TABLE = make_table(
+    {
+        'radius': [1.0, 1.0, 2.0, 2.0, 1.0, 2.0],
+        'environment': ['a', 'a', 'a', 'a', 'b', 'b'],
+        'seed': [0, 1, 0, 1, 0, 0],
+        'shift_scale': [1.0] * 6,
+        'localizer.rms_px': [1.0, 3.0, 5.0, None, -7.0, 8.0],
+    }
+)
 
 
 def test_what_was_swept_is_what_differs_but_for_seeds() -> None:
@@ -61,12 +63,14 @@ def test_a_picture_shows_no_more_curves_than_can_be_told_apart(
     rows = list(product([1.0, 2.0], range(7), 'abc'))
     radius, scale, environment = (list(column) for column in zip(*rows, strict=True))
     draw_table(
-        {
-            'radius': radius,
-            'shift_scale': scale,
-            'environment': environment,
-            'localizer.rms_px': [float(i) for i in range(len(rows))],
-        },
+        make_table(
+            {
+                'radius': radius,
+                'shift_scale': scale,
+                'environment': environment,
+                'localizer.rms_px': [float(i) for i in range(len(rows))],
+            }
+        ),
         tmp_path,
     )
     figure = next(one for one in figures if one.axes[0].get_xlabel().startswith('range'))
@@ -84,12 +88,14 @@ def test_a_grid_holds_magnitudes() -> None:
 
 
 def test_of_calibrations_only_those_of_all_sets_count() -> None:
-    table = {
-        'radius': [1.0] * 3,
-        'set': [0, 1, 2],
-        'sets': [3, 3, 3],
-        'stereo_calibrator.position_error_m': [9.0, 8.0, 1.0],
-    }
+    table = make_table(
+        {
+            'radius': [1.0] * 3,
+            'set': [0, 1, 2],
+            'sets': [3, 3, 3],
+            'stereo_calibrator.position_error_m': [9.0, 8.0, 1.0],
+        }
+    )
     (curve,) = curves(table, 'stereo_calibrator.position_error_m', 'radius', [])
     assert curve.median.tolist() == [1.0]
 
@@ -131,7 +137,7 @@ def test_a_sweep_is_drawn_against_everything_that_was_swept(tmp_path: Path) -> N
 
 
 def test_a_table_is_found_in_its_folder(tmp_path: Path) -> None:
-    write_columns(tmp_path / 'table', TABLE)
+    write_table(tmp_path / 'table', TABLE)
     assert main(['plot', str(tmp_path), '-o', str(tmp_path / 'plots')]) == 0
     assert (tmp_path / 'plots' / 'error_against_radius.png').exists()
 
@@ -144,7 +150,8 @@ def test_a_rig_is_drawn(tmp_path: Path) -> None:
 
 def test_every_metric_that_is_to_be_drawn_has_its_curve(figures: list[Figure]) -> None:
     columns = [f'{node}.{name}' for node, solver in SOLVERS.items() for name in solver.metrics]
-    draw_table({'radius': [1.0, 2.0], **{name: [1.0, 2.0] for name in columns}}, Path())
+    table = make_table({'radius': [1.0, 2.0], **{name: [1.0, 2.0] for name in columns}})
+    draw_table(table, Path())
     titles = [axis.get_title('left') for axis in figures[0].axes]
     drawn = [name for name in columns if name.partition('.')[2] in DRAWN_METRICS]
     assert len(titles) == len(drawn) and {*DRAWN_METRICS} <= {n.partition('.')[2] for n in drawn}
@@ -168,7 +175,7 @@ def test_residuals_are_drawn_against_angle_and_range(tmp_path: Path) -> None:
 def test_a_table_in_which_nothing_differs_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_columns(tmp_path / 'table', {'radius': [1.0], 'localizer.rms_px': [0.5]})
+    write_table(tmp_path / 'table', make_table({'radius': [1.0], 'localizer.rms_px': [0.5]}))
     for name in ('table.csv', *(['table.parquet'] if arrow()[0] else [])):
         assert main(['plot', str(tmp_path / name), '-o', str(tmp_path / 'out')]) == 2
         assert 'nothing to draw' in capsys.readouterr().err

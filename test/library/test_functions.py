@@ -51,7 +51,10 @@ RECORDINGS = ('rosbags', 'mcap', 'apsw', 'zstandard')
             ('numpy', 'scipy', 'matplotlib', 'numba', 'pyarrow', 'yaml', 'cv2', *RECORDINGS),
         ),
         ('import fisheye_svp_ros.commands.paper', ('numpy',)),
-        ('import fisheye_svp_ros.library.functions, fisheye_svp_ros.commands.sweep', RECORDINGS),
+        (
+            'import fisheye_svp_ros.library.functions, fisheye_svp_ros.commands.sweep',
+            (*RECORDINGS, 'pandas'),
+        ),
     ],
 )
 def test_what_is_not_needed_is_not_loaded(statement: str, heavy: tuple[str, ...]) -> None:
@@ -153,6 +156,8 @@ def test_results_come_back(seen: Simulated, pair: Simulated, tmp_path: Path) -> 
                 kept = replace(kept, max_incidence=was.max_incidence)
             assert repr(kept) == repr(was)
         assert list(map(repr, again.table().rows())) == list(map(repr, one.table().rows()))
+        frame = one.table().to_dataframe()
+        assert list(frame) == list(one.table()) and len(frame) == len(list(one.table().rows()))
 
 
 def test_a_file_that_is_no_such_result(seen: Simulated, tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def test_a_sweep_offline_has_the_same_gate() -> None:
                 'localizer': {'sigma_px': 0.3, 'gate': gate},
             }
         )
-        return sweep_rows(plan, range(2))['localizer.note']
+        return list(sweep_rows(plan, range(2))['localizer.note'])
 
     assert notes(0.0) == [None, None]
     sound, shifted = notes(1.5)

@@ -19,6 +19,7 @@ from helpers.graph import Graph
 from helpers.photographs import BOARD, LENS, poses
 
 from fisheye_svp_ros.io.bags import Bag
+from fisheye_svp_ros.io.columns import plain_columns
 from fisheye_svp_ros.io.csv_files import write_observations
 from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.io.lens_files import save_lens
@@ -97,7 +98,7 @@ def test_a_sweep_is_recorded_and_ends_by_itself(ros_domain: int, tmp_path: Path)
     launch.finish()
     text = '\n'.join(launch.lines)
     assert 'Traceback' not in text and 'has died' not in text, text
-    columns = tabulate(Bag(bag).records(is_tabulated))
+    columns = plain_columns(tabulate(Bag(bag).records(is_tabulated)))
     assert columns['scenario'] == [0, 1, 2, 3] and columns['radius'] == [2.0, 2.0, 1.0, 1.0]
     assert all(error < 0.01 for error in columns['localizer.position_error_m'])
 

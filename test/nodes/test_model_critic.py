@@ -29,6 +29,7 @@ from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.bags import Bag
+from fisheye_svp_ros.io.columns import make_table, plain_columns
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
@@ -234,8 +235,8 @@ def test_two_runs_are_drawn_into_one_picture(tmp_path: Path) -> None:
         'depth.rms_px': [1.0, 1.0],
     }
     path = tmp_path / 'runs.png'
-    assert draw_runs(columns, path) == [] and not path.exists()
-    assert draw_runs({**columns, 'after.axis_error_rad': [0.5, None]}, path) == [path]
+    assert draw_runs(make_table(columns), path) == [] and not path.exists()
+    assert draw_runs(make_table({**columns, 'after.axis_error_rad': [0.5, None]}), path) == [path]
     assert path.read_bytes().startswith(b'\x89PNG')
 
 
@@ -320,7 +321,7 @@ def test_from_a_recording_with_a_hidden_effect_to_a_better_localizer(
             processes.wait(['replay'], TIMEOUT)
             processes.stop(name)
         processes.stop('recorder')
-    table = tabulate(Bag(errors).records(is_tabulated))
+    table = plain_columns(tabulate(Bag(errors).records(is_tabulated)))
     assert len(table['before.position_error_m']) == FRAMES
     error = {name: np.mean(table[f'{name}.position_error_m']) for name in ('before', 'after')}
     assert error['after'] < 0.5 * error['before'], json.dumps(error)

@@ -21,6 +21,7 @@ from rclpy.serialization import serialize_message  # isort: skip
 
 from fisheye_svp_ros.io import bags
 from fisheye_svp_ros.io.bags import Bag, BagWriter, OfferedQos
+from fisheye_svp_ros.io.columns import plain_columns
 from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.nodes import messages
@@ -165,6 +166,6 @@ def test_a_table_of_what_rosbag2_recorded_is_that_of_our_own_recording(
     )
     assert camera.finish() == 0
     assert [one.finish(signal.SIGINT) for one in (localizer, *recorders)] == [0, 0, 0]
-    tables = [tabulate(Bag(path).records(is_tabulated)) for path in (theirs, own)]
+    tables = [plain_columns(tabulate(Bag(path).records(is_tabulated))) for path in (theirs, own)]
     assert tables[0] == tables[1] and tables[0]['radius'] == [2.0, 0.5, 0.2]
     assert all(error < 0.1 for error in tables[0]['localizer.position_error_m'])

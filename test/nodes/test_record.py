@@ -32,7 +32,7 @@ from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.errors import BagError, ObservationError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.bags import Bag, BagWriter, OfferedQos
-from fisheye_svp_ros.io.columns import arrow, read_columns
+from fisheye_svp_ros.io.columns import arrow, plain_columns, read_table
 from fisheye_svp_ros.io.decoding import stamp_of
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
@@ -60,7 +60,7 @@ def write_results(path: Path, count: int, flush_each: bool = False) -> None:
 def test_a_table_is_a_join_on_stamps(tmp_path: Path) -> None:
     write_results(tmp_path / 'bag', 7)
     bag = Bag(tmp_path / 'bag')
-    columns = tabulate(bag.records(is_tabulated))
+    columns = plain_columns(tabulate(bag.records(is_tabulated)))
     assert columns == {
         'namespace': ['/a'] * 7,
         'stamp_ns': list(range(7)),
@@ -79,7 +79,7 @@ def test_results_without_scenarios_and_of_two_nodes_are_rows_as_well(tmp_path: P
             bag.write(f'{node}/result', DIAGNOSTICS, serialize_message(message))
         failed = messages.key_values_message('n', {}, 6, 'too few points', b'\x01')
         bag.write('/x/stereo_depth/result', DIAGNOSTICS, serialize_message(failed))
-    columns = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
+    columns = plain_columns(tabulate(Bag(tmp_path / 'bag').records(is_tabulated)))
     assert columns['namespace'] == ['/x', '/x', '/x/left'] and columns['stamp_ns'] == [5, 6, 5]
     assert columns['stereo_depth.rms_px'] == [2.0, None, None]
     assert columns['stereo_depth.note'] == [None, 'too few points', None]
@@ -99,7 +99,7 @@ def test_why_a_set_has_no_solution_and_what_is_doubtful_are_columns_apart(tmp_pa
             values = {'rms_px': 1.0} if stamp > 2 else {}
             message = messages.key_values_message('n', values, stamp, text, b'\x01')
             bag.write('/localizer/result', DIAGNOSTICS, serialize_message(message))
-    columns = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
+    columns = plain_columns(tabulate(Bag(tmp_path / 'bag').records(is_tabulated)))
     assert columns['localizer.note'] == [
         *['the set has 3 usable points in it; 4 are needed'] * 2,
         *[None] * 3,
@@ -132,7 +132,7 @@ def test_a_node_belongs_to_the_nearest_scenario_above_it(tmp_path: Path) -> None
         for node in ('/x/left/localizer', '/x/right/localizer'):
             message = messages.key_values_message('n', {'rms_px': 3.0}, 5)
             bag.write(f'{node}/result', DIAGNOSTICS, serialize_message(message))
-    assert tabulate(Bag(tmp_path / 'bag').records(is_tabulated)) == {
+    assert plain_columns(tabulate(Bag(tmp_path / 'bag').records(is_tabulated))) == {
         'namespace': ['/x', '/x/left'],
         'stamp_ns': [5, 5],
         'radius': [1.0, 2.0],
@@ -152,7 +152,7 @@ def test_the_command_writes_csv_parquet_and_json(
         rows = list(csv.DictReader(stream))
     assert [float(row['localizer.rms_px']) for row in rows] == [n / 3 for n in range(5)]
     if arrow()[0] is not None:
-        table = read_columns(tmp_path / 'out' / 'table.parquet')
+        table = plain_columns(read_table(tmp_path / 'out' / 'table.parquet'))
         assert table['localizer.rms_px'] == [n / 3 for n in range(5)]
         assert table['stamp_ns'] == list(range(5))
     document = json.loads((tmp_path / 'out' / 'table.json').read_text())
@@ -189,13 +189,13 @@ def test_a_recording_that_was_cut_short_yields_what_is_whole(
     tmp_path: Path, part: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_results(tmp_path / 'bag', 40, flush_each=True)
-    whole = len(tabulate(Bag(tmp_path / 'bag').records(is_tabulated))['localizer.rms_px'])
+    whole = len(tabulate(Bag(tmp_path / 'bag').records(is_tabulated)))
     (file,) = (tmp_path / 'bag').glob('*.mcap')
     data = file.read_bytes()
     file.write_bytes(data[: int(part * len(data))])
     (tmp_path / 'bag' / 'metadata.yaml').unlink()
     bag = Bag(tmp_path / 'bag')
-    columns = tabulate(bag.records(is_tabulated))
+    columns = plain_columns(tabulate(bag.records(is_tabulated)))
     assert 'only its intact parts are read' in bag.damage
     known = [v for v in columns.get('localizer.rms_px', []) if v is not None]
     assert len(columns['stamp_ns']) == whole
@@ -212,7 +212,7 @@ def test_a_chunk_that_is_cut_short_yields_its_whole_messages(tmp_path: Path) -> 
     (file,) = (tmp_path / 'bag').glob('*.mcap')
     data = file.read_bytes()
     file.write_bytes(data[: len(data) // 3])
-    stamps = tabulate(Bag(file).records(is_tabulated))['stamp_ns']
+    stamps = plain_columns(tabulate(Bag(file).records(is_tabulated)))['stamp_ns']
     assert stamps == list(range(len(stamps))) and 20 < len(stamps) < 40
 
 
@@ -227,7 +227,7 @@ def test_no_flipped_bit_changes_a_table_in_silence(tmp_path: Path) -> None:
     write_results(tmp_path / 'bag', 12, flush_each=True)
     (file,) = (tmp_path / 'bag').glob('*.mcap')
     good, rng = file.read_bytes(), np.random.default_rng(5)
-    table = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
+    table = plain_columns(tabulate(Bag(tmp_path / 'bag').records(is_tabulated)))
     told = 0
     for place in rng.choice(8 * len(good), 400, replace=False).tolist():
         bad = bytearray(good)
@@ -235,7 +235,7 @@ def test_no_flipped_bit_changes_a_table_in_silence(tmp_path: Path) -> None:
         file.write_bytes(bad)
         bag = Bag(tmp_path / 'bag')
         try:
-            same = tabulate(bag.records(is_tabulated)) == table
+            same = plain_columns(tabulate(bag.records(is_tabulated))) == table
         except (BagError, ObservationError):
             same = False
             bag.damage = bag.damage or 'refused'
@@ -450,7 +450,7 @@ def test_the_recorder_writes_every_message_until_it_is_interrupted(
     assert recorder.finish(signal.SIGINT) == 0
     assert not [line for line in recorder.lines if 'Traceback' in line]
     assert '25 messages on 5 topics' in recorder.lines[-1]
-    columns = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
+    columns = plain_columns(tabulate(Bag(tmp_path / 'bag').records(is_tabulated)))
     assert columns['seed'] == [1, 2, 3, 4, 5]
 
 
@@ -478,7 +478,7 @@ def test_a_camera_ends_when_what_it_sent_has_come(
     time.sleep(2.0)  # twice as long as all sets take
     recorder.process.send_signal(signal.SIGCONT)
     assert camera.finish() == 0 and recorder.finish(signal.SIGINT) == 0
-    columns = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
+    columns = plain_columns(tabulate(Bag(tmp_path / 'bag').records(is_tabulated)))
     assert columns['seed'] == seeds
 
 
@@ -515,7 +515,7 @@ def test_a_recorder_that_is_killed_leaves_what_it_has_flushed(
     recorder.process.wait()
     assert camera.finish(signal.SIGTERM) == 0
     bag = Bag(tmp_path / 'bag')
-    assert len(tabulate(bag.records(is_tabulated))['stamp_ns']) >= 5
+    assert len(tabulate(bag.records(is_tabulated))) >= 5
     assert 'only its intact parts are read' in bag.damage
 
 
@@ -528,7 +528,7 @@ def test_a_recorder_has_flushed_what_came_and_ends_while_others_go_on(
 
     def flushed() -> int:
         with suppress(BagError):
-            return len(tabulate(Bag(tmp_path / 'bag').records(is_tabulated))['stamp_ns'])
+            return len(tabulate(Bag(tmp_path / 'bag').records(is_tabulated)))
         return 0
 
     until(lambda: flushed() == 1)

@@ -14,7 +14,7 @@ from helpers.nodes import ROOT
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.commands import record
 from fisheye_svp_ros.io.bags import Bag
-from fisheye_svp_ros.io.columns import read_columns
+from fisheye_svp_ros.io.columns import plain_columns, read_table
 from fisheye_svp_ros.io.recording import NAMESPACE, STAMP, is_tabulated, tabulate
 
 MONO = """
@@ -71,8 +71,8 @@ def test_every_scenario_once_and_with_the_offline_numbers(
         assert main(['record', '--sweep', str(path), '-o', str(tmp_path / 'bag')]) == 0
     assert bars and min(bars) > 0 and sum(bars) <= scenarios
     assert main(['sweep', str(path), '-o', str(tmp_path / 'out')]) == 0
-    recorded = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
-    offline = read_columns(tmp_path / 'out' / 'sweep.csv')
+    recorded = plain_columns(tabulate(Bag(tmp_path / 'bag').records(is_tabulated)))
+    offline = plain_columns(read_table(tmp_path / 'out' / 'sweep.csv'))
     places = list(zip(recorded['scenario'], recorded['set'], strict=True))
     assert places == [(n, s) for n in range(scenarios) for s in range(sets)]
     notes = {name for name in offline if name.endswith('.note')}

@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 from helpers.nodes import ROOT, need_ros
 
@@ -19,7 +20,7 @@ from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.commands.processes import Processes
 from fisheye_svp_ros.errors import BagError, GraphError, ObservationError
 from fisheye_svp_ros.io.bags import Bag
-from fisheye_svp_ros.io.columns import read_columns
+from fisheye_svp_ros.io.columns import plain_columns, read_table
 from fisheye_svp_ros.io.decoding import RESIDUALS
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.io.recording import has_residuals, is_tabulated, tabulate
@@ -96,7 +97,7 @@ def test_a_rectified_pair_is_shown(demo: Any) -> None:
 
 def test_everything_is_recorded(demo: Any) -> None:
     folder, _ = demo
-    columns = tabulate(Bag(folder / 'recording').records(is_tabulated))
+    columns = plain_columns(tabulate(Bag(folder / 'recording').records(is_tabulated)))
     counts = {name: columns['namespace'].count(name) for name in set(columns['namespace'])}
     assert counts == {'/localization': 3, '/calibration': 3 * 10, '/depth': 3 * 2}
     assert len(set(zip(columns['namespace'], columns['stamp_ns'], strict=True))) == 39
@@ -149,12 +150,11 @@ def test_the_nodes_have_nothing_to_complain_of(demo: Any) -> None:
 
 def test_a_missing_scenario_is_named(demo: Any) -> None:
     folder, _ = demo
-    columns = tabulate(Bag(folder / 'recording').records(is_tabulated))
+    table = tabulate(Bag(folder / 'recording').records(is_tabulated))
     with pytest.raises(BagError, match=r'no result of localizer for fish180, whole, 2\.0 m'):
-        demo_rows(columns, ['fish180'], [2.0])
-    twice = {name: cells * 2 for name, cells in columns.items()}
+        demo_rows(table, ['fish180'], [2.0])
     with pytest.raises(BagError, match='was recorded twice'):
-        demo_rows(twice, ['fish180'], [0.5])
+        demo_rows(pd.concat([table, table]), ['fish180'], [0.5])
 
 
 @pytest.fixture
@@ -195,7 +195,7 @@ def test_without_ros_the_same_scenarios_are_computed(computed: Any) -> None:
         'table.csv',
     ]
     assert json.loads((folder / 'demo.json').read_text())['recording'] is None
-    counts = read_columns(folder / 'table.csv')['namespace']
+    counts = plain_columns(read_table(folder / 'table.csv'))['namespace']
     assert [counts.count(f'/{task.name}') for task in TASKS] == [3, 3 * 10, 3 * 2]
 
 

@@ -22,7 +22,14 @@ from fisheye_svp_ros.commands.processes import missing_rclpy
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import decode_image, exif_turned
 from fisheye_svp_ros.io.bags import Bag, BagWriter
-from fisheye_svp_ros.io.columns import TableParts, arrow, read_columns, write_columns
+from fisheye_svp_ros.io.columns import (
+    TableParts,
+    arrow,
+    make_table,
+    plain_columns,
+    read_table,
+    write_table,
+)
 from fisheye_svp_ros.io.landmark_files import environment, load_landmarks
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.lens_formats import WRITABLE, write_foreign
@@ -133,7 +140,7 @@ def _unchanged(read: Callable[[Path], tuple[Any, bool]], files: Files, folder: P
 
 def _table(path: Path) -> tuple[Any, bool]:
     bag = Bag(path)
-    return tabulate(bag.records(is_tabulated)), bool(bag.damage)
+    return plain_columns(tabulate(bag.records(is_tabulated))), bool(bag.damage)
 
 
 def _written(folder: Path, name: str, write: Callable[[Path], Any]) -> Files:
@@ -291,14 +298,14 @@ def _value(default: Any, rng: Random) -> Any:
 
 def _parts(folder: Path) -> Trial:
     parts = TableParts(folder, {'n': int, 'x': float, 'name': str})
-    parts.write(0, {'n': [1, 2], 'x': [0.5, None], 'name': ['a', None]})
-    data = (folder / '000000000.json').read_bytes()
+    parts.write(0, make_table({'n': [1, 2], 'x': [0.5, None], 'name': ['a', None]}))
+    data = (folder / '000000000.csv').read_bytes()
 
     def read(folder: Path) -> str:
         parts.join(folder / 'all')
-        return '' if len(read_columns(folder / 'all.csv')['n']) else 'no row'
+        return '' if len(read_table(folder / 'all.csv')) else 'no row'
 
-    return of_files({'000000000.json': data}, read, folder)
+    return of_files({'000000000.csv': data}, read, folder)
 
 
 def _foreign(folder: Path) -> Trial:
@@ -418,8 +425,8 @@ def surfaces() -> list[Surface]:
             'table CSV',
             _file(
                 'a.csv',
-                lambda p: write_columns(p.with_suffix(''), _COLUMNS),
-                _quietly(read_columns),
+                lambda p: write_table(p.with_suffix(''), make_table(_COLUMNS)),
+                _quietly(read_table),
             ),
             50,
         ),
@@ -431,9 +438,11 @@ def surfaces() -> list[Surface]:
             Surface(
                 'table Parquet',
                 lambda folder: _unchanged(
-                    lambda path: (read_columns(path), False),
+                    lambda path: (plain_columns(read_table(path)), False),
                     _written(
-                        folder, 'a.parquet', lambda p: write_columns(p.with_suffix(''), _COLUMNS)
+                        folder,
+                        'a.parquet',
+                        lambda p: write_table(p.with_suffix(''), make_table(_COLUMNS)),
                     ),
                     folder,
                 ),
