@@ -88,9 +88,10 @@ def lasting_workers() -> Iterator[None]:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compose pictures, but do not draw them: half the time of a command that writes a report."""
     from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
+    from matplotlib.layout_engine import ConstrainedLayoutEngine, TightLayoutEngine
 
-    monkeypatch.setattr(ConstrainedLayoutEngine, 'execute', lambda *_: None)
+    for engine in (ConstrainedLayoutEngine, TightLayoutEngine):
+        monkeypatch.setattr(engine, 'execute', lambda *_: None)
     monkeypatch.setattr(Figure, 'savefig', lambda _, file, **__: file.write(b'\x89PNG'))
 
 
