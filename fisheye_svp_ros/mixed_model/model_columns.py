@@ -275,11 +275,12 @@ def arrange_blocks(
 
 def _assemble(shared: Array, crossed: Array, blocks: Array, blocks_first: bool) -> Array:
     """Return one matrix of shared products (Q, Q), crossed (Q, E k) and diagonal blocks."""
-    count, width = blocks.shape[:2]
-    diagonal = np.zeros((count, width, count, width))
-    diagonal[np.arange(count), :, np.arange(count)] = blocks
-    flat = diagonal.reshape(count * width, count * width)
-    parts = [[flat, crossed.T], [crossed, shared]]
-    if not blocks_first:
-        parts = [row[::-1] for row in parts[::-1]]
-    return np.block(parts)
+    (count, width), rest = blocks.shape[:2], len(shared)
+    size = count * width
+    begin, after = (0, size) if blocks_first else (rest, 0)
+    own, others = slice(begin, begin + size), slice(after, after + rest)
+    at = begin + np.arange(size).reshape(count, width)
+    whole = np.zeros((size + rest, size + rest))
+    whole[at[:, :, None], at[:, None]] = blocks
+    whole[own, others], whole[others, own], whole[others, others] = crossed.T, crossed, shared
+    return whole

@@ -310,11 +310,15 @@ def _leave_out(
         f, group, own, rows_of_unit, offset.reshape(height, width)[used]
     )
     # P of this group's rows, and P border
-    p = np.eye(len(used)) - inside - root @ root.T
+    p = root @ root.T
+    p += inside
+    np.negative(p, out=p)
+    p[np.diag_indices_from(p)] += 1.0
     remaining = border[used] - at_border - predicted
     (basis,) = group_basis(fixed[None, used])
     remaining -= basis @ (basis.T @ remaining)
-    rows[used], found[used] = np.linalg.solve(p + basis @ basis.T, remaining), remaining
+    p += basis @ basis.T
+    rows[used], found[used] = np.linalg.solve(p, remaining), remaining
     return found
 
 
