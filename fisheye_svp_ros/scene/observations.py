@@ -181,6 +181,18 @@ class Views(_Views, Batch):
         """Which entries (S, N) are observations and not padding."""
         return self.row >= 0
 
+    def take_points(self, at: Index) -> Views:
+        """Return the same views with some of their N points."""
+        return self._replace(
+            points=self.points[:, at],
+            uv=self.uv[:, at],
+            weight=self.weight[:, at],
+            landmark=self.landmark[:, at],
+            board=self.board[:, at],
+            t=self.t[:, at],
+            row=self.row[:, at],
+        )
+
 
 def group_views(observations: Observations) -> Views:
     """Group a table by frame and camera, unknown sigma 1 px; raise ObservationError for none."""

@@ -39,6 +39,7 @@ _KEPT_SHARE = 0.6  # of the landmarks, that a lens is fitted to
 _MAX_WRONG_SHARE = 0.4
 _STEPS = 8
 _CONSENSUS_VIEWS = 12  # those with most points
+_CONSENSUS_POINTS = 120  # of a view, about: more tell no better which pose most agree on
 _LANDMARK_SHARE = 0.75  # of the squared residuals, explained by displaced landmarks
 _NEIGHBORS = 8
 _OWN_SHARE = 0.5  # of an offset, that the nearest landmarks do not have
@@ -200,7 +201,9 @@ class _Landmarks(NamedTuple):
         richest = np.argsort(-self.views.used.sum(axis=1), kind='stable')[:_CONSENSUS_VIEWS]
         for rows, _, one in model.split(self.views):
             for view in np.intersect1d(np.arange(len(posed))[rows], richest):
-                single = self.views.take([view])
+                used = np.flatnonzero(self.views.used[view])
+                step = max(1, len(used) // _CONSENSUS_POINTS)
+                single = self.views.take([view]).take_points(used[::step])
                 try:
                     found = localize(one, single)
                 except GeometryError:
