@@ -360,8 +360,10 @@ def _doubts(evaluation: Evaluation) -> Iterator[_Doubt]:
         reason, rival = None, None
         if len(kept) < 2:
             reason = Reason.NO_OTHER_FRAME
-        elif z <= 1:
-            reason = Reason.REFUTED_BY_FRAMES if z < -1 else Reason.NO_GAIN
+        elif z < -1:
+            reason = Reason.REFUTED_BY_FRAMES
+        elif z <= 1 and not (z > 0 and _adds_density(tests, effect, columns)):
+            reason = Reason.NO_GAIN
         elif other is not None:
             z_file = _gain_in_sigmas(evaluation.predict([effect.name]), other)
             if z_file < 0:
@@ -372,6 +374,15 @@ def _doubts(evaluation: Evaluation) -> Iterator[_Doubt]:
             reason = Reason.IMPLAUSIBLE
         if reason is not None:
             yield _Doubt(z, cause, reason, rival)
+
+
+def _adds_density(tests: EffectTests, effect: Effect, columns: Index) -> bool:
+    """Say whether frames left out are likelier with an effect, by more than the error of that.
+
+    The sum of their squares may be one frame's doing: of few frames, or where one is near.
+    """
+    rest = np.setdiff1d(tests.null.included_columns, columns)
+    return tests.held_out_gain(rest, columns, effect).sufficient
 
 
 def _gain_in_sigmas(before: HeldOut, after: HeldOut) -> float:

@@ -135,7 +135,7 @@ class Effect(ABC):
     hidden_structure: ClassVar[tuple[str, ...]] = ()  # variables on which residuals depend by it
     # How its displacements of landmarks are shown: 'smooth' over boards, 'single' ones; or not
     target_map: ClassVar[str] = ''
-    when_untestable: ClassVar[str] = ''  # what to do where frames differ and it cannot be tested
+    when_untestable: ClassVar[str] = ''  # what to do where frames differ and have no time
     meaning: ClassVar[str] = ''  # what it is, as a sentence
     headline: ClassVar[str] = ''  # the same, shorter, without a stop; '' for the meaning
     signature: ClassVar[str]
@@ -323,6 +323,9 @@ class PlaneEffect(Effect):
         return values / ratio
 
 
+NO_TIME = 'the observations carry no time, or too few instants'
+
+
 class NoiseEffect(Effect):
     """An effect that moves no prediction: it changes the scatter or the table itself."""
 
@@ -344,7 +347,7 @@ def require_time(scene: Scene, minimum: int) -> Array:
     """Return the times (S,) of the views; raise Untestable for fewer than `minimum` instants."""
     instants = np.unique(scene.times[np.isfinite(scene.times)])
     if len(instants) < minimum or not np.isfinite(scene.times).all():
-        raise Untestable('the observations carry no time, or too few instants')
+        raise Untestable(NO_TIME)
     return scene.times
 
 

@@ -21,6 +21,9 @@ class RollingShutterEffect(Effect):
     stage = 'pose'
     of_motion = True
     of_frames = True
+    when_untestable = (
+        'give the time of each frame (a column t, s): motion during the exposure becomes testable'
+    )
     signature = (
         'residuals that grow with the distance from the middle row and with the camera speed'
     )

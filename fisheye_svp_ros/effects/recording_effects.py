@@ -15,10 +15,10 @@ from fisheye_svp_ros.effects.base import (
     PlaneEffect,
     Scene,
     Untestable,
-    require_time,
 )
 
 _MAX_STARTS = 32  # starts at pauses, and as many more, evenly spread
+_MIN_INSTANTS = 5
 _PAUSE = 2.0  # times the median time between instants
 _STEP = (('relative', '1', 0.01), ('cx', 'px', 5.0), ('cy', 'px', 5.0))
 
@@ -26,6 +26,8 @@ _STEP = (('relative', '1', 0.01), ('cx', 'px', 5.0), ('cy', 'px', 5.0))
 @dataclass(frozen=True)
 class FocalDriftEffect(PlaneEffect):
     """A relative change of the focal length as a polynomial of time, constant left out.
+
+    Of the number of the frame where no time is known (timed: whether it is).
 
     Before and after the frames that it was found on it stays as it was at their ends, since a
     polynomial says nothing of other times.
@@ -38,25 +40,28 @@ class FocalDriftEffect(PlaneEffect):
     start: float = field(default=0.0, metadata={'key': False})
     duration: float = field(default=1.0, metadata={'key': False})
     means: tuple[float, ...] = field(default=(), metadata={'key': False})
+    timed: bool = field(default=True, metadata={'key': False})
 
     name = 'focal_drift'
     headline = 'The focal length drifts'
     meaning = 'The focal length drifts smoothly with time (temperature).'
     of_recording = True
     of_frames = True
-    when_untestable = (
-        'give the time of each frame (a column t, s): drifts, jumps and motion during the '
-        'exposure become testable'
-    )
     signature = 'residuals in proportion to the image height that change smoothly with time'
     to_separate = 'a longer recording with the temperature noted; frames well spread in time'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
-        t = require_time(scene, 5)
-        bare = cls(3, float(t.min()), float(np.ptp(t)))
+        timed = bool(np.isfinite(scene.times).all())
+        t = scene.times if timed else scene.views.frame.astype(float)
+        if len(np.unique(t)) < _MIN_INSTANTS:
+            raise Untestable('fewer than five frames')
+        bare = cls(3, float(t.min()), float(np.ptp(t)), timed=timed)
         means = tuple(bare._polynomials(t).mean(axis=0).tolist())
         return [replace(bare, degree=degree, means=means[:degree]) for degree in (1, 2, 3)]
+
+    def holds_for(self, t: Array, known: Array) -> bool:
+        return self.timed and super().holds_for(t, known)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -68,7 +73,8 @@ class FocalDriftEffect(PlaneEffect):
 
     def relative_change(self, scene: Scene) -> Array:
         """Return the derivatives (S, degree) of the relative focal length of each view."""
-        return np.asarray(np.nan_to_num(self._polynomials(scene.times)))
+        instant = scene.times if self.timed else scene.views.frame.astype(float)
+        return np.asarray(np.nan_to_num(self._polynomials(instant)))
 
     def _polynomials(self, t: Array) -> Array:
         x = np.clip(2 * (t - self.start) / self.duration - 1, -1, 1)

@@ -14,6 +14,7 @@ from fisheye_svp_ros.diagnosis import (
     Diagnosis,
     Reason,
 )
+from fisheye_svp_ros.effects.base import NO_TIME
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.cause_text import (
     describe_effect,
@@ -368,7 +369,8 @@ def _next_step(d: Diagnosis) -> str:
     ]
     steps += [_remedy(c) for c in d.causes if c.effect_class.stage == 'noise']
     if 'frame' in {one.variable for one in d.remaining}:
-        steps += filter(None, (CATALOGUE[name].when_untestable for name in d.untestable))
+        untimed = [name for name, reason in d.untestable.items() if reason == NO_TIME]
+        steps += filter(None, (CATALOGUE[name].when_untestable for name in untimed))
     if d.remaining:
         steps.append(f'look for the cause of the remaining residuals: {remains(d)}')
     return '; '.join(dict.fromkeys(steps)) + '.'

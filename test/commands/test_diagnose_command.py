@@ -24,6 +24,7 @@ from fisheye_svp_ros.diagnosis import (
     diagnose,
 )
 from fisheye_svp_ros.diagnosis.variance_budget import Structure
+from fisheye_svp_ros.effects.base import NO_TIME
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -450,7 +451,9 @@ class TestWords:
         assert 'look for the cause' in following
         *_, following = verdict_sentences(
             with_changes(
-                found, remaining=[Structure('frame', 0.0, 0.5)], untestable={'focal_drift': 'no t'}
+                found,
+                remaining=[Structure('frame', 0.0, 0.5)],
+                untestable={'rolling_shutter': NO_TIME},
             )
         )
         assert 'give the time of each frame (a column t, s)' in following

@@ -237,6 +237,19 @@ def test_a_drift_leaves_the_mean_focal_length_to_the_lens(linearised):
         np.testing.assert_allclose(np.nanmean(growth, axis=(0, 1, 2)), 0.0, atol=1e-12)
 
 
+def test_a_drift_needs_no_times_where_frames_are_in_order(linearised):
+    *_, scene_ = linearised
+    frame = scene_.views.frame.astype(float)
+    bare, even = (
+        replace(scene_, views=scene_.views._replace(t=np.broadcast_to(t, scene_.views.t.shape)))
+        for t in (np.nan, frame[:, None])
+    )
+    forms = [CATALOGUE['focal_drift'].candidates(one) for one in (bare, even)]
+    for untimed, timed in zip(*forms, strict=True):
+        np.testing.assert_allclose(untimed.plane_columns(bare), timed.plane_columns(even))
+        assert not untimed.holds_for(frame[:1], frame)
+
+
 def test_a_drift_stays_as_it_was_where_the_recording_ends(linearised):
     *_, scene_ = linearised
     last = np.nanargmax(scene_.times)
