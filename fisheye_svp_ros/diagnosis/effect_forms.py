@@ -118,7 +118,7 @@ def _forms(kind: type[Effect], linear: Linearization) -> list[Sequence[Effect]]:
     Raises Untestable where there is none.
     """
     scene, labels = linear.scene, linear.state.labels
-    of_lens = kind.stage in ('ray', 'image', 'detector') and not kind.of_target
+    of_lens = kind.stage in ('pupil', 'ray', 'image', 'detector') and not kind.of_target
     if not scene.cameras or not of_lens:
         return [_catalogue_forms(kind, scene, linear.free)]
     found: list[Sequence[Effect]] = []

@@ -128,7 +128,7 @@ class ModelErrors:
         turn = _turn_columns(linear)
         weight = linear.row_weight
         columns = linear.shared_columns * mask_shared(
-            linear, lambda effect: effect.stage in ('ray', 'image', 'detector')
+            linear, lambda effect: effect.stage in ('pupil', 'ray', 'image', 'detector')
         )
         flat, around = flat_rows(columns), flat_rows(turn)
         columns = (flat - around @ np.linalg.lstsq(around, flat, rcond=None)[0]).reshape(

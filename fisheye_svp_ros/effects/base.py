@@ -3,6 +3,7 @@
 The stages and what a displacement means there (S views of N points, last axis D):
 target   D = 3, m: the landmark moves in the target frame
 pose     D = 6, m and rad: the camera moves for this one point (`Pose.retract`)
+pupil    D = 3, m: the ray starts beside the axis, in the camera frame
 ray      D = 2, m and px: viewpoint shift s and image height h change
 image    D = 2, px: the optical image moves
 detector D = 2, px: the detected point moves
@@ -30,7 +31,15 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.boards import Board, find_boards
 from fisheye_svp_ros.scene.observations import Views
 
-DIMENSIONS = {'target': 3, 'pose': 6, 'ray': 2, 'image': 2, 'detector': 2, 'noise': 0}  # D
+DIMENSIONS = {
+    'target': 3,
+    'pose': 6,
+    'pupil': 3,
+    'ray': 2,
+    'image': 2,
+    'detector': 2,
+    'noise': 0,
+}  # D
 _PAUSE = 4.0  # times the median time between views: over so long no motion is known
 _MAX_PLAUSIBLE = 30.0  # times what would be a large value of a parameter
 

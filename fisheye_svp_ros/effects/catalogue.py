@@ -29,6 +29,7 @@ _KINDS: tuple[type[Effect], ...] = (
     image.SkewEffect,
     image.DecenteringEffect,
     image.SensorTiltEffect,
+    ray.PupilDecenteringEffect,
     ray.FlatPortEffect,
     recording.FocalDriftEffect,
     recording.SessionStepEffect,

@@ -1,4 +1,4 @@
-"""The forward model: landmarks and poses through target, pose, ray, image and detector.
+"""The forward model: landmarks and poses through target, pose, pupil, ray, image and detector.
 
 Of one lens, or of the lenses of a rig: then each view is that of its camera.
 """
@@ -17,6 +17,7 @@ from fisheye_svp_ros.arrays import Array, Index, Mask, gather_rows
 from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import Target, curved_lens
+from fisheye_svp_ros.effects.ray_effects import PupilDecenteringEffect
 from fisheye_svp_ros.effects.terms import ModelTerm, camera_terms
 from fisheye_svp_ros.optics import camera, engines
 from fisheye_svp_ros.optics.camera import Image, Incidence, LinearImage, Rays, lens_columns
@@ -25,6 +26,7 @@ from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Views, views_of
 
 _STEP = 1e-4  # px
+_PUPIL_STEPS = 3  # of the angle at which a ray comes, each nearer by the motion over the range
 
 
 class CameraViews(NamedTuple):
@@ -114,7 +116,7 @@ class ForwardModel:
     def is_lens_only(self) -> bool:
         """Whether what the lens's own curves do is all there is, of one lens."""
         bare = not self.cameras and self._target is None
-        return bare and not self._acts('target', 'pose', 'image', 'detector')
+        return bare and not self._acts('target', 'pose', 'pupil', 'image', 'detector')
 
     def seeing(self, views: Views) -> ForwardModel:
         """Return the model without corrections of a target that none of the views shows."""
@@ -200,14 +202,29 @@ class ForwardModel:
     def back_project(self, uv: Array) -> Rays:
         """Return the rays of image points (S, N, 2), px, in the camera frame."""
         if not self._acts('image', 'detector'):
-            return camera.back_project(self.lens, uv)
+            return self._move_origins(camera.back_project(self.lens, uv))
         ideal = uv
         views = views_of(np.zeros((*uv.shape[:-1], 3)), uv)
         pose = identity(len(uv))
         for _ in range(4):
             scene = Scene(views, self.lens, pose, ideal)
             ideal = uv - self._displace(scene, 'image') - self._displace(scene, 'detector')
-        return camera.back_project(self.lens, ideal)
+        return self._move_origins(camera.back_project(self.lens, ideal))
+
+    def _move_origins(self, rays: Rays) -> Rays:
+        """Return rays that start where a pupil that moves sideways has them start."""
+        if not self._acts('pupil'):
+            return rays
+        return rays._replace(origin=rays.origin + self._pupil(rays.theta))
+
+    def _pupil(self, theta: Array) -> Array:
+        """Return by what rays of angles (...) start beside the axis, in the camera frame, m."""
+        columns = [
+            term.effect.origin_columns(theta) @ term.values
+            for term in self.terms
+            if isinstance(term.effect, PupilDecenteringEffect)
+        ]
+        return np.asarray(np.sum(columns, axis=0))
 
     def scene(self, pose: Pose, views: Views, linear: LinearViews) -> Scene:
         """Return what effects may look at once the views are linearised."""
@@ -239,7 +256,11 @@ class ForwardModel:
             per_px = linear.image.d_height / self.lens.focal
             stage = np.stack([linear.image.d_shift, per_px], axis=-1)
         else:
-            stage = {'target': linear.d_target, 'pose': linear.d_pose}[effect.stage]
+            stage = {
+                'target': linear.d_target,
+                'pose': linear.d_pose,
+                'pupil': -linear.image.d_point,
+            }[effect.stage]
         return np.asarray(stage @ columns)
 
     def _effect_columns_by_camera(
@@ -308,6 +329,12 @@ class ForwardModel:
             turn = rotation_from_vector(-move[..., 3:])
             place = pose.position[..., None, :]
             points = place + (turn @ (points - place - move[..., :3])[..., None])[..., 0]
+        if self._acts('pupil'):
+            local, off = pose.into_body(points), np.zeros(3)
+            for _ in range(_PUPIL_STEPS):
+                theta = camera.incidence(self.lens, local - off, limited=False).theta
+                off = np.nan_to_num(self._pupil(theta))
+            points = points - off @ np.swapaxes(pose.rotation, -1, -2)
         return points
 
     def _acts(self, *stages: str) -> bool:

@@ -58,6 +58,41 @@ class ViewpointShiftEffect(Effect):
 
 
 @dataclass(frozen=True)
+class PupilDecenteringEffect(Effect):
+    """The entrance pupil moves sideways: by e0_x, e0_y times the angle's part of a Gennery shift.
+
+    The same curve as that of a shift along the axis, which a sideways one adds to.
+    """
+
+    name = 'pupil_decentering'
+    headline = 'The entrance pupil moves sideways with the angle'
+    meaning = 'The entrance pupil moves sideways with the incidence angle.'
+    stage = 'pupil'
+    rarer_than = 'decentering'
+    signature = (
+        'residuals towards one side that grow with the angle and with 1 / range, like those of a '
+        'decentered lens at one range'
+    )
+    to_separate = (
+        'views of the same angles at clearly different ranges, on all sides, the nearest as near '
+        'as possible'
+    )
+
+    parameters = (Parameter('e0_x', 'm', 0.01), Parameter('e0_y', 'm', 0.01))
+
+    def prior_sigma(self, scene: Scene) -> Array:
+        return np.array([parameter.large for parameter in self.parameters])
+
+    def columns(self, scene: Scene) -> Array:
+        return self.origin_columns(scene.theta)
+
+    def origin_columns(self, theta: Array) -> Array:
+        """Return what moves the origins (..., 3, 2) of rays of angles (...), camera frame."""
+        growth = Gennery().columns(theta)[..., 1]
+        return np.asarray(growth[..., None, None] * np.eye(3)[:, :2])
+
+
+@dataclass(frozen=True)
 class RadialProfileEffect(Effect):
     """A smooth change of h(theta), px, as sums of Chebyshev polynomials of theta / theta_max.
 

@@ -171,7 +171,7 @@ def _model(linear: Linearization) -> ForwardModel:
     terms = [
         term
         for term in linear.state.terms
-        if term.effect.stage in ('ray', 'image') and not term.effect.of_target
+        if term.effect.stage in ('pupil', 'ray', 'image') and not term.effect.of_target
     ]
     return ForwardModel(linear.state.lens, terms)
 

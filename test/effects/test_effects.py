@@ -10,6 +10,7 @@ from fisheye_svp_ros.effects.base import Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE, load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.ray_effects import PupilDecenteringEffect
 from fisheye_svp_ros.effects.rig_effect import rig_kind
 from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import LensError
@@ -29,6 +30,7 @@ DESIGN_NAMES = {
     'skew',
     'decentering',
     'sensor_tilt',
+    'pupil_decentering',
     'flat_port',
     'focal_drift',
     'session_step',
@@ -341,3 +343,18 @@ def test_displaced_landmarks_are_named_unless_they_are_all():
     survey = CATALOGUE['landmark_survey']
     assert survey((7, 9)).key == 'landmark_survey(landmarks=7 9)'
     assert survey((7, 9), everywhere=True).key == 'landmark_survey(landmarks=all)'
+
+
+def test_rays_of_a_pupil_that_moves_sideways_meet_the_points_that_they_are_of():
+    model = ForwardModel(lens(), [ModelTerm(PupilDecenteringEffect(), np.array([2e-3, -1e-3]))])
+    theta, azimuth = np.meshgrid(np.linspace(0.1, 1.6, 9), np.linspace(0, 6, 7))
+    ahead = np.stack(
+        [np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)], axis=-1
+    )
+    points = 0.2 * ahead.reshape(-1, 3)
+    image = model.project(points)
+    rays = model.back_project(image.uv[None]).reshape((len(points),))
+    off = np.linalg.norm(np.cross(points - rays.origin, rays.direction), axis=-1)
+    assert off.max() < 1e-8
+    central = ForwardModel(lens(), ()).project(points).uv
+    assert np.abs(image.uv - central).max() > 0.5

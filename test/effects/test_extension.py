@@ -45,6 +45,7 @@ SHAPES = {
     'principal_point': {},
     'decentering': {},
     'sensor_tilt': {},
+    'pupil_decentering': {},
     'skew': {},
     'session_step': {'starts': (0.2,)},
     'focal_drift': {'duration': 0.3},
@@ -114,6 +115,7 @@ def test_what_the_lens_has_a_place_for_goes_there():
     assert set(extended.corrections) == {
         'decentering',
         'sensor_tilt',
+        'pupil_decentering',
         'skew',
         'session_step',
         'focal_drift',

@@ -153,6 +153,7 @@ def test_equals_scipy(shift):
 CORRECTIONS = [
     ('sensor_tilt', {}, 0.003),
     ('decentering', {}, 0.003),
+    ('pupil_decentering', {}, 0.003),
     ('aspect', {}, 0.003),
     ('skew', {}, 0.003),
     ('dot_centroid', {}, 1e-3),
