@@ -16,7 +16,7 @@ Document = Mapping[str, Any]
 ROUNDING = 1e-9
 LENS = {
     'keep': 'Keep the lens',
-    'use_extended': 'Use extended_lens.yaml',
+    'use_extended': 'Use ',
     'recalibrate': 'Do not use the lens as given',
     'undecided': 'Undecided about the lens',
 }
@@ -176,11 +176,15 @@ def _bounds(document: Document) -> Iterator[str]:
                     yield f'a shift of {shift["e0"]:.2g}, at most {bound["value"]:.2g} m'
 
 
+def _line(screen: str, head: str) -> str:
+    return screen.partition(head)[2].partition('. ')[0]
+
+
 def _screen(document: Document, screen: str) -> Iterator[str]:
     """Yield where the first screen says something else than the document."""
     screen, say = ' '.join(screen.split()), document['decision']['lens']['say']
     for answer, words in LENS.items():
-        if (words in screen) != (answer == say):
+        if (words in _line(screen, 'Lens:')) != (answer == say):
             yield f'{say}, and the screen {"has" if answer != say else "lacks"} {words!r}'
     if document['adequacy'] and ('Enough' in screen or '% sure' in screen):
         yield 'inadequate data, and the screen reassures'
