@@ -121,13 +121,15 @@ def rms_reduction(before: HeldOut, after: HeldOut) -> Comparison:
 def gain_and_confidence(before: HeldOut, after: HeldOut, noise: float) -> tuple[Comparison, float]:
     """Return 1 - (held-out variance above noise after) / (before), with a bootstrap interval.
 
-    And the share of the bootstrap in which it is above zero.
+    And the share of the bootstrap in which it is above zero.  The interval holds the value, also
+    where hardly anything is above the noise.
     """
     gains = _excess_gain(before, after, noise, _resample_frames(len(before.squares)))
     low, high = np.quantile(gains, (0.025, 0.975))
     whole = np.arange(len(before.squares))[None]
     value = float(_excess_gain(before, after, noise, whole)[0])
-    gain = Comparison(before.rms, after.rms, value, float(low), float(high))
+    ends = min(float(low), value), max(float(high), value)
+    gain = Comparison(before.rms, after.rms, value, *ends)
     return gain, float((gains > 0).mean())
 
 

@@ -399,8 +399,7 @@ def largest_cause(d: Diagnosis) -> str:
 
 def likely_effects(d: Diagnosis) -> str:
     """Return what is likely and not confirmed, as a clause."""
-    names = d.likely_effects
-    return f'{" or ".join(names)} is likely, not confirmed'
+    return f'likely, not confirmed: {" or ".join(d.likely_effects)}'
 
 
 def _displaced_landmarks(d: Diagnosis) -> str:
