@@ -220,7 +220,7 @@ def test_a_wide_pinhole_is_taken_as_it_is(d: tuple[float, ...]) -> None:
     """Of 137 degrees over the diagonal, as a rectified image has it."""
     lens, worst = lens_of('plumb_bob', (1280, 800), (300.0, 300.0, 640.0, 400.0), d, 'c', 'info')
     rays = np.array([[2.1, 1.3, 1.0], [-2.0, 1.2, 1.0], [0.0, 0.0, 1.0]])
-    seen = forward.project(lens, rays)
+    seen = forward.project_corrected(lens, rays)
     assert worst == 0.0 and seen.valid.all()
     np.testing.assert_allclose(seen.uv, 300 * rays[:, :2] + (640, 400), atol=1e-9)
 
