@@ -610,7 +610,8 @@ def test_landmarks_in_millimetres_are_asked_about(scene, without_solution, capsy
 
 def test_intrinsics_are_told_with_their_unit():
     values = namedtuple('Values', 'before before_stderr after after_stderr')(1.0, 0.1, 2.0, 0.1)
-    diagnosis = SimpleNamespace(intrinsics={'left.fx': values, 'k1': values})
+    fitted = SimpleNamespace(intrinsics={'left.fx': values, 'k1': values})
+    diagnosis = SimpleNamespace(evaluation=fitted)
     assert [row[0] for row in intrinsic_rows(diagnosis)] == ['left.fx, px', 'k1']
 
 
