@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis import Comparison, Diagnosis
     from fisheye_svp_ros.planning.plan import NextViews
     from fisheye_svp_ros.reporting.diagnosis_plots import PointResiduals
-    from fisheye_svp_ros.reporting.next_steps import ReportInputs
+    from fisheye_svp_ros.reporting.wording.next_steps import ReportInputs
 
 _OF_DOTS = 'dot_centroid'  # corners have none
 
@@ -282,11 +282,11 @@ def _print(
     wanted: NextViews | None,
 ) -> None:
     """Print what the first screen of the report says, and the photographs to take next."""
-    from fisheye_svp_ros.reporting import external_text
-    from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE
-    from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
-    from fisheye_svp_ros.reporting.next_steps import command_to_go_on
     from fisheye_svp_ros.reporting.terminal import print_lines, print_table
+    from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE
+    from fisheye_svp_ros.reporting.wording.external import sections
+    from fisheye_svp_ros.reporting.wording.first_screen import first_screen, terminal_lines
+    from fisheye_svp_ros.reporting.wording.next_steps import command_to_go_on
 
     command = command_to_go_on(diagnosis, _inputs(args, bool(diagnosis.evaluation.intrinsics)))
     print_lines(
@@ -294,7 +294,7 @@ def _print(
             *terminal_lines(
                 first_screen(diagnosis, args.observations, known), command if args.output else ''
             ),
-            *(f'{one.title}: {one.sentence}' for one in external_text.sections(diagnosis)),
+            *(f'{one.title}: {one.sentence}' for one in sections(diagnosis)),
         ]
     )
     if wanted:
@@ -315,7 +315,7 @@ def _print(
 
 
 def _inputs(args: argparse.Namespace, free: bool) -> ReportInputs:
-    from fisheye_svp_ros.reporting.next_steps import ReportInputs
+    from fisheye_svp_ros.reporting.wording.next_steps import ReportInputs
 
     return ReportInputs(
         args.observations,
@@ -353,7 +353,7 @@ def _write(
     from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
     from fisheye_svp_ros.reporting.diagnosis_plots import point_residuals
     from fisheye_svp_ros.reporting.diagnosis_report import write_report
-    from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE, refusal_reason
+    from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE, refusal_reason
 
     folder, points = (
         args.output,

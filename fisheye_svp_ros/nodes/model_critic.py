@@ -35,9 +35,9 @@ from fisheye_svp_ros.nodes.set_collection import (
 from fisheye_svp_ros.nodes.solver import SolverNode
 from fisheye_svp_ros.nodes.validation import Items
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.reporting.diagnosis_text import refusal_reason
-from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason
+from fisheye_svp_ros.reporting.wording.diagnosis import refusal_reason
+from fisheye_svp_ros.reporting.wording.first_screen import first_screen, terminal_lines
 from fisheye_svp_ros.scene.observations import STEREO, Observations
 from fisheye_svp_ros.solve.measured_poses import posable_observations
 from fisheye_svp_ros.study.settings import RigSettings

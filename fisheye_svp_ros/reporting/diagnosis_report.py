@@ -13,20 +13,46 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.planning.plan import NextViews
-from fisheye_svp_ros.reporting import cause_text, external_text, shot_list
-from fisheye_svp_ros.reporting import diagnosis_text as text
+from fisheye_svp_ros.reporting import shot_list
 from fisheye_svp_ros.reporting.blocks import data_uri, page
-from fisheye_svp_ros.reporting.cause_text import outlier_rows
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, PointResiduals, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
-from fisheye_svp_ros.reporting.first_screen import first_screen, tone, verdict_words
-from fisheye_svp_ros.reporting.next_steps import (
+from fisheye_svp_ros.reporting.wording.advice import separation
+from fisheye_svp_ros.reporting.wording.causes import (
+    bare_probability,
+    budget_rows,
+    cause_rows,
+    describe_effect,
+    intrinsic_rows,
+    outlier_rows,
+    percent,
+    quantity,
+    uncertainty_rows,
+)
+from fisheye_svp_ros.reporting.wording.diagnosis import (
+    STAGE_WORDS,
+    VARIABLES,
+    advice_text,
+    count_frames,
+    frame_ranges,
+    join_names,
+    known_rows,
+    lens_contents,
+    refusal_reason,
+    remaining_text,
+    verdict_sentences,
+)
+from fisheye_svp_ros.reporting.wording.external import (
+    CARRIED_HEADER,
+    sections,
+)
+from fisheye_svp_ros.reporting.wording.findings import belief, finding_reason
+from fisheye_svp_ros.reporting.wording.first_screen import first_screen, tone, verdict_words
+from fisheye_svp_ros.reporting.wording.next_steps import (
     ReportInputs,
     command_to_go_on,
     follow_up_files,
 )
-from fisheye_svp_ros.reporting.wording.advice import separation
-from fisheye_svp_ros.reporting.wording.findings import belief, finding_reason
 
 _CAPTIONS = {
     'field': 'Residual vectors over the image; the scale is above each panel; dotted: equal '
@@ -86,13 +112,13 @@ def write_report(
             'diagnosis.html',
             d=diagnosis,
             inputs=inputs,
-            percent=cause_text.percent,
+            percent=percent,
             significance=NAMED_P,
             screen=first_screen(diagnosis, inputs.observations, known),
             command=command_to_go_on(diagnosis, inputs),
             verdict=verdict_words(diagnosis),
             tone=tone(diagnosis),
-            sentences=text.verdict_sentences(diagnosis, known),
+            sentences=verdict_sentences(diagnosis, known),
             pictures={
                 'target': None,
                 'evidence': None,
@@ -111,15 +137,15 @@ def write_report(
                 'header': shot_list.HEADER,
                 'rows': shot_list.rows(wanted),
             },
-            uncertainty=list(cause_text.uncertainty_rows(diagnosis)),
-            known=list(text.known_rows(diagnosis, known)),
+            uncertainty=list(uncertainty_rows(diagnosis)),
+            known=list(known_rows(diagnosis, known)),
             free=_free(inputs, diagnosis),
-            external=external_text.sections(diagnosis),
-            carried_header=external_text.CARRIED_HEADER,
-            contents=text.lens_contents(diagnosis),
-            count=text.count_frames(diagnosis),
+            external=sections(diagnosis),
+            carried_header=CARRIED_HEADER,
+            contents=lens_contents(diagnosis),
+            count=count_frames(diagnosis),
             extended=follow_up_files(diagnosis, inputs),
-            not_offered=text.refusal_reason(diagnosis),
+            not_offered=refusal_reason(diagnosis),
         ),
     )
     return [report, *pictures]
@@ -157,12 +183,12 @@ def _free(inputs: ReportInputs, diagnosis: Diagnosis) -> str:
         'poses': diagnosis.evaluation.fixed_model.data.poses is None,
         'intrinsics': inputs.free_intrinsics,
     }
-    return text.join_names([name for name, fitted in free.items() if fitted]) or 'nothing'
+    return join_names([name for name, fitted in free.items() if fitted]) or 'nothing'
 
 
 def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
     causes = []
-    for cause, row in zip(diagnosis.causes, cause_text.cause_rows(diagnosis), strict=True):
+    for cause, row in zip(diagnosis.causes, cause_rows(diagnosis), strict=True):
         fields = dict(
             zip(('effect', 'size', 'p', 'share', 'rms', 'gain', 'same'), row, strict=True)
         )
@@ -170,14 +196,14 @@ def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
         causes.append(
             {
                 **fields,
-                'what': cause_text.describe_effect(cause.effect),
+                'what': describe_effect(cause.effect),
                 'belief': belief(cause.status, cause.probability),
                 'to_separate': separation(cause) if cause.indistinguishable_from else '',
-                'refuted': text.frame_ranges(diagnosis, cause.refuted_by_frames),
+                'refuted': frame_ranges(diagnosis, cause.refuted_by_frames),
                 'parameters': [
                     (
                         name,
-                        cause_text.quantity(entry),
+                        quantity(entry),
                         f'{entry["value"]:.6g} {entry["unit"]}'.removesuffix(' 1'),
                     )
                     for name, entry in shown
@@ -211,7 +237,7 @@ def _step(step: Finding, withdrawn: Mapping[str, str]) -> dict[str, Any]:
         'why': f'{reason}; not confirmed: {why}' if why else reason,
         'rank': step.rank if tried else '',
         'explains': f'{step.statistic:.1f}' if tried else '',
-        'p': cause_text.bare_probability(step.p_corrected) if tried else '',
+        'p': bare_probability(step.p_corrected) if tried else '',
         'held_out': held_out,
     }
 
@@ -226,14 +252,14 @@ def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
     total = diagnosis.figures.base.rms_px**2
     return {
         'bars': [
-            (stage, text.STAGE_WORDS[stage], 100 * (share - named), 100 * named, names[stage])
+            (stage, STAGE_WORDS[stage], 100 * (share - named), 100 * named, names[stage])
             for stage, (share, named) in shares.items()
         ],
         'total_px2': f'{total:.3g}',
-        'budget_rows': list(cause_text.budget_rows(diagnosis)),
-        'intrinsics': list(cause_text.intrinsic_rows(diagnosis)),
+        'budget_rows': list(budget_rows(diagnosis)),
+        'intrinsics': list(intrinsic_rows(diagnosis)),
         'advice': [
-            (text.advice_text(one), cause_text.percent(one.gain) if one.gain > 0 else '')
+            (advice_text(one), percent(one.gain) if one.gain > 0 else '')
             for one in diagnosis.advice
         ],
     }
@@ -244,15 +270,15 @@ def _remaining_structures(diagnosis: Diagnosis) -> dict[str, Any]:
     return {
         'remaining': [
             {
-                'words': text.remaining_text(diagnosis, s.variable),
+                'words': remaining_text(diagnosis, s.variable),
                 'link': _PICTURE_OF.get(s.variable),
-                'p': cause_text.bare_probability(s.p_value),
-                'share': cause_text.percent(s.share) if s.variable in text.VARIABLES else '',
+                'p': bare_probability(s.p_value),
+                'share': percent(s.share) if s.variable in VARIABLES else '',
                 'width': round(_BAR * min(s.share, 1.0)),
             }
             for s in {s.variable: s for s in strongest}.values()
         ],
-        'looked_at': text.join_names(list(text.VARIABLES.values()), 'or'),
+        'looked_at': join_names(list(VARIABLES.values()), 'or'),
         'untestable': [
             (effect, why, CATALOGUE[effect].signature)
             for effect, why in diagnosis.untestable.items()

@@ -41,10 +41,10 @@ from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting import diagnosis_plots, evidence_plots
-from fisheye_svp_ros.reporting.cause_text import cause_rows, intrinsic_rows
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, point_residuals, residual_pictures
-from fisheye_svp_ros.reporting.diagnosis_text import advice_text, verdict_sentences
-from fisheye_svp_ros.reporting.first_screen import headline
+from fisheye_svp_ros.reporting.wording.causes import cause_rows, intrinsic_rows
+from fisheye_svp_ros.reporting.wording.diagnosis import advice_text, verdict_sentences
+from fisheye_svp_ros.reporting.wording.first_screen import headline
 from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo

@@ -12,7 +12,7 @@ from helpers.flawed_sets import flawed
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, FlawKind, diagnose
 from fisheye_svp_ros.io.lens_files import save_lens
-from fisheye_svp_ros.reporting.first_screen import (
+from fisheye_svp_ros.reporting.wording.first_screen import (
     first_screen,
     terminal_lines,
     tone,

@@ -15,7 +15,7 @@ from fisheye_svp_ros.diagnosis.written_lens import MIN_GAIN
 from fisheye_svp_ros.effects.forward import back_project_corrected, project_corrected
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
-from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
+from fisheye_svp_ros.reporting.wording.diagnosis import verdict_sentences
 
 
 def warp(uv: np.ndarray, size: float, length: float = 380.0) -> np.ndarray:

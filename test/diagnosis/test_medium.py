@@ -12,7 +12,7 @@ from fisheye_svp_ros.diagnosis.checks.medium import InAir
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import FlatGlass
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
+from fisheye_svp_ros.reporting.wording.diagnosis import verdict_sentences
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.solve.initial_rig import initial_state, prediction_distances
 from fisheye_svp_ros.solve.lens_calibration import calibrate

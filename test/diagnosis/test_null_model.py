@@ -31,7 +31,7 @@ from fisheye_svp_ros.mixed_model import (
 from fisheye_svp_ros.mixed_model.reml import update_variances
 from fisheye_svp_ros.mixed_model.solution import deviance_without, solution_without
 from fisheye_svp_ros.optics.lens import intrinsic_names
-from fisheye_svp_ros.reporting.cause_text import COMPONENTS
+from fisheye_svp_ros.reporting.wording.causes import COMPONENTS
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, shorten_step
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame

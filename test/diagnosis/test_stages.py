@@ -17,7 +17,7 @@ from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.effects.recording_effects import FocalDriftEffect, SessionStepEffect
 from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.reporting.first_screen import first_screen, headline
+from fisheye_svp_ros.reporting.wording.first_screen import first_screen, headline
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state

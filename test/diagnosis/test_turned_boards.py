@@ -17,8 +17,8 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
-from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
-from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
+from fisheye_svp_ros.reporting.wording.diagnosis import verdict_sentences
+from fisheye_svp_ros.reporting.wording.first_screen import first_screen, terminal_lines
 from fisheye_svp_ros.scene.boards import board_turns
 from fisheye_svp_ros.scene.observations import Observations, make_observations, views_of
 

@@ -28,9 +28,9 @@ from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
-from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
-from fisheye_svp_ros.reporting.external_text import sections
-from fisheye_svp_ros.reporting.first_screen import first_screen
+from fisheye_svp_ros.reporting.wording.diagnosis import verdict_sentences
+from fisheye_svp_ros.reporting.wording.external import sections
+from fisheye_svp_ros.reporting.wording.first_screen import first_screen
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state, localize_frames
 from fisheye_svp_ros.solve.measured_poses import posable_observations

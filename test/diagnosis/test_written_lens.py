@@ -20,7 +20,7 @@ from fisheye_svp_ros.diagnosis.written_lens import (
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
-from fisheye_svp_ros.reporting.first_screen import first_screen
+from fisheye_svp_ros.reporting.wording.first_screen import first_screen
 
 
 def diagnosed(e0: float, noise: float, seed: int = 0, **settings: object) -> Diagnosis:

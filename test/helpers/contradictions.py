@@ -10,7 +10,7 @@ from typing import Any
 from fisheye_svp_ros.diagnosis import Diagnosis
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
-from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
+from fisheye_svp_ros.reporting.wording.first_screen import first_screen, terminal_lines
 
 Document = Mapping[str, Any]
 ROUNDING = 1e-9

@@ -25,11 +25,11 @@ from fisheye_svp_ros.diagnosis import (
 )
 from fisheye_svp_ros.diagnosis.decision import EffectBound, Figure
 from fisheye_svp_ros.diagnosis.variance_budget import Structure
-from fisheye_svp_ros.reporting.cause_text import percent, size
 from fisheye_svp_ros.reporting.diagnosis_plots import point_residuals
 from fisheye_svp_ros.reporting.diagnosis_report import write_report
-from fisheye_svp_ros.reporting.diagnosis_text import refusal_reason, verdict_sentences
-from fisheye_svp_ros.reporting.first_screen import (
+from fisheye_svp_ros.reporting.wording.causes import percent, size
+from fisheye_svp_ros.reporting.wording.diagnosis import refusal_reason, verdict_sentences
+from fisheye_svp_ros.reporting.wording.first_screen import (
     Photo,
     first_screen,
     headline,
@@ -38,7 +38,7 @@ from fisheye_svp_ros.reporting.first_screen import (
     terminal_lines,
     verdict_words,
 )
-from fisheye_svp_ros.reporting.next_steps import ReportInputs, command_to_go_on
+from fisheye_svp_ros.reporting.wording.next_steps import ReportInputs, command_to_go_on
 
 
 @pytest.fixture(scope='module')

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fisheye_svp_ros.reporting.cause_text import outlier_rows
+from fisheye_svp_ros.reporting.wording.causes import outlier_rows
 
 
 def test_many_outliers_of_one_view_are_one_row() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fisheye_svp_ros.diagnosis import Diagnosis
-from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE
+from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE
 
 
 class ReportInputs(NamedTuple):

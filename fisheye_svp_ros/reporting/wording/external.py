@@ -13,8 +13,8 @@ from fisheye_svp_ros.reporting.calibration_text import (
     hand_eye_sentence,
     hand_eye_warnings,
 )
-from fisheye_svp_ros.reporting.cause_text import quantity
-from fisheye_svp_ros.reporting.diagnosis_text import compared_row, join_names
+from fisheye_svp_ros.reporting.wording.causes import quantity
+from fisheye_svp_ros.reporting.wording.diagnosis import compared_row, join_names
 from fisheye_svp_ros.solve.hand_eye import HandEye
 
 CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'less by (95 %)')

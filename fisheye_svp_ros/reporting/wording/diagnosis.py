@@ -16,14 +16,14 @@ from fisheye_svp_ros.diagnosis import (
 )
 from fisheye_svp_ros.effects.base import NO_TIME
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.reporting.cause_text import (
+from fisheye_svp_ros.reporting.wording.adequacy import flaw_headline, flaw_reason
+from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
+from fisheye_svp_ros.reporting.wording.causes import (
     describe_effect,
     percent,
     probability,
     size,
 )
-from fisheye_svp_ros.reporting.wording.adequacy import flaw_headline, flaw_reason
-from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason
 from fisheye_svp_ros.reporting.wording.findings import with_odds
 from fisheye_svp_ros.scene.observations import frame_name

@@ -27,14 +27,20 @@ from fisheye_svp_ros.diagnosis import (
     status_of,
 )
 from fisheye_svp_ros.reporting.blocks import image_uri
-from fisheye_svp_ros.reporting.cause_text import (
+from fisheye_svp_ros.reporting.wording.adequacy import (
+    NOT_CERTAIN,
+    flaw_headline,
+    flaw_statement,
+)
+from fisheye_svp_ros.reporting.wording.causes import (
     HUMAN_UNITS,
     describe_effect,
     most_significant,
     percent,
     size,
 )
-from fisheye_svp_ros.reporting.diagnosis_text import (
+from fisheye_svp_ros.reporting.wording.decisions import bound_place, decision_reason
+from fisheye_svp_ros.reporting.wording.diagnosis import (
     LENS_FILE,
     count_frames,
     frame_ranges,
@@ -43,12 +49,6 @@ from fisheye_svp_ros.reporting.diagnosis_text import (
     lens_words,
     only_gross,
 )
-from fisheye_svp_ros.reporting.wording.adequacy import (
-    NOT_CERTAIN,
-    flaw_headline,
-    flaw_statement,
-)
-from fisheye_svp_ros.reporting.wording.decisions import bound_place, decision_reason
 from fisheye_svp_ros.reporting.wording.findings import belief, chance, finding_reason, with_odds
 from fisheye_svp_ros.reporting.wording.travel import travel_sentence
 from fisheye_svp_ros.scene.observations import photograph_names
