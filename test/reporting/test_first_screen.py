@@ -28,7 +28,11 @@ from fisheye_svp_ros.diagnosis.variance_budget import Structure
 from fisheye_svp_ros.reporting.diagnosis_plots import point_residuals
 from fisheye_svp_ros.reporting.diagnosis_report import write_report
 from fisheye_svp_ros.reporting.wording.causes import percent, size
-from fisheye_svp_ros.reporting.wording.diagnosis import refusal_reason, verdict_sentences
+from fisheye_svp_ros.reporting.wording.diagnosis import (
+    lens_contents,
+    refusal_reason,
+    verdict_sentences,
+)
 from fisheye_svp_ros.reporting.wording.first_screen import (
     Photo,
     first_screen,
@@ -327,7 +331,8 @@ def test_the_report_of_a_likely_shift_claims_no_causes(found: Diagnosis, tmp_pat
         ReportInputs('obs.csv', ('l.yaml',), None, None, tmp_path, False),
     )
     page = (tmp_path / 'report.html').read_text()
-    assert 'is the lens as it was fitted; every command' in page
+    assert f'is the lens {lens_contents(likely)}; every command' in page
+    assert 'with its causes' not in page
     assert 'fits and pictures: 1 point<' in page
 
 
