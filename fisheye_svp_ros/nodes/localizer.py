@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 MAX_RMS_RATIO = 1.5  # a set may fit this much worse than the one before it, by chance
 MAX_POSE_CHANGE = 0.1  # rad, and of the distance of the nearest landmark
 PERFECT_FIT_PX = 1e-6  # px; what fits better fits perfectly
-_MAX_AHEAD = 2  # intervals between two sets by which a motion is carried on
+_MAX_AHEAD = 2  # intervals between two sets, after which a motion is not carried on
 OUTLIER_SEARCH_INTERVAL = 10  # sets, of those that fit badly one after the other
 
 
@@ -172,21 +172,23 @@ def _rms_px(found: SetSolutions[Localization]) -> float:
 
 
 def _pose_at(stamp: int, latest: Sequence[tuple[int, Pose]]) -> Pose | None:
-    """Return where a camera is that goes on as it went, (1,); latest: stamps, ns, and poses."""
+    """Return where a camera is that moves on as it did, (1,); latest: stamps, ns, and poses."""
     if not latest:
         return None
-    now, pose = latest[-1]
-    before, other = latest[0]
-    if not before < now < stamp <= now + _MAX_AHEAD * (now - before):
+    (before, other), (now, pose) = latest[0], latest[-1]
+    if not before < now < stamp < now + _MAX_AHEAD * (now - before):
         return pose
-    return pose.retract(pose.difference(other) * (stamp - now) / (now - before))
+    turned = pose.rotation @ np.swapaxes(other.rotation, -1, -2) @ pose.rotation
+    # Rounding would grow from set to set: a step towards the nearest rotation.
+    turned = 1.5 * turned - 0.5 * turned @ np.swapaxes(turned, -1, -2) @ turned
+    return Pose._make((turned, 2 * pose.position - other.position))
 
 
 def _is_near(start: Pose, pose: Pose, views: Views) -> bool:
     """Say whether a camera that went from one pose (1,) to another sees nearly the same."""
-    change = pose.difference(start)[0]
-    nearest = np.linalg.norm(pose.into_body(views.points)[0], axis=-1).min()
+    nearest = np.linalg.norm(views.points[0] - pose.position, axis=-1).min()
+    turned = np.linalg.norm(pose.rotation - start.rotation) / np.sqrt(2)  # the angle, if small
     return bool(
-        np.linalg.norm(change[:3]) < MAX_POSE_CHANGE * nearest
-        and np.linalg.norm(change[3:]) < MAX_POSE_CHANGE
+        np.linalg.norm(pose.position - start.position) < MAX_POSE_CHANGE * nearest
+        and turned < MAX_POSE_CHANGE
     )
