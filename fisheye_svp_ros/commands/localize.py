@@ -20,6 +20,7 @@ from fisheye_svp_ros.commands.detect import (
 from fisheye_svp_ros.commands.lenses import add_lens_argument, lenses_of, load_lenses
 from fisheye_svp_ros.commands.notes import (
     note_doubtful,
+    note_extrapolated,
     note_gross_errors,
     note_left_out,
     note_wrong_landmarks,
@@ -107,6 +108,7 @@ def run(args: argparse.Namespace) -> None:
                 uncertainty = pose_summary(parts)
             else:
                 measured = localize_measured(model, table)
+        note_extrapolated(name or 'image points', lens, measured.views.uv[measured.views.used])
         title = ' '.join(filter(None, (args.observations, name)))
         _print(table, measured, uncertainty, title)
         note_wrong_landmarks(measured.landmarks)
@@ -126,6 +128,8 @@ def _localize_rig(
     cameras, places = load_cameras(args.rig)
     with progress('localizing'):
         found = localize_rig(table, lenses, cameras, places)
+    for camera, (name, lens) in enumerate(lenses.items()):
+        note_extrapolated(name, lens, table.uv[table.camera == camera])
     note_left_out(table, found.left_out)
     note_gross_errors(found.table, found.outliers)
     if found.contradicted:

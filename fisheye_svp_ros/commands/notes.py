@@ -12,10 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.io.lens_formats import READERS_TO_90_DEG, share_beyond_90_deg
+from fisheye_svp_ros.reporting.wording.inputs import points_extrapolated
 from fisheye_svp_ros.reporting.wording.landmarks import wrong_landmark_notes
 from fisheye_svp_ros.scene.observations import frame_name, list_frames
+from fisheye_svp_ros.solve.lens_checks import extrapolated_points
 
 if TYPE_CHECKING:
+    from fisheye_svp_ros.arrays import Array
     from fisheye_svp_ros.optics.lens import Lens
     from fisheye_svp_ros.scene.observations import Observations
     from fisheye_svp_ros.solve.outliers import Outliers, WrongLandmark
@@ -39,6 +42,12 @@ def note_reader_limit(lens: Lens, form: str) -> None:
             f'{100 * share:.2g} % of the image of {lens.name} lies beyond 90 deg, where '
             f'{READERS_TO_90_DEG[form]} ends; basalt, nerfstudio and mrcal reach further'
         )
+
+
+def note_extrapolated(what: str, lens: Lens, uv: Array) -> None:
+    """Say it where image points uv (N, 2), px, lie beyond what is known of a lens."""
+    if beyond := extrapolated_points(lens, uv):
+        say(points_extrapolated(what, beyond))
 
 
 def counted(count: int, noun: str) -> str:

@@ -39,6 +39,7 @@ from fisheye_svp_ros.reporting.undistort_report import (
     shift_left,
     tolerated_text,
 )
+from fisheye_svp_ros.reporting.wording.inputs import points_extrapolated
 
 # What camera_info calls the rectified cameras that it can describe, and its coefficients
 _CAMERA_INFO = {'pinhole': ('plumb_bob', 5), 'fisheye': ('equidistant', 4)}
@@ -148,6 +149,8 @@ def run(args: argparse.Namespace) -> None:
             draw_remaining(args.output / 'rows.png', pair.left, rows, 'difference of rows')
         write_json(args.output / _RESULT, document)
     for name, side in sides.items():
+        if side.extrapolated:
+            say(points_extrapolated(name or side.lens.name, side.extrapolated))
         _print_camera(side, name, left.get(name))
     if pair and rows:
         print_remaining(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -33,6 +33,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.cameras import camera_for
 from fisheye_svp_ros.rectify.maps import RANGE, Rectification, rectify_pair
+from fisheye_svp_ros.reporting.wording.inputs import points_extrapolated
 from fisheye_svp_ros.scene.observations import STEREO
 from fisheye_svp_ros.study.settings import Settings
 
@@ -190,6 +191,15 @@ class Rectifier(BaseNode):
             return {'': Rectification(lenses[0], camera, settings.range)}
         pair = rectify_pair(lenses[0], lenses[1], rig, camera, settings.range)
         return dict(zip(self._cameras, (pair.left, pair.right), strict=True))
+
+    def report(self) -> tuple[Mapping[str, object], str]:
+        """Return what is wrong with the rectified images."""
+        sides = self._setup.sides.items()
+        return {}, '; '.join(
+            points_extrapolated(f'{camera}image_rect', side.extrapolated)
+            for camera, side in sides
+            if side.extrapolated
+        )
 
     def _take(self, camera: str, stamp: int, image: Unread) -> None:
         """Rectify an image, if somebody listens."""

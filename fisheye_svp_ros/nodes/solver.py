@@ -41,6 +41,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.wording import inputs as wording
 from fisheye_svp_ros.scene.observations import STEREO, Views
+from fisheye_svp_ros.solve.lens_checks import extrapolated_points
 from fisheye_svp_ros.study.settings import SolverSettings
 from fisheye_svp_ros.study.solutions import Pair
 
@@ -120,7 +121,7 @@ class SolverNode(ManagedNode):
         self._validation = SetValidation(
             self._image_points, tuple(self._poses), self.drop, self._find_frame
         )
-        self._left_out: list[str] = []  # of the set that is solved
+        self._left_out: list[str] = []  # of the set that is solved, and what is doubtful in it
         self._said = ''
         self._lenses: dict[str, Lens] = {}  # those of the parameter lens
         self._infos = CameraInfos(self.get_logger().info)
@@ -208,6 +209,10 @@ class SolverNode(ManagedNode):
         lens, known = self.lens(stamp, items, camera), self._models.get(camera)
         if known is None or known[0] is not lens:
             known = self._models[camera] = lens, ForwardModel(lens)
+        topic = f'{camera}image_points'
+        if beyond := extrapolated_points(lens, items[topic].uv):
+            self._left_out.append(wording.points_extrapolated(topic, beyond))
+            self.warn(self._left_out[-1])
         return known[1]
 
     def models(self, stamp: int, items: Items) -> Pair:
@@ -264,7 +269,8 @@ class SolverNode(ManagedNode):
         problem = '; '.join(filter(None, (problem, *self._left_out)))
         values = {key: float(value[0]) for key, value in metrics.items()}
         for key, value in values.items():
-            self._metrics[key].publish(messages.number_message(value))
+            if self._metrics[key].get_subscription_count():  # seldom, and each takes its time
+                self._metrics[key].publish(messages.number_message(value))
         level = DiagnosticStatus.WARN if problem else DiagnosticStatus.OK
         self._result.publish(messages.key_values_message(name, values, stamp, problem, level))
 

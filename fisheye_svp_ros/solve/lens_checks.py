@@ -12,6 +12,7 @@ from fisheye_svp_ros.optics.lens import Lens
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
 _MAX_CENTER_OFFSET = 0.1  # of the image, by which a principal point is seldom off its center
 _MIN_COVERED_RADIUS = 0.7  # of the way to the nearest edge; less is poor coverage
+_ANGLE_SLACK = np.radians(2.0)  # past the outermost point of a calibration: as good as there
 
 
 class ImageCoverage(NamedTuple):
@@ -65,3 +66,32 @@ def is_known_in_part(lens: Lens) -> bool:
         return False
     height = float(lens.image_height.value_and_slope(np.asarray(angle))[0])
     return height * lens.focal < _MIN_COVERED_RADIUS * _nearest_edge(lens)
+
+
+class Extrapolated(NamedTuple):
+    """What share of image points lies beyond the angle that a lens is known to.
+
+    farthest: the angle of the outermost; known: that of the calibration; rad.
+    """
+
+    share: float
+    farthest: float
+    known: float
+
+
+def extrapolated_points(lens: Lens, uv: Array) -> Extrapolated | None:
+    """Return which of image points uv (N, 2), px, lie where the curve of a lens is a guess.
+
+    None where none does, or where nobody says how far the lens was calibrated.
+    """
+    known = lens.calibrated_angle
+    if known is None:
+        return None
+    height = np.hypot((uv[:, 0] - lens.cx) / lens.fx, (uv[:, 1] - lens.cy) / lens.fy)
+    limit, _ = lens.image_height.value_and_slope(np.asarray(known + _ANGLE_SLACK))
+    beyond = height > limit
+    if not beyond.any():
+        return None
+    edge, _ = lens.image_height.value_and_slope(np.asarray(lens.max_incidence))
+    farthest = lens.image_height.angle(np.minimum(height[beyond].max(), edge))
+    return Extrapolated(float(beyond.mean()), float(farthest), known)

@@ -149,6 +149,14 @@ class TestLocalize:
         assert cli.main(['localize', str(folder / 'given.csv'), '--lens', lens]) == 0
         assert 'the sigma of the observations' in capsys.readouterr().out
 
+    def test_points_beyond_what_is_known_of_the_lens(self, scene, tmp_path, capsys):
+        folder, _, _ = scene
+        lens = load_lens(folder / 'lens.yaml')
+        save_lens(replace(lens, calibration={'reached_deg': 10.0}), tmp_path / 'lens.yaml')
+        arguments = [folder / 'observations.csv', '--lens', tmp_path / 'lens.yaml']
+        assert cli.main(['localize', *map(str, arguments)]) == 0
+        assert 'image points of the calibration reach 10 deg' in capsys.readouterr().err
+
     def test_the_standard_errors_are_those_of_the_worst_direction(self, output, scene, capsys):
         folder, _, _ = scene
         lens = str(folder / 'lens.yaml')

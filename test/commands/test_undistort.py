@@ -450,3 +450,11 @@ def test_what_cannot_be_rendered_is_said_in_a_line(
     said = refused(capsys, 'render', '--lens', f'{tmp_path}/', '--count', 1, *end)
     assert 'it holds left, right but not their relative poses; add rig.yaml' in said
     assert not (tmp_path / 'out').exists()
+
+
+def test_pixels_beyond_what_is_known_of_the_lens_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_lens(replace(LENS, calibration={'reached_deg': 30.0}), tmp_path / 'lens.yaml')
+    run(tmp_path / 'lens.yaml', '--fov', 100, '-o', tmp_path / 'out')
+    assert 'but image points of the calibration reach 30 deg' in capsys.readouterr().err

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,8 @@ from sensor_msgs.msg import PointCloud2  # isort: skip
 
 from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
+from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.complaints import Complaints
 from fisheye_svp_ros.nodes.localizer import Localizer
@@ -209,3 +213,16 @@ def test_slots_are_bounded() -> None:
     for number in range(1000):
         complaints.add(chr(0x4E00 + number), 1e9)
     assert len(complaints.collect()) == 20 and len(complaints._logged) == 200
+
+
+def test_points_beyond_what_is_known_of_the_lens_are_told(
+    graph: Callable[..., Graph], tmp_path: Path
+) -> None:
+    lens = load_lens(lens_path('fish214')).svp()
+    save_lens(replace(lens, calibration={'reached_deg': 20.0}), tmp_path / 'lens.yaml')
+    told = Told(graph(f'lens:={tmp_path}/lens.yaml', 'patience:=0.2'))
+    told.world()
+    status = told.tell(1)
+    reason = 'deg from the axis, but image points of the calibration reach 20 deg'
+    assert status.values and reason in status.message and status.level == status.WARN
+    told.report(lambda text: reason in text)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,6 +26,8 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # isort: skip
 from std_msgs.msg import String  # isort: skip
 
 from fisheye_svp_ros.io.landmark_files import environment
+from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.detector import Detector
 from fisheye_svp_ros.nodes.localizer import Localizer
@@ -333,6 +338,26 @@ def odometry_frame(hour: Hour, pattern: str) -> None:
             points.publish(image_points()),
         ),
     )
+
+
+@tries('Doubtful: points beyond what is known of the lens')
+def beyond_the_calibration(hour: Hour, pattern: str) -> None:
+    lens = replace(load_lens(lens_path('fish214')).svp(), calibration={'reached_deg': 20.0})
+    with TemporaryDirectory() as folder:
+        save_lens(lens, Path(folder) / 'lens.yaml')
+        _, points = framed_sets(hour, f'lens:={folder}/lens.yaml', 'patience:=0.1')
+    hour.says(pattern, lambda: points.publish(image_points()))
+
+
+@tries('Slower for a minute, at the first start with Numba')
+def compiling(hour: Hour, pattern: str) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr('fisheye_svp_ros.optics.engines.find_spec', lambda _: 'there')
+        patch.setattr('fisheye_svp_ros.optics.engines.cache.is_compiled', lambda: False)
+        patch.setattr('fisheye_svp_ros.optics.engines.compilation._CODE', 'input()')
+        patch.setenv('FISHEYE_SVP_ENGINE', 'auto')
+        hour.begin(*SOLVING).start(Localizer)
+    hour.logs(pattern)
 
 
 @tries('All sets fail: camera_info is of another camera')

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
+from fisheye_svp_ros.solve.lens_checks import Extrapolated
+
 _MAX_NAMES = 5
 
 
@@ -100,3 +104,12 @@ def compiled(state: str) -> str:
     if state == 'compiled':
         return 'solving with Numba from now on'
     return f'solving with NumPy: Numba has not compiled ({state})'
+
+
+def points_extrapolated(what: str, beyond: Extrapolated) -> str:
+    """Tell of points, or pixels, where nothing is known of the lens."""
+    return (
+        f'{what}: {100 * beyond.share:.2g} % lie up to '
+        f'{np.degrees(beyond.farthest):.0f} deg from the axis, but image points of the '
+        f'calibration reach {np.degrees(beyond.known):.0f} deg: nothing is known beyond'
+    )
