@@ -242,10 +242,10 @@ def cross_validate(
         weight = linear.data.views.weight[..., None]
         repeating = linear.data.blocks(offsets.views.cross_predictions * weight)
     at = null.columns_and_residual(null.included_columns)
+    rows = null.fixed.border[..., at] if offsets is None else null.leave_one_out(at).rows
     for frame, information in enumerate(null.information_without_frames(at)):
         _, _, combination = refit_shared(null, information, without, held)
-        rows = null.fixed.border if offsets is None else null.leave_one_out.rows
-        residual[frame] = rows[frame][:, at] @ combination
+        residual[frame] = rows[frame] @ combination
     left = project_out(
         (residual * ratio - repeating)[..., None], linear.frame_columns * ratio[..., None]
     )

@@ -85,12 +85,13 @@ def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
     at = null.columns_and_residual(shifts.columns)
     refit_rig = _rig_response(null, at[:-1])
     residual = np.zeros((*linear.residual.shape, 2))
+    rows = null.leave_one_out(at).rows
     for frame, information in enumerate(null.information_without_frames(at)):
         change, added, combination = shifts.refit(null, information)
         new = np.append(now + change - given, np.zeros(len(shifts.columns)))
         off = np.where(of_lens, new * null.scale[at[:-1]] + added, 0.0)
         off[: len(refit_rig)] -= refit_rig @ off
-        residual[frame] = (null.leave_one_out.rows[frame][:, at] @ combination)[:, None]
+        residual[frame] = (rows[frame] @ combination)[:, None]
         residual[frame, :, 0] += null.fixed.border[frame][:, at[:-1]] @ off
     even = ratio[..., None]
     left = project_out(residual * even, linear.frame_columns * even) / even

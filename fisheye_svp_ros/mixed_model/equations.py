@@ -327,6 +327,15 @@ class FactoredEquations:
         logs = log_determinant(self.factor) - log_determinant(self.inverse)
         return float(logs - np.log(priors[priors > 0]).sum())
 
+    def select_border(self, at: Index) -> FactoredEquations:
+        """Return the same with some of the border (m,)."""
+        return replace(
+            self,
+            block_border=self.block_border[..., at],
+            border=self.border[:, at],
+            information=self.information[at[:, None], at],
+        )
+
     def coefficients(self, combination: Array) -> tuple[Array, Array]:
         """Return the coefficients (E, k), (R,) predicted from a combination (X,) of the border."""
         r = solve_upper(self.factor, self.border @ combination)

@@ -251,6 +251,10 @@ class LeaveOneOut(NamedTuple):
     information: Array
     rows: Array
 
+    def select(self, at: Index) -> LeaveOneOut:
+        """Return the same of some of the border (m,)."""
+        return LeaveOneOut(self.information[:, at[:, None], at], self.rows[..., at])
+
 
 def leave_groups_out(
     f: FactoredEquations, random: RandomColumns, group_fixed: Array, border: Array

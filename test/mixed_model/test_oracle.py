@@ -150,6 +150,16 @@ def test_a_group_left_out_is_predicted_as_by_a_fit_without_it(case):
     np.testing.assert_allclose(left_out.rows[4], border[4], atol=1e-9)
 
 
+def test_some_of_the_columns_are_left_out_as_all_of_them_are(case):
+    (_, columns, border), _, _, f, _, _ = case
+    at, none = np.array([1, 2]), np.zeros((GROUPS, ROWS, 0))
+    some = leave_groups_out(f.select_border(at), columns, none, border[..., at])
+    for one, other in zip(
+        some, leave_groups_out(f, columns, none, border).select(at), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+
+
 def test_units_that_are_exact_leave_all_as_it_is(case):
     """Offsets of units, a second grouping factor, of which the variance is zero."""
     (_, columns, border), _, now, f, _, _ = case
