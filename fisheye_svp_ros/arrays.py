@@ -29,6 +29,16 @@ def gather_rows(parts: Sequence[tuple[Index, Array]]) -> Array:
     return whole
 
 
+def symmetric_root(covariance: Array) -> Array:
+    """Return the symmetric root (n, n) of a covariance, whose negative eigenvalues count as zero.
+
+    What is drawn by it moves as little as the covariance does.  The signs of eigenvectors, and
+    their directions where eigenvalues are alike, are those of the last digits.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+
+
 def flat_rows(columns: Array) -> Array:
     """Return columns (..., P) as (rows, P), also where P is 0."""
     return columns.reshape(int(np.prod(columns.shape[:-1])), columns.shape[-1])

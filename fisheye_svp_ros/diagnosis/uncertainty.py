@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array, Index, symmetric_root
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.model_errors import parameter_names, shared_names
 from fisheye_svp_ros.diagnosis.null_model import NullModel
@@ -165,8 +165,7 @@ def draw_models(
             continue
         values, wider = _fit_other_model(null, one, reported, prior)
         step = into[:, one.included]
-        sizes, vectors = np.linalg.eigh(step @ wider @ step.T - known)
-        root = vectors * np.sqrt(np.maximum(sizes, 0.0))
+        root = symmetric_root(step @ wider @ step.T - known)
         change = step @ values - base
         drawn.append(change[:, None] + root @ rng.standard_normal((len(root), count)))
     return np.asarray(np.concatenate(drawn, axis=1) * size[:, None])

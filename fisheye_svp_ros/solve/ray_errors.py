@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.arrays import Array, Mask, symmetric_root
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import Lens
 
@@ -118,8 +118,9 @@ class RayModel(NamedTuple):
         return np.asarray(self.columns[at] @ self._draw_parameters(seed))
 
     def _draw_parameters(self, seed: int) -> Array:
-        values, vectors = np.linalg.eigh(self.covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        errors = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        # Of correlations: rounding of what is large is none of what is small.
+        root = errors[:, None] * symmetric_root(self.covariance / np.outer(errors, errors))
         draws = root @ np.random.default_rng(seed).standard_normal((len(root), SAMPLES))
         if self.others is not None:
             draws[: len(self.others)] += self.others

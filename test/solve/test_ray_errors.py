@@ -96,3 +96,19 @@ def test_a_viewpoint_shift_costs_more_the_nearer_the_landmark_is() -> None:
     model, _ = ray_model(shifted, np.array([[1e-6]]), UV)
     near, middle, far = (one.value for one in model.errors())
     assert near > 2.5 * middle > 5 * far
+
+
+def test_what_is_drawn_follows_the_last_digits_of_a_covariance_no_further() -> None:
+    def moved(step: np.ndarray) -> Lens:
+        return replace(
+            LENS, fx=400 + step[0], fy=400 + step[1], cx=640 + step[2], cy=480 + step[3]
+        )
+
+    covariance = np.diag([0.04, 0.04, 0.09, 0.09])  # eigenvalues that are alike
+    rounding = 1e-16 * np.random.default_rng(1).standard_normal((4, 4))
+    one, other = (
+        ray_model(moved, matrix, UV)[0]
+        for matrix in (covariance, covariance + rounding + rounding.T)
+    )
+    np.testing.assert_allclose(one.errors(), other.errors(), rtol=1e-6)
+    np.testing.assert_allclose(one.sample(1), other.sample(1), atol=1e-6 * one.sd.max())
