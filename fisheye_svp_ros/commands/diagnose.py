@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -146,6 +147,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose, diagnose_against
     from fisheye_svp_ros.planning.plan import check_number
     from fisheye_svp_ros.reporting.terminal import stages
+    from fisheye_svp_ros.reporting.wording.provisional import provisional_headline, what_changed
     from fisheye_svp_ros.solve.measured_poses import poses_by_frame, rig_lenses
     from fisheye_svp_ros.solve.rig_state import free_parameters
     from fisheye_svp_ros.study.trust import known_errors
@@ -165,7 +167,15 @@ def run(args: argparse.Namespace) -> None:
     other = _read(args.against, args, given)[0] if args.against else None
     if args.number and isinstance(lens, Lens):
         check_number(args.number, observations, lens, names)
+    told: list[tuple[str, ...]] = []
     with stages('diagnosing') as progress:
+
+        def tell(names: tuple[str, ...]) -> None:
+            """Show on a terminal, once, what the first round has found."""
+            if not told and sys.stderr.isatty():
+                told.append(names)
+                progress.announce(provisional_headline(names))
+
         settings: dict[str, Any] = {
             'free_intrinsics': free,
             'poses': poses,
@@ -174,6 +184,7 @@ def run(args: argparse.Namespace) -> None:
                 tuple(args.included), effects_left_out(args), args.quick, args.range_m, stated
             ),
             'progress': progress,
+            'provisional': tell,
         }
         try:
             if other is None:
@@ -192,6 +203,8 @@ def run(args: argparse.Namespace) -> None:
             with write_together():
                 _write(args, diagnosis, known, bool(names), wanted)
     _print(diagnosis, known, args, wanted)
+    for names in told:
+        print(*what_changed(names, diagnosis), sep='\n', end='', file=sys.stderr)
     note_wrong_landmarks(diagnosis.evaluation.selection.revision.outliers.landmarks)
     if not args.poses:
         note_unconnected(observations)

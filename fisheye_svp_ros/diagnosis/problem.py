@@ -64,11 +64,16 @@ from fisheye_svp_ros.solve.rig_state import (
 from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
 
 Progress = Callable[[str, float], None]
+Provisional = Callable[[tuple[str, ...]], None]  # told the names of causes
 
 _STEP_OVER_NOISE = 0.1  # a step this small beside the noise is how numbers are written
 # F ratio of what known poses leave and free ones do not.  With poses of the camera: about 1, 1 to
 # 2 beside local errors of board and image that imitate motions; with those of robots: 30 and more.
 _MAX_RATIO = 4.0
+
+
+def tell_nobody(names: tuple[str, ...]) -> None:
+    """Keep what a diagnosis has found so far from everybody."""
 
 
 def can_be_included(name: str) -> bool:
@@ -118,7 +123,8 @@ class Inputs:
     """What a diagnosis is asked about, checked.
 
     observations; lenses: as given, by camera, '' where one is that of all; free: intrinsics that
-    are fitted; poses: those given, by frame; held_out: other frames of the same cameras.
+    are fitted; poses: those given, by frame; held_out: other frames of the same cameras;
+    provisional: told the causes that the first round finds.
     """
 
     observations: Observations
@@ -127,6 +133,7 @@ class Inputs:
     options: DiagnosisOptions
     poses: dict[int, Pose] | None = None
     held_out: Observations | None = None
+    provisional: Provisional = tell_nobody
 
     @classmethod
     def check(

@@ -138,6 +138,14 @@ def select_causes(problem: Problem, progress: Progress) -> Selection:
         # How many causes may be taken in at once.
         most = 1 if _misfit(null) > _LINEAR_LIMIT and not turn else _MAX_EFFECTS
         search = _change_effects(problem, before, null, most)
+        if not turn:
+            problem.inputs.provisional(
+                tuple(
+                    term.name
+                    for term in search.state.terms
+                    if term.effect not in problem.given_effects
+                )
+            )
         if search.state is before.state:
             search = _revise(problem, search, null)
         if search.state is before.state and search.finest == before.finest:

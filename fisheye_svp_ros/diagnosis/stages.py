@@ -42,8 +42,10 @@ from fisheye_svp_ros.diagnosis.problem import (
     DiagnosisOptions,
     Inputs,
     Progress,
+    Provisional,
     find_hand_eye,
     prepare_problem,
+    tell_nobody,
 )
 from fisheye_svp_ros.diagnosis.selection import Selection, select_causes, without_cause
 from fisheye_svp_ros.diagnosis.variance_budget import (
@@ -74,6 +76,7 @@ def diagnose(
     held_out: Observations | None = None,
     options: DiagnosisOptions | None = None,
     progress: Progress = lambda *_: None,
+    provisional: Provisional = tell_nobody,
 ) -> Diagnosis:
     """Find what a lens's simulation gets wrong about observations.
 
@@ -82,7 +85,7 @@ def diagnose(
     poses: by frame, of the camera (of a rig: its right one), or of the flange of a robot that
     carries it, which the data tell apart; held_out: other frames of the same camera
     and target; options: effects to include or leave out; progress: told what is being done, and
-    which share is done.
+    which share is done; provisional: told the names of the causes that the first round finds.
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
     inputs = Inputs.check(
@@ -93,6 +96,7 @@ def diagnose(
         poses=poses,
         held_out=held_out,
     )
+    inputs = replace(inputs, provisional=provisional)
     diagnosis = _run_stages(inputs, progress)
     if diagnosis.noise_px > ROUNDING:
         return diagnosis

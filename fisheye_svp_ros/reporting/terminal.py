@@ -120,11 +120,28 @@ def progress(description: str, total: int | None = None) -> Iterator[Callable[..
         yield lambda count=1: update(advance=count)
 
 
+class Stages:
+    """Progress of work in stages: called with the stage and the share done."""
+
+    def __init__(self, description: str, update: Callable[..., None]) -> None:
+        self._lines, self._description, self._update = ['', ''], description, update
+
+    def __call__(self, stage: str, done: float) -> None:
+        """Show a stage."""
+        self._lines[1] = f'{self._description}: {stage}'
+        self._update(description='\n'.join(filter(None, self._lines)), completed=done)
+
+    def announce(self, news: str) -> None:
+        """Show a line above the stage from now on."""
+        self._lines[0] = news
+        self._update(description='\n'.join(filter(None, self._lines)))
+
+
 @contextmanager
-def stages(description: str) -> Iterator[Callable[[str, float], None]]:
+def stages(description: str) -> Iterator[Stages]:
     """Show a bar while the block runs; call what it yields with the stage and the share done."""
     with _bar(description, 1) as update:
-        yield lambda stage, done: update(description=f'{description}: {stage}', completed=done)
+        yield Stages(description, update)
 
 
 @contextmanager

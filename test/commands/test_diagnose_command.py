@@ -3,7 +3,7 @@
 import json
 import re
 from collections import namedtuple
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -725,3 +725,17 @@ def test_the_depth_of_a_rig_gains_too():
 def test_corners_have_no_dots(board, included, found):
     asked = SimpleNamespace(board=board, included=included, left_out=['skew'])
     assert effects_left_out(asked) == found
+
+
+def test_a_terminal_shows_a_provisional_answer(scene, capsys, monkeypatch):
+    monkeypatch.setattr('sys.stderr.isatty', lambda: True, raising=False)
+    shown = []
+    monkeypatch.setattr(
+        'fisheye_svp_ros.reporting.terminal._bar',
+        lambda *_: nullcontext(lambda **told: shown.append(told['description'])),
+    )
+    assert run('shift.csv', scene, '--quick') == 0
+    printed = capsys.readouterr()
+    words = 'Provisional: The viewpoint of the lens shifts with the angle'
+    assert shown[-1] == f'{words}\ndiagnosing: errors where the truth is known'
+    assert 'rovisional' not in printed.out + printed.err  # nothing has changed
