@@ -159,8 +159,9 @@ def _starts(
     left: ForwardModel, right: ForwardModel, left_views: Views, right_views: Views, systems: int
 ) -> tuple[Pose, Pose]:
     """Return poses (S, V) of the right camera and rigs (S,) from views localized one by one."""
-    left_pose, left_posed = _localize_posable(left, left_views)
-    right_pose, right_posed = _localize_posable(right, right_views)
+    (left_pose, left_posed), (right_pose, right_posed) = _localize_sides(
+        (left, right), (left_views, right_views)
+    )
     lost = np.flatnonzero(~(left_posed | right_posed))
     if lost.size:
         raise GeometryError(
@@ -177,6 +178,20 @@ def _starts(
     from_left = left_pose.reshape(systems, -1).compose(rig.inverse().take(np.s_[:, None]))
     own = right_pose.reshape(systems, -1)
     return own.where(right_posed.reshape(systems, -1), from_left), rig
+
+
+def _localize_sides(
+    models: tuple[ForwardModel, ForwardModel], sides: tuple[Views, Views]
+) -> list[tuple[Pose, Mask]]:
+    """Localize the views of both cameras, together where these have one lens."""
+    left, right = models
+    if left is not right and not (
+        left.is_lens_only and right.is_lens_only and left.lens == right.lens
+    ):
+        return [_localize_posable(*one) for one in zip(models, sides, strict=True)]
+    pose, posed = _localize_posable(left, Views.concatenate(sides))
+    count = len(sides[0].frame)
+    return [(pose.take(part), posed[part]) for part in (slice(count), slice(count, None))]
 
 
 def _localize_posable(model: ForwardModel, views: Views) -> tuple[Pose, Mask]:
