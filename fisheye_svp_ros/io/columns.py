@@ -6,6 +6,7 @@ than most commands need to start.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cache
@@ -143,7 +144,7 @@ def read_table(path: Path, wanted: Callable[[str], bool] = lambda _: True) -> Da
     with open_bytes(path, OutputError) as stream:
         try:
             if path.suffix == '.csv':
-                return _read_csv(stream, usecols=wanted, low_memory=False)
+                return _read_in_pieces(stream, wanted)
             return _read_parquet(pyarrow, stream, wanted)
         except Exception as cause:  # whatever pandas or pyarrow makes of what is damaged
             raise OutputError(f'{path}: not a table ({_brief(cause)})') from cause
@@ -156,6 +157,19 @@ def _read_csv(stream: IO[bytes], **options: Any) -> DataFrame:
     if tuple(map(int, pandas.__version__.split('.')[:2])) < _EXACT_BY_DEFAULT:
         options['float_precision'] = 'round_trip'
     return pandas.read_csv(stream, keep_default_na=False, na_values=[''], **options)
+
+
+def _read_in_pieces(stream: IO[bytes], wanted: Callable[[str], bool]) -> DataFrame:
+    """Read a CSV piece by piece; as one, where a column is numbers here and text there."""
+    from pandas.errors import DtypeWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter('error', DtypeWarning)
+        try:
+            return _read_csv(stream, usecols=wanted)
+        except DtypeWarning:
+            stream.seek(0)
+            return _read_csv(stream, usecols=wanted, low_memory=False)
 
 
 def _brief(cause: Exception) -> str:

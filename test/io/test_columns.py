@@ -73,3 +73,10 @@ def test_a_table_reads_back_as_it_was(tmp_path: Path) -> None:
         assert found['text'] == ['NA', None, 'a,"b"'] and found['empty'] == [None] * 3
     assert (tmp_path / 'table.csv').read_text().splitlines()[1] == '1,0.30000000000000004,NA,'
     assert list(read_table(tmp_path / 'table.csv', lambda name: name == 'text')) == ['text']
+
+
+def test_a_column_is_text_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
+    rows = 200_000
+    (tmp_path / 'a.csv').write_text('a,b\n' + '1,2\n' * rows + 'x,2\n')
+    table = read_table(tmp_path / 'a.csv')
+    assert set(table['a']) == {'1', 'x'} and table['b'].sum() == 2 * (rows + 1)
