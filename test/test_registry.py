@@ -1,5 +1,6 @@
 """Curves, effects and readers of a distribution of the user's own."""
 
+import json
 import os
 import subprocess
 import sys
@@ -7,6 +8,9 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from helpers.nodes import need_ros
+
+from fisheye_svp_ros.io.columns import read_table
 
 ROOT = Path(__file__).parents[1]
 MODULE = '''
@@ -143,6 +147,67 @@ if sys.argv[1] == 'numpy':
 print('done')
 """
 
+NODES = """
+import sys
+
+from helpers.nodes import until
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from diagnostic_msgs.msg import DiagnosticArray
+
+from fisheye_svp_ros.io.decoding import read_key_values
+from fisheye_svp_ros.nodes.localizer import Localizer
+from fisheye_svp_ros.nodes.measured_camera import MeasuredCamera
+
+context = Context()
+context.init(args=[], domain_id=int(sys.argv[1]))
+executor, results = SingleThreadedExecutor(context=context), []
+listener = Node('listener', context=context)
+listener.create_subscription(DiagnosticArray, '/localizer/result', results.append, 10)
+for kind, values in ((Localizer, {'lens': 'lens.yaml'}),
+                     (MeasuredCamera, {'observations': 'seen.semicolon', 'rate': 50.0})):
+    given = [Parameter(name, value=value) for name, value in values.items()]
+    executor.add_node(kind(context=context, parameter_overrides=given))
+executor.add_node(listener)
+until(lambda: executor.spin_once(0.02) or results)
+assert float(read_key_values(results[0])['rms_px']) < 0.15
+context.try_shutdown()
+print('done')
+"""
+SEE = """
+import numpy as np
+from helpers.targets import cube, poses_around
+
+import fisheye_svp_ros as fsvp
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.io.csv_files import write_observations
+from fisheye_svp_ros.simulate.simulation import simulate
+
+rng = np.random.default_rng(2)
+model, landmarks = ForwardModel(fsvp.load_lens('lens.yaml')), cube()
+seen = simulate(model, landmarks, poses_around(landmarks, 12, rng, widest=1.0), 0.05, rng)
+write_observations('seen.csv', seen)
+text = open('seen.csv').read()
+open('seen.semicolon', 'w').write(text.replace(',', ';'))
+"""
+SWEEP = """
+synthetic_camera: {ros__parameters: {lens: lens.yaml, sweep.radius: [2.0, 0.5]}}
+localizer: {ros__parameters: {lens: lens.yaml, svp: false}}
+"""
+COMMANDS = {
+    'localize': 'seen.semicolon --lens lens.yaml -o found',
+    'calibrate': 'seen.semicolon --model rational --image-size 1280x960 -o fitted.yaml',
+    'diagnose': 'seen.semicolon --lens lens.yaml -o causes',
+    'lens': 'lens.yaml',
+    'budget': '--lens lens.yaml -o budget',
+    'plan': '--lens lens.yaml --board chessboard:9x6:25mm --room 0.2 1 -o plan',
+    'render': '--lens lens.yaml --board chessboard:9x6:30mm --count 1 -o photographs',
+    'sweep': 'sweep.yaml -o sweep',
+}
+
 
 def run(folder, *arguments):
     path = os.pathsep.join(map(str, (folder, ROOT, ROOT / 'test')))
@@ -196,3 +261,31 @@ def test_a_broken_entry_point_is_named_in_one_line(old, new, reason, distributio
     done = run(distribution, '-m', 'fisheye_svp_ros.cli', 'budget', '--lens', 'lens.yaml')
     assert done.returncode == 2
     assert reason in done.stderr and done.stderr.count('\n') == 1
+
+
+@pytest.fixture
+def recorded(distribution):
+    """Return the folder with observations in the form of the user's own reader, too."""
+    (distribution / 'see.py').write_text(SEE)
+    (distribution / 'sweep.yaml').write_text(SWEEP)
+    done = run(distribution, 'see.py')
+    assert done.returncode == 0, done.stderr
+    return distribution
+
+
+@pytest.mark.slow
+def test_commands_take_what_a_users_package_adds(recorded):
+    for name, arguments in COMMANDS.items():
+        done = run(recorded, '-m', 'fisheye_svp_ros.cli', name, *arguments.split())
+        assert done.returncode == 0, (name, done.stderr)
+    assert json.loads((recorded / 'found' / 'localize.json').read_text())['rms_px'] < 0.1
+    assert 'model: rational' in (recorded / 'fitted.yaml').read_text()
+    rows = read_table(recorded / 'sweep' / 'sweep.csv')
+    assert rows['localizer.rms_px'].max() < 1e-6
+
+
+def test_nodes_take_what_a_users_package_adds(recorded, ros_domain):
+    need_ros()
+    (recorded / 'nodes.py').write_text(NODES)
+    done = run(recorded, 'nodes.py', str(ros_domain))
+    assert done.stdout.splitlines()[-1:] == ['done'], done.stderr

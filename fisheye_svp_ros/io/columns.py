@@ -125,6 +125,9 @@ class TableParts:
             part = _read_csv(BytesIO(data), dtype=kinds)
             if [*part] != [*kinds] or not data.endswith(b'\n'):
                 raise ValueError('it is cut off, or its columns differ')
+            for name, kind in kinds.items():
+                if part[name].dtype != kind:  # what pandas 2 makes of a number above 2^63
+                    raise ValueError(f'{name} holds a number out of range')
         except Exception as cause:  # whatever pandas makes of what is damaged
             raise OutputError(
                 f'{self._path(number)}: a part of the table is damaged ({_brief(cause)}); remove '
