@@ -9,6 +9,7 @@ and what to do about it, is said as far as a node can see it.
 
 from __future__ import annotations
 
+import os
 import struct
 import time
 from collections import Counter, OrderedDict
@@ -27,11 +28,13 @@ from rclpy.qos import (
     qos_check_compatible,
 )
 from rclpy.serialization import deserialize_message
+from rclpy.utilities import get_rmw_implementation_identifier
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.decoding import nanoseconds
+from fisheye_svp_ros.io.share import config_path
 from fisheye_svp_ros.nodes.quality import INPUT, PREFIX, create_with_qos, overridden, qos_words
-from fisheye_svp_ros.reporting.wording.inputs import messages_lost
+from fisheye_svp_ros.reporting.wording import inputs as wording
 
 _LONG_INTERVALS = 3  # of a topic, without a message: it has stopped
 # Messages by which one subscription of a topic may be ahead of another: as many as may wait.
@@ -43,6 +46,7 @@ _Kind = tuple[bool, bool]  # of a subscription: reliable, latched
 LIMIT = 5.0  # s without a message after which it is said
 _MAX_PROPOSALS = 3  # topics to propose
 _MAX_LOSS = 0.1  # of the messages between two reports, lost on the way
+_PROFILE_VARIABLE, _PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE', 'fastdds/images.xml'
 _LARGE = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 
 
@@ -231,7 +235,8 @@ class Input:
         self._reported = copy(self.count)
         if lost <= _MAX_LOSS * (lost + received):
             return ''
-        return messages_lost(self.name, lost, lost + received, f'{PREFIX}{self.resolved}')
+        remedy = _loss_remedy(self.typename, self.resolved)
+        return wording.messages_lost(self.name, lost, lost + received, remedy)
 
     def _count_losses(self, number: int | None) -> None:
         """Count what is missing between two messages of one publisher, which numbers them.
@@ -374,10 +379,19 @@ def _remedy(one: Input, offers: Sequence[Any]) -> str:
         if one.latched and volatile:
             return ' (volatile: what was sent before this node started is lost; publish it again)'
         return f'; check its own input, and run ros2 topic hz {one.resolved}'
-    override = f'set {PREFIX}{one.resolved}.subscription.reliability:=reliable'
     if all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers):
+        override = f'set {PREFIX}{one.resolved}.subscription.reliability:=reliable'
         return f'; if ros2 topic hz {one.resolved} shows messages, {override}'
-    return f' (best effort loses large messages: raise net.core.rmem_max, or {override})'
+    return f' (best effort loses large messages: {_loss_remedy(one.typename, one.resolved)})'
+
+
+def _loss_remedy(typename: str, topic: str) -> str:
+    """Say what helps against the loss of messages of a type on a topic."""
+    if typename not in _LARGE:
+        return wording.small_message_remedy(f'{PREFIX}{topic}')
+    takes_profiles = get_rmw_implementation_identifier().startswith('rmw_fastrtps')
+    named = takes_profiles and _PROFILE_VARIABLE not in os.environ
+    return wording.large_message_remedy(str(config_path(_PROFILE)) if named else '')
 
 
 def _comes_from_elsewhere(node: Any, topic: str) -> bool:

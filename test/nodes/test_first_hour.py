@@ -114,6 +114,7 @@ def hour(
     graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> Hour:
     monkeypatch.setattr('fisheye_svp_ros.nodes.base.LIMIT', 0.5)
+    monkeypatch.delenv('FASTRTPS_DEFAULT_PROFILES_FILE', raising=False)
     monkeypatch.setattr('fisheye_svp_ros.nodes.detector._MIN_FAILURES', 3)
     return Hour(graph, capfd)
 

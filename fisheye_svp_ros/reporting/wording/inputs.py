@@ -73,12 +73,20 @@ def inactive(node: str) -> str:
     return f'not active, so no set is solved; run ros2 lifecycle set {node} activate'
 
 
-def messages_lost(topic: str, count: int, of: int, override: str) -> str:
-    """Tell of messages that were sent and have not come; override: of the QoS."""
-    return (
-        f'{topic}: {count} of {of} messages were lost; raise net.core.rmem_max, or set '
-        f'{override}.subscription.reliability:=reliable'
-    )
+def messages_lost(topic: str, count: int, of: int, remedy: str) -> str:
+    """Tell of messages that were sent and have not come."""
+    return f'{topic}: {count} of {of} messages were lost; {remedy}'
+
+
+def small_message_remedy(override: str) -> str:
+    """Say what helps against the loss of messages; override: of the QoS."""
+    return f'raise net.core.rmem_max, or set {override}.subscription.reliability:=reliable'
+
+
+def large_message_remedy(profile: str) -> str:
+    """Say what helps against the loss of images; profile: of Fast DDS, empty for none to name."""
+    memory = f'start both nodes with FASTRTPS_DEFAULT_PROFILES_FILE={profile}, or ' * bool(profile)
+    return f'{memory}raise net.core.rmem_max, or have it sent reliably'
 
 
 def no_camera_info(topic: str) -> str:
