@@ -63,6 +63,17 @@ def viewpoint_shift(rng: Rng, scene: Scene) -> Form:
     )
 
 
+def pupil_decentering(rng: Rng, scene: Scene) -> Form:
+    """The entrance pupil moves sideways, as the square of the angle or of its sine."""
+    phi, even = rng.uniform(0, 2 * np.pi), rng.random() < 0.5
+    towards = np.array([np.cos(phi), np.sin(phi), 0.0])
+
+    def growth(theta: Array) -> Array:
+        return np.asarray(theta**2 if even else np.sin(theta) ** 2)
+
+    return lambda a: Departure(pupil=lambda t, _: a * growth(t)[:, None] * towards)
+
+
 def radial_profile(rng: Rng, scene: Scene) -> Form:
     """h(θ) departs by a random odd polynomial without its linear term."""
     share = rng.normal(size=3) * [1, 0.7, 0.4]
@@ -146,6 +157,13 @@ def focal_drift(rng: Rng, scene: Scene) -> Form:
     curve = rng.normal() * t + rng.normal() * np.sin(
         np.pi * rng.uniform(0.8, 2) * t + rng.uniform(0, 2 * np.pi)
     )
+    curve = ((curve - curve.mean()) / curve.std())[scene.frame]
+    return lambda a: Departure(focal=(1 + a * curve)[:, None] * np.ones(2))
+
+
+def thermal_drift(rng: Rng, scene: Scene) -> Form:
+    """The focal length settles, as a camera warms up."""
+    curve = rng.choice([-1, 1]) * np.exp(-_over_time(scene) / rng.uniform(0.1, 0.6))
     curve = ((curve - curve.mean()) / curve.std())[scene.frame]
     return lambda a: Departure(focal=(1 + a * curve)[:, None] * np.ones(2))
 
@@ -295,6 +313,7 @@ EFFECTS: dict[str, Effect] = {
     'skew': Effect('lens', '1', 0.02, skew),
     'decentering': Effect('lens', 'px', 20.0, decentering),
     'sensor_tilt': Effect('lens', 'rad', 0.1, sensor_tilt),
+    'pupil_decentering': Effect('lens', 'm', 0.03, pupil_decentering),
     'flat_port': Effect('lens', 'm', 0.03, flat_port, widest=1.35),
     'focal_drift': Effect('lens or frame', '1', 0.05, focal_drift),
     'session_step': Effect('lens or frame', '1', 0.05, session_step),
