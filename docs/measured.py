@@ -67,6 +67,15 @@ CLAIMS = (
         'make study NAME=ray_coverage',
     ),
     Claim(
+        'What an oracle sees is named: a shift in few photographs, a drift without times',
+        'power',
+        r'shift, few \| 5\.5 to 8 \| (\d+ of \d+).*?no times \| 7 to 11 \| (\d+ of \d+)'
+        r'.*?false name: [\d.]+ % \((\d+)/(\d+)\)',
+        '{0} and {1}; false names in {2} of {3} sets',
+        'a test that is told what to look for',
+        'make study NAME=power',
+    ),
+    Claim(
         "Kita's tables 1 and 2 are reproduced",
         'paper',
         r'z and residual \| (\d+ of \d+) within 10 %.*?\| (\d+) and (\d+) \|',
