@@ -21,7 +21,7 @@ import numpy as np
 from benchmark import study
 from benchmark.studies.boards import FEW, FRAMES, HEIGHT, WIDTH, draw_warped_set
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.solve.ray_errors import typical_points
+from fisheye_svp_ros.solve.ray_errors import RANGES, typical_points
 
 
 class Outcome(NamedTuple):
@@ -98,6 +98,13 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
             rows,
         ),
     ]
+    outside = np.mean([one.outside.any(axis=1) for one in outcomes], axis=0)
+    for name, shares in zip(('given', 'extended'), outside, strict=True):
+        each = ', '.join(
+            f'{100 * (1 - share):.0f} % at {far:g} m'
+            for far, share in zip(RANGES, shares, strict=True)
+        )
+        lines += ['', f'Within, of the {name} lens: {each}.']
     for name, some in {
         'all': list(outcomes),
         'those offered': [one for one in outcomes if one.offered],

@@ -127,11 +127,14 @@ class EffectTests:
         """Return twice the logarithm of the odds that an effect of such a score is there (BIC).
 
         What counts as so many observations are the frames: points of one have errors in common.
+        Before the data one of all effects that are tested is expected.
         Source: Raftery 1995, eq. 35; Pauler, The Schwarz criterion and related methods for normal
-        linear models (1998), for the number.
+        linear models (1998), for the number; Scott and Berger, Bayes and empirical-Bayes
+        multiplicity adjustment in the variable-selection problem (2010), for the prior.
         """
         frames = max(self.null.linear.data.frames, _MIN_FRAMES)
-        return float(score.statistic - score.rank * np.log(frames))
+        prior = 2 * np.log(max(self.effect_count, 1))
+        return float(score.statistic - score.rank * np.log(frames) - prior)
 
     def candidates(
         self,
