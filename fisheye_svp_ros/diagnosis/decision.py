@@ -109,8 +109,8 @@ class Decision:
 class LensOffset(NamedTuple):
     """How far the lens as given is off what the data say.
 
-    mrad: least rms of the errors of its rays at 1 m (95 % sure), by the fit with causes or that
-    without, whichever is nearer; ratio: of the distance over what the stated errors and those of
+    mrad: least rms of the errors of its rays at 1 m (95 % sure), by the fit with causes or one
+    without, whichever is nearest; ratio: of the distance over what the stated errors and those of
     the fit let expect, by their covariance; p_value: of so much by chance; px: mrad in the image;
     stated: whether the lens file states errors; camera: whose lens, of several; gain: its expected
     error over that of a fresh calibration.

@@ -40,7 +40,7 @@ from fisheye_svp_ros.solve.ray_errors import (
     typical_points,
     without_motion,
 )
-from fisheye_svp_ros.solve.rig_state import Linearization
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState
 
 _BOUNDED_EFFECTS = ('viewpoint_shift', 'sensor_tilt', 'decentering')
 _NORMAL_95 = 1.96
@@ -206,7 +206,10 @@ def find_lens_rays(
     known = LensCovariance.from_model(
         evaluation.null, evaluation.averaged_model, None if quick else evaluation.other_models
     )
-    before = evaluation.extended_lenses(evaluation.simulation.state)
+    fits = [
+        evaluation.extended_lenses(state)
+        for state in (evaluation.simulation.state, _generalized_fit(evaluation.selection.first))
+    ]
     views = known.linear.data.views
     errors, offsets, asked = {}, [], evaluation.problem.options.range_m
     for number, (name, given) in enumerate(lenses.items()):
@@ -222,10 +225,21 @@ def find_lens_rays(
             errors[name]['extended'].append(wider.errors()[-1])
         if _is_of_these_data(evaluation, given):
             continue  # a fresh calibration is this one
-        fitted = _difference(model, points_on_rays(before[name], uv[there]))
-        one = _offset(model, (off, off - fitted), given, uv[there], evaluation.noise_px)
+        nearer = [off - _difference(model, points_on_rays(fit[name], uv[there])) for fit in fits]
+        one = _offset(model, (off, *nearer), given, uv[there], evaluation.noise_px)
         offsets.append(one._replace(camera=name if len(lenses) > 1 else ''))
     return errors, least_likely_offset(offsets)
+
+
+def _generalized_fit(null: NullModel) -> RigState:
+    """Return the state that generalized least squares finds, as `calibrate` writes it.
+
+    Least squares bends the lens to the board, and is far from it for that.
+    """
+    own, linear = null.included_columns, null.linear
+    inverse = pseudo_inverse(null.information[np.ix_(own, own)], 1e-13)
+    step = inverse @ null.information[own, -1] / null.scale[own]
+    return linear.state.retract(linear.free, np.zeros((linear.data.frames, 6)), step)
 
 
 def _is_of_these_data(evaluation: Evaluation, lens: Lens) -> bool:
@@ -286,7 +300,7 @@ def _difference(model: RayModel, points: Array) -> Array:
 def _offset(
     model: RayModel, off: Sequence[Array], given: Lens, uv: Array, noise: float
 ) -> LensOffset:
-    """Return how far a lens is off the nearer of two fits, and how often chance does as much.
+    """Return how far a lens is off the nearest of some fits, and how often chance does as much.
 
     By the covariance of what both may be off: a small change counts where it is known well.
     noise: px; angles far below it, and what a large change is by more than linear, do not count.
