@@ -83,6 +83,7 @@ all commands: fisheye-svp --help
 _SOLVING = ('budget', 'calibrate', 'demo', 'detect', 'diagnose', 'localize', 'paper', 'sweep')
 # Others project many points at once, for which the compiled engine takes every core.
 _ON_ONE_THREAD = ('calibrate', 'diagnose', 'sweep')
+_ON_LARGE_ARRAYS = ('calibrate', 'diagnose')
 _SIGNAL_HANDLERS = ('record', 'run', 'watch')  # these end themselves on SIGTERM
 _BAD_INPUT = 2
 _EXIT_SIGINT = 130  # 128 + SIGINT, as a shell reports it
@@ -142,6 +143,8 @@ def _run(arguments: Sequence[str]) -> None:
     named = next((word for word in arguments if not word.startswith('-')), '')
     if named in _ON_ONE_THREAD:
         set_thread_count()
+    if named in _ON_LARGE_ARRAYS:
+        import_module('fisheye_svp_ros.memory').keep_memory()
     if named in COMMANDS:
         module = import_module(f'fisheye_svp_ros.commands.{named}')
         module.add_arguments(commands.choices[named])
