@@ -22,8 +22,8 @@ sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
 
 from helpers.lasting import LastingWorker  # noqa: E402
 from helpers.nodes import TIMEOUT, Caller, NodeProcess  # noqa: E402
+from helpers.shared_memory import remove_orphans, segments  # noqa: E402
 
-from fisheye_svp_ros.commands.processes import remove_orphans, segments  # noqa: E402
 from fisheye_svp_ros.optics import engines  # noqa: E402
 
 _SEGMENTS = segments()

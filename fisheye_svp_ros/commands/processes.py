@@ -1,21 +1,16 @@
-"""Commands as processes of their own: with ROS 2, started together, ended in order.
-
-A process that is killed leaves shared memory of Fast DDS behind, which goes with the others.
-"""
+"""Commands as processes of their own: with ROS 2, started together, ended in order."""
 
 from __future__ import annotations
 
 import ctypes
-import fcntl
 import os
 import random
-import re
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -32,10 +27,6 @@ _POLL = 0.05  # s
 _PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of <sys/prctl.h>
 _END = 4000  # bytes
 _GRACE = 10.0  # s to end after a signal
-_SHARED_MEMORY = Path('/dev/shm')
-# A segment of a participant or the port of a transport; locks and a semaphore lie beside them.
-_SEGMENT = re.compile(r'fastrtps_([0-9a-f]{16}|port\d+)')
-_SETTLING_TIME = 0.2  # s, more than a process takes from making a segment to locking it
 
 
 def missing_rclpy() -> str:
@@ -63,14 +54,13 @@ def prepare_ros() -> None:
 
 
 class Processes:
-    """A context manager that leaves no process and no shared memory; each writes DIR/NAME.log."""
+    """A context manager that leaves no process behind; each writes DIR/NAME.log."""
 
     def __init__(self, logs: Path) -> None:
         self._logs = logs
         self._environment = {**os.environ, 'ROS_DOMAIN_ID': domain(), 'PYTHONUNBUFFERED': '1'}
         self._environment.setdefault(_RANGE, _LOCALHOST)
         self._running: dict[str, subprocess.Popen[bytes]] = {}
-        self._segments = segments()
 
     def __enter__(self) -> Processes:
         self._logs.mkdir(parents=True, exist_ok=True)
@@ -85,8 +75,6 @@ class Processes:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-        if any((process.returncode or 0) < 0 for process in self._running.values()):
-            remove_orphans(self._segments)
 
     def start(self, name: str, arguments: Sequence[str]) -> None:
         """Start `fisheye-svp ARGUMENTS`."""
@@ -163,56 +151,3 @@ def domain() -> str:
                 continue
         return str(number)
     raise GraphError('all ROS domains from 1 to 101 are in use; set ROS_DOMAIN_ID')
-
-
-def segments() -> set[str]:
-    """Return the names of all segments and ports of shared memory that are there."""
-    with suppress(OSError):  # of Linux
-        return {path.name for path in _SHARED_MEMORY.iterdir() if _SEGMENT.fullmatch(path.name)}
-    return set()
-
-
-def remove_orphans(before: Set[str]) -> None:
-    """Remove shared memory that was not there before and that no process holds."""
-    found = segments() - before
-    if found:
-        time.sleep(_SETTLING_TIME)
-    held = _locked_inodes()
-    for name in found:
-        locks = [_SHARED_MEMORY / f'{name}{lock}' for lock in ('_el', '_sl')]
-        # To try a lock is to take it for a moment, in which its process might want it.
-        if any(_inode(lock) in held for lock in locks) or any(map(_is_locked, locks)):
-            continue
-        for path in (_SHARED_MEMORY / name, *locks, _SHARED_MEMORY / f'sem.{name}_mutex'):
-            with suppress(OSError):  # gone, or somebody else's
-                path.unlink()
-
-
-def _locked_inodes() -> set[int]:
-    """Return the inodes of all files that processes of this namespace hold locked."""
-    with suppress(OSError):  # of Linux
-        return {
-            int(inode)
-            for inode in re.findall(
-                r'FLOCK .* [0-9a-f]+:[0-9a-f]+:(\d+) ', Path('/proc/locks').read_text()
-            )
-        }
-    return set()
-
-
-def _inode(path: Path) -> int:
-    with suppress(OSError):
-        return path.stat().st_ino
-    return 0
-
-
-def _is_locked(path: Path) -> bool:
-    """Say whether a living process holds the lock of a file; it may be of another namespace."""
-    try:
-        with path.open('rb') as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:  # there is none
-        return False
-    return False

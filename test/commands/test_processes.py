@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import fcntl
-import os
-import re
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from helpers import shared_memory
 from helpers.nodes import need_ros, until
 
 from fisheye_svp_ros.cli import main
-from fisheye_svp_ros.commands import processes
 from fisheye_svp_ros.commands.node_sweeps import lens_folder, read_sweep
-from fisheye_svp_ros.commands.processes import Processes, remove_orphans, segments
-from fisheye_svp_ros.errors import GraphError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.share import lens_path
 
@@ -54,55 +50,19 @@ def test_children_end_with_their_parent(tmp_path: Path, number: signal.Signals) 
     until(lambda: not any(map(_runs, children)), 20)
 
 
-def _held(pid: int) -> set[str]:
-    """Return the segments that a process has made, whose locks it alone holds.
-
-    Neither those of others, which it maps too, nor ports, which others soon have.
-    """
-    files = map(_target, Path(f'/proc/{pid}/fd').iterdir())
-    return {
-        segment[1]
-        for file in files
-        if (segment := re.fullmatch(r'/dev/shm/(fastrtps_[0-9a-f]{16})_el', file))
-    }
-
-
-def _target(link: Path) -> str:
-    try:
-        return str(link.readlink())
-    except OSError:  # closed meanwhile
-        return ''
-
-
-def test_a_node_that_is_killed_leaves_no_shared_memory(tmp_path: Path, ros_domain: int) -> None:
-    need_ros()
-    with Processes(tmp_path) as processes:
-        for name in ('killed', 'other'):
-            processes.start(name, ['run', 'localizer'])
-        killed, other = (one.pid for one in processes._running.values())
-        left, ended = (until(lambda pid=pid: _held(pid)) for pid in (killed, other))
-        os.kill(killed, signal.SIGKILL)
-        with pytest.raises(GraphError, match='killed ended with status -9'):
-            processes.wait(['killed'], 60.0)
-        # What a living process holds stays.
-        remove_orphans(segments() - ended)
-        assert _held(other) <= segments()
-    assert not (left | ended) & segments()
-
-
 def test_shared_memory_of_a_living_process_is_left_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nor is its lock tried, which it might want at that moment; new segments have none yet."""
-    monkeypatch.setattr(processes, '_SHARED_MEMORY', tmp_path)
-    monkeypatch.setattr(processes, '_is_locked', lambda lock: False)
+    monkeypatch.setattr(shared_memory, '_SHARED_MEMORY', tmp_path)
+    monkeypatch.setattr(shared_memory, '_is_locked', lambda lock: False)
     held, orphan = (tmp_path / f'fastrtps_port{number}' for number in (1, 2))
     for file in (held, orphan):
         file.touch()
         file.with_name(f'{file.name}_el').touch()
     with held.with_name('fastrtps_port1_el').open('rb') as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        remove_orphans(set())
+        shared_memory.remove_orphans(set())
         assert held.exists() and not orphan.exists()
 
 
