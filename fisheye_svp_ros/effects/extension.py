@@ -156,7 +156,7 @@ def extend_lens(lens: Lens, terms: Iterable[ModelTerm], seen: Observations | Non
 
 def curved_lens(lens: Lens, terms: Iterable[ModelTerm]) -> Lens:
     """Return a lens with what effects add to its curves; its field ends where they do."""
-    curved = reduce(lambda one, term: term.effect.with_curves(one, term.values), terms, lens)
+    curved = reduce(lambda known, term: term.effect.with_curves(known, term.values), terms, lens)
     if curved is lens:
         return lens
     return replace(curved, max_incidence=min(lens.max_incidence, curve_limit(curved)))

@@ -89,8 +89,8 @@ class ForwardModel:
         if not isinstance(lens, Lens):
             if len(lens) > 1:
                 self.cameras = tuple(
-                    ForwardModel(one, None if terms is None else camera_terms(terms, i))
-                    for i, one in enumerate(lens)
+                    ForwardModel(own, None if terms is None else camera_terms(terms, i))
+                    for i, own in enumerate(lens)
                 )
                 terms = ()
             lens = lens[0]

@@ -132,7 +132,7 @@ class LandmarkScaleEffect(Effect):
         if self.plane:
             x, y = np.reshape(self.plane, (2, 3))
             stretches = np.outer(x, x) - np.outer(y, y), np.outer(x, y) + np.outer(y, x)
-            return np.stack([arm @ one / 2 for one in stretches], axis=-1)
+            return np.stack([arm @ stretch / 2 for stretch in stretches], axis=-1)
         contrasts = np.array([[0.5, -0.5, 0.0], [0.0, 0.0, 1.0]])[: self.axes - 1]
         return np.asarray(arm[..., None] * contrasts.T)
 
@@ -165,7 +165,7 @@ class TargetShapeEffect(Effect):
         highest = min(board.highest_degree for board in boards)
         forms: list[Effect] = [cls(degree, every) for degree in _DEGREES if degree <= highest]
         if len(every) > 1:
-            forms.extend(cls(2, (one,)) for one in every)
+            forms.extend(cls(2, (number,)) for number in every)
         return forms
 
     def merge_with(self, other: Self) -> Effect:
@@ -233,7 +233,7 @@ class BoardPoseEffect(Effect):
             for board in scene.boards
             if board.id != reference
         ]
-        forms: list[Effect] = [cls((one,)) for one in others]
+        forms: list[Effect] = [cls((landmark,)) for landmark in others]
         return forms if len(others) == 1 else [cls(tuple(others)), *forms]
 
     def merge_with(self, other: Self) -> Effect:

@@ -67,11 +67,11 @@ class KnownTarget(NamedTuple):
     def maps(self, moved: Array) -> list[BoardMap]:
         """Return displacements (L, 3) board by board."""
         maps = []
-        for one in find_boards(self.points, self.board):
-            mine = self.board == one.id
-            local = less_similarity(self.points[mine], moved[mine]) @ one.axes.T
-            place = one.to_board(self.points[mine])[:, :2] * one.size
-            maps.append(BoardMap(one.id, place, local[:, 2], local[:, :2]))
+        for board in find_boards(self.points, self.board):
+            mine = self.board == board.id
+            local = less_similarity(self.points[mine], moved[mine]) @ board.axes.T
+            place = board.to_board(self.points[mine])[:, :2] * board.size
+            maps.append(BoardMap(board.id, place, local[:, 2], local[:, :2]))
         return maps
 
 
