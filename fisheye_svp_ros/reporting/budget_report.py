@@ -102,7 +102,7 @@ def answer(points: Sequence[Point], asked: BudgetRequest) -> str:
     unknown = [point for point in judged if point.kept is None]
     if not broken and not unknown:
         return f'Yes: {where} {asked.model} keeps every limit.'
-    untold = ' and '.join(_LABELS[one.quantity] for one in unknown) + ' cannot be computed there'
+    untold = ' and '.join(_LABELS[part.quantity] for part in unknown) + ' cannot be computed there'
     if not broken:
         return (
             f'Not known: {where} {asked.model} keeps {len(judged) - len(unknown)} of '

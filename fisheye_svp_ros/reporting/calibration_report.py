@@ -37,50 +37,50 @@ def write_calibration_report(
             'calibration.html',
             command=command,
             standard_errors=STANDARD_ERRORS,
-            cameras=[_camera(name, one) for name, one in cameras.items()],
+            cameras=[_camera(name, camera) for name, camera in cameras.items()],
         ),
     )
 
 
-def _camera(name: str, one: CalibratedCamera) -> dict[str, Any]:
-    rays = _rays(one)
-    figures = one.lens.calibration or {}
+def _camera(name: str, camera: CalibratedCamera) -> dict[str, Any]:
+    rays = _rays(camera)
+    figures = camera.lens.calibration or {}
     return {
         'name': name,
-        'lens': one.lens.name,
-        'source': one.table.source,
+        'lens': camera.lens.name,
+        'source': camera.table.source,
         'points': figures['observations'],
         'frames': figures['frames'],
-        'photographs': bool(one.table.photographs),
+        'photographs': bool(camera.table.photographs),
         'rms': figures['rms_px'],
         'estimate': estimate_sentence(figures),
-        'noise': one.result.sigma,
-        'warnings': one.warnings,
-        'rows': one.parameter_rows(),
-        'ranged': any(row[3] for row in one.parameter_rows()),
-        'reached': float(np.degrees(one.result.reached)),
+        'noise': camera.result.sigma,
+        'warnings': camera.warnings,
+        'rows': camera.parameter_rows(),
+        'ranged': any(row[3] for row in camera.parameter_rows()),
+        'reached': float(np.degrees(camera.result.reached)),
         'errors': [
             (f'{e.range_m:g}', f'{1e3 * e.value:.2g}', f'{1e3 * e.low:.2g}', f'{1e3 * e.high:.2g}')
             for e in rays[1].errors()
         ],
-        'coverage': _drawn(_coverage, one),
-        'residuals': _drawn(_residuals, one),
-        'frames_picture': _drawn(_frames, one),
-        'uncertainty': _drawn(_uncertainty, one, *rays),
+        'coverage': _drawn(_coverage, camera),
+        'residuals': _drawn(_residuals, camera),
+        'frames_picture': _drawn(_frames, camera),
+        'uncertainty': _drawn(_uncertainty, camera, *rays),
     }
 
 
-def _rays(one: CalibratedCamera) -> tuple[Array, RayModel]:
+def _rays(camera: CalibratedCamera) -> tuple[Array, RayModel]:
     """Return image points (G, 2) and how the fitted parameters move their rays."""
-    names = one.result.adjusted.names
-    values = parameter_values(one.lens, names)
+    names = camera.result.adjusted.names
+    values = parameter_values(camera.lens, names)
 
     def perturb_lens(step: Array) -> Lens:
-        return one.lens.with_parameters(names, [*np.add(values, step).tolist()])
+        return camera.lens.with_parameters(names, [*np.add(values, step).tolist()])
 
-    views = one.result.views
+    views = camera.result.views
     uv = typical_points(views.uv[views.used])
-    model, there = ray_model(perturb_lens, one.trust.covariance, uv)
+    model, there = ray_model(perturb_lens, camera.trust.covariance, uv)
     return uv[there], model
 
 
@@ -101,16 +101,16 @@ def _image(axis: Any, lens: Lens) -> None:
     )
 
 
-def _coverage(figure: Any, one: CalibratedCamera) -> None:
+def _coverage(figure: Any, camera: CalibratedCamera) -> None:
     image, field = figure.subplots(1, 2)
-    views = one.result.views
+    views = camera.result.views
     image.plot(*views.uv[views.used].T, '.', color=OURS, ms=2)
-    _image(image, one.lens)
+    _image(image, camera.lens)
     image.set_title('image points')
-    points = one.result.adjusted.pose.into_body(views.points)[views.used]
+    points = camera.result.adjusted.pose.into_body(views.points)[views.used]
     distance = np.linalg.norm(points, axis=-1)
     field.plot(np.degrees(np.arccos(points[:, 2] / distance)), distance, '.', color=OURS, ms=2)
-    field.axvline(np.degrees(one.lens.max_incidence), color=PUBLISHED, lw=1)
+    field.axvline(np.degrees(camera.lens.max_incidence), color=PUBLISHED, lw=1)
     field.set(
         xlabel='incidence angle / deg',
         ylabel='distance / m',
@@ -120,10 +120,10 @@ def _coverage(figure: Any, one: CalibratedCamera) -> None:
     )
 
 
-def _residuals(figure: Any, one: CalibratedCamera) -> None:
+def _residuals(figure: Any, camera: CalibratedCamera) -> None:
     image, angles = figure.subplots(1, 2)
-    views, lens = one.result.views, one.lens
-    uv, residual = views.uv[views.used], one.result.adjusted.residual[views.used]
+    views, lens = camera.result.views, camera.lens
+    uv, residual = views.uv[views.used], camera.result.adjusted.residual[views.used]
     step = max(1, len(uv) // _ARROWS)
     size = np.linalg.norm(residual, axis=1)
     typical = max(float(np.quantile(size, 0.9)), 1e-9)
@@ -141,7 +141,7 @@ def _residuals(figure: Any, one: CalibratedCamera) -> None:
     _image(image, lens)
     arm = uv - (lens.cx, lens.cy)
     radial = (residual * arm).sum(axis=1) / np.maximum(np.linalg.norm(arm, axis=1), 1e-9)
-    points = one.result.adjusted.pose.into_body(views.points)[views.used]
+    points = camera.result.adjusted.pose.into_body(views.points)[views.used]
     theta = np.degrees(np.arccos(points[:, 2] / np.linalg.norm(points, axis=-1)))
     angles.plot(theta, radial, '.', color=OURS, ms=2, alpha=0.4)
     parts = np.array_split(np.argsort(theta), max(1, min(16, len(theta) // 8)))
@@ -157,28 +157,28 @@ def _residuals(figure: Any, one: CalibratedCamera) -> None:
     angles.legend(loc='upper right')
 
 
-def _frames(figure: Any, one: CalibratedCamera) -> None:
-    axis, views = figure.subplots(), one.result.views
-    squares = np.where(views.used, (one.result.adjusted.residual**2).sum(axis=-1), 0.0)
+def _frames(figure: Any, camera: CalibratedCamera) -> None:
+    axis, views = figure.subplots(), camera.result.views
+    squares = np.where(views.used, (camera.result.adjusted.residual**2).sum(axis=-1), 0.0)
     rms = np.sqrt(squares.sum(axis=1) / views.used.sum(axis=1))
     place = np.arange(len(rms))
     axis.bar(place, rms, color=OURS)
     axis.axhline(float(np.median(rms)), color=PUBLISHED, lw=1, label='median')
     step = -(-len(rms) // _TICKS)
     names = [
-        frame_name(one.table, frame).removeprefix('frame ')
+        frame_name(camera.table, frame).removeprefix('frame ')
         for frame in views.frame[::step].tolist()
     ]
     axis.set_xticks(place[::step], names, rotation=90, fontsize=7)
-    axis.set(ylabel='rms residual / px', xlabel='' if one.table.photographs else 'frame')
+    axis.set(ylabel='rms residual / px', xlabel='' if camera.table.photographs else 'frame')
     axis.legend(loc='upper right')
 
 
-def _uncertainty(figure: Any, one: CalibratedCamera, uv: Array, rays: RayModel) -> None:
+def _uncertainty(figure: Any, camera: CalibratedCamera, uv: Array, rays: RayModel) -> None:
     image, angles = figure.subplots(1, 2)
     shown = image.scatter(*uv.T, c=1e3 * rays.sd[-1], s=9, cmap='viridis')
     figure.colorbar(shown, ax=image, label=f'standard error at {RANGES[-1]:g} m / mrad')
-    _image(image, one.lens)
+    _image(image, camera.lens)
     axis = rays.points[-1] / np.linalg.norm(rays.points[-1], axis=-1, keepdims=True)
     theta = np.degrees(np.arccos(np.clip(axis[:, 2], -1, 1)))
     for sd, range_m, color in zip(rays.sd, RANGES, (PUBLISHED, FAINT, OURS), strict=True):

@@ -87,9 +87,9 @@ class CalibratedCamera:
         """
         errors = dict((self.lens.calibration or {}).get('stderr', {}))
         ranges = {
-            name: interval(one.low, one.high)
-            for name, one in self.trust.admissible.items()
-            if not one.settled
+            name: interval(limits.low, limits.high)
+            for name, limits in self.trust.admissible.items()
+            if not limits.settled
         }
         for known in (errors, ranges):
             if 'f' in known:

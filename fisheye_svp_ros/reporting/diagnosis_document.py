@@ -120,7 +120,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         'observations': d.observations,
         'base': base,
         'components': [part._asdict() for part in d.components],
-        'causes': [_cause(one) for one in d.causes],
+        'causes': [_cause(cause) for cause in d.causes],
         'named': named,
         'lens': {
             **lens,
@@ -130,8 +130,8 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         },
         'extended': extended,
         'file': d.file._asdict(),
-        'candidates': [_candidate(one) for one in d.candidates],
-        'decision': {name: _decision(one) for name, one in d.decision.items()},
+        'candidates': [_candidate(candidate) for candidate in d.candidates],
+        'decision': {about: _decision(decision) for about, decision in d.decision.items()},
         'adequacy': [flaw_document(flaw) for flaw in d.adequacy.flaws],
         'reached_deg': degrees(d.adequacy.reached),
         'photographs': [
@@ -141,84 +141,84 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
             ).items()
         ],
         'gross': d.gross,
-        'advice': [_advice(one) for one in d.advice],
+        'advice': [_advice(advice) for advice in d.advice],
         'remaining': {'structure': [s._asdict() for s in d.remaining]},
         'untestable': [{'effect': e, 'why': why} for e, why in d.untestable.items()],
         'gain': d.figures.gain.interval,
         'intrinsics': {name: asdict(value) for name, value in d.evaluation.intrinsics.items()},
         'uncertainty': d.evaluation.uncertainty,
-        'trace': [_step(one) for one in d.trace],
+        'trace': [_step(finding) for finding in d.trace],
         **_external(d),
-        'turned': [asdict(one) for one in d.turned],
+        'turned': [asdict(view) for view in d.turned],
         **({'hand_eye': d.hand_eye.to_dict()} if d.hand_eye else {}),
     }
 
 
-def _decision(one: Decision) -> DecisionEntry:
+def _decision(decision: Decision) -> DecisionEntry:
     entry: DecisionEntry = {
-        'say': one.say,
-        'why': decision_reason(one),
-        'figure': one.figure._asdict(),
-        'confidence': one.confidence,
+        'say': decision.say,
+        'why': decision_reason(decision),
+        'figure': decision.figure._asdict(),
+        'confidence': decision.confidence,
     }
-    if one.bound:
-        entry['bound'] = [asdict(bound) for bound in one.bound]
+    if decision.bound:
+        entry['bound'] = [asdict(bound) for bound in decision.bound]
     return entry
 
 
-def _cause(one: Cause) -> CauseEntry:
+def _cause(cause: Cause) -> CauseEntry:
     return {
-        'effect': one.effect,
-        'form': one.form,
-        'parameters': one.parameters,
-        'p_value': one.p_value,
-        'probability': one.probability,
-        'status': one.status.value,
-        'share': one.share,
-        'survives': one.survives,
-        'heldout_rms_px': one.heldout_rms_px,
-        'gain': one.gain,
-        'indistinguishable_from': one.indistinguishable_from,
-        'odds': dict(one.odds),
-        'to_separate': separation(one),
-        'refuted_by_frames': one.refuted_by_frames,
+        'effect': cause.effect,
+        'form': cause.form,
+        'parameters': cause.parameters,
+        'p_value': cause.p_value,
+        'probability': cause.probability,
+        'status': cause.status.value,
+        'share': cause.share,
+        'survives': cause.survives,
+        'heldout_rms_px': cause.heldout_rms_px,
+        'gain': cause.gain,
+        'indistinguishable_from': cause.indistinguishable_from,
+        'odds': dict(cause.odds),
+        'to_separate': separation(cause),
+        'refuted_by_frames': cause.refuted_by_frames,
     }
 
 
-def _advice(one: Advice) -> AdviceEntry:
+def _advice(advice: Advice) -> AdviceEntry:
     return {
-        'what': advised_action(one),
-        'frames': one.frames,
-        'photographs': one.photographs,
-        'landmarks': one.landmarks,
-        'boards': one.boards,
-        'gain': one.gain,
-        'kind': one.kind,
+        'what': advised_action(advice),
+        'frames': advice.frames,
+        'photographs': advice.photographs,
+        'landmarks': advice.landmarks,
+        'boards': advice.boards,
+        'gain': advice.gain,
+        'kind': advice.kind,
     }
 
 
-def _candidate(one: Finding) -> CandidateEntry:
+def _candidate(candidate: Finding) -> CandidateEntry:
     return {
-        'effect': one.effect,
-        'parameters': one.parameters,
-        'p_value': one.p_corrected,
-        'probability': one.probability,
-        'status': one.status.value,
-        'why': finding_reason(one),
+        'effect': candidate.effect,
+        'parameters': candidate.parameters,
+        'p_value': candidate.p_corrected,
+        'probability': candidate.probability,
+        'status': candidate.status.value,
+        'why': finding_reason(candidate),
     }
 
 
-def _step(one: Finding) -> StepEntry:
+def _step(finding: Finding) -> StepEntry:
     return {
-        'effect': one.form,
-        'statistic': one.statistic,
-        'rank': one.rank,
-        'p_value': one.p_value,
-        'corrected': one.p_corrected,
-        'held_out': one.held_out,
-        'held_out_stderr': one.held_out_stderr,
-        'accepted': one.accepted,
-        'why': finding_reason(one),
+        'effect': finding.form,
+        'statistic': finding.statistic,
+        'rank': finding.rank,
+        'p_value': finding.p_value,
+        'corrected': finding.p_corrected,
+        'held_out': finding.held_out,
+        'held_out_stderr': finding.held_out_stderr,
+        'accepted': finding.accepted,
+        'why': finding_reason(finding),
     }
 
 

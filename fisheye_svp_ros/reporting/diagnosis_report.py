@@ -216,7 +216,7 @@ def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _evidence(diagnosis: Diagnosis) -> dict[str, Any]:
-    withdrawn = {one.effect: finding_reason(one) for one in diagnosis.candidates}
+    withdrawn = {candidate.effect: finding_reason(candidate) for candidate in diagnosis.candidates}
     return {
         'steps': [_step(step, withdrawn) for step in diagnosis.trace],
         'tested': len(CATALOGUE) - len(diagnosis.untestable),
@@ -259,8 +259,8 @@ def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
         'budget_rows': list(budget_rows(diagnosis)),
         'intrinsics': list(intrinsic_rows(diagnosis)),
         'advice': [
-            (advice_text(one), percent(one.gain) if one.gain > 0 else '')
-            for one in diagnosis.advice
+            (advice_text(advice), percent(advice.gain) if advice.gain > 0 else '')
+            for advice in diagnosis.advice
         ],
     }
 

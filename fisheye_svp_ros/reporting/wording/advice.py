@@ -61,8 +61,8 @@ def advised_action(advice: Advice) -> str:
 def separation(cause: Cause) -> str:
     """Return how to tell a cause from others, and what would remain if it is another one."""
     others = [
-        f'{CATALOGUE[one.effect].to_separate}; if it is a {one.effect}, a ray error of '
-        f'{1e3 * one.ray_error:.2g} mrad remains'
-        for one in cause.imitations
+        f'{CATALOGUE[imitation.effect].to_separate}; if it is a {imitation.effect}, a ray error '
+        f'of {1e3 * imitation.ray_error:.2g} mrad remains'
+        for imitation in cause.imitations
     ]
     return '; '.join([cause.effect_class.to_separate, *others])

@@ -97,7 +97,7 @@ def most_significant(parameters: Mapping[str, Mapping[str, Any]], least: float) 
 
     '' where that is less than so many, or there is none; what has no error always counts.
     """
-    name = max(parameters, key=lambda one: _significance(parameters[one]), default='')
+    name = max(parameters, key=lambda part: _significance(parameters[part]), default='')
     if not name or (parameters[name]['stderr'] > 0 and _significance(parameters[name]) < least):
         return ''
     return f'{name} = {quantity(parameters[name])}'
@@ -202,16 +202,16 @@ class OutlierRow(NamedTuple):
 def outlier_rows(gross: Sequence[Mapping[str, Any]]) -> list[OutlierRow]:
     """Return a row for each view and reason, most points first; gross: as in diagnosis.json."""
     groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
-    for one in gross:
-        where = one.get('photograph') or f'frame {one["frame"]}'
-        groups.setdefault((where, one.get('camera', ''), one['why']), []).append(one)
+    for point in gross:
+        where = point.get('photograph') or f'frame {point["frame"]}'
+        groups.setdefault((where, point.get('camera', ''), point['why']), []).append(point)
     rows = [
         OutlierRow(
             where,
             camera,
-            _numbers([one['landmark'] for one in points]),
+            _numbers([point['landmark'] for point in points]),
             len(points),
-            max(one['px'] for one in points),
+            max(point['px'] for point in points),
             why,
         )
         for (where, camera, why), points in groups.items()

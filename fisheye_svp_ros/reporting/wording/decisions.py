@@ -91,13 +91,13 @@ def _likely_effects(facts: LensFacts) -> str:
     if not likely:
         return ''
     return (
-        f'likely but not confirmed: {" or ".join(one.effect for one in likely)}, '
+        f'likely but not confirmed: {" or ".join(bound.effect for bound in likely)}, '
         f'which may cause up to {likely[0].edge_px:.2g} px {bound_place(likely[0])}'
     )
 
 
 def _nothing_confirmed(facts: LensFacts) -> str:
-    worst = max(facts.bounds, key=lambda one: one.edge_px, default=None)
+    worst = max(facts.bounds, key=lambda bound: bound.edge_px, default=None)
     agrees = facts.offset is not None and facts.offset.is_chance
     fit = ' and its parameters agree with these data within their errors' if agrees else ''
     cost = ''

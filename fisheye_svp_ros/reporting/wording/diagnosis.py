@@ -95,7 +95,7 @@ def refusal_reason(d: Diagnosis) -> str:
 
 def only_gross(d: Diagnosis) -> bool:
     """Say whether all that remains is points that were rejected, by name."""
-    return bool(d.gross) and {one.variable for one in d.remaining} == {'outliers'}
+    return bool(d.gross) and {structure.variable for structure in d.remaining} == {'outliers'}
 
 
 def remains(diagnosis: Diagnosis, most: int = 3) -> str:
@@ -140,7 +140,7 @@ def verdict_sentences(
 def frame_ranges(d: Diagnosis, ranges: Sequence[tuple[int, int]]) -> str:
     """Return what the first and the last frames of ranges are called; '' for none."""
     table = d.evaluation.problem.observations
-    return join_names([' to '.join(frame_name(table, one) for one in ends) for ends in ranges])
+    return join_names([' to '.join(frame_name(table, end) for end in ends) for ends in ranges])
 
 
 def count_frames(d: Diagnosis) -> str:
@@ -245,7 +245,7 @@ def _almost(d: Diagnosis) -> str:
 
 
 def _name(d: Diagnosis, cause: Cause) -> str:
-    others = join_names([with_odds(cause, one) for one in cause.indistinguishable_from], 'or')
+    others = join_names([with_odds(cause, rival) for rival in cause.indistinguishable_from], 'or')
     assumed = ', assumed by --with' if is_assumed(d, cause) else ''
     return f'{cause.effect}{assumed}' + (f', confounded with {others}' if others else '')
 
@@ -340,7 +340,7 @@ def _next_step(d: Diagnosis) -> str:
         return '; '.join([lens, flaw_reason(d.adequacy.flaws, 'photographs')]) + '.'
     if d.verdict == 'adequate':
         blind = f'; not testable here: {join_names(list(d.untestable))}' if d.untestable else ''
-        turned = [advice_text(one) for one in d.advice if one.kind == TURNED]
+        turned = [advice_text(advice) for advice in d.advice if advice.kind == TURNED]
         return '; '.join([lens, *_rig_advice(d), *turned]) + f'{blind}.'
     steps = [lens, *_rig_advice(d)]
     steps += [
@@ -350,10 +350,14 @@ def _next_step(d: Diagnosis) -> str:
         for pair in d.cameras
         if pair.verdict == 'contradict'
     ]
-    steps += [advice_text(one) for one in d.advice if one.frames]
-    gaining = [one for one in d.advice if one.gain > 0 and one.action is not Action.USE_EXTENDED]
-    steps += [advice_text(one) for one in gaining[:_MAX_CAUSES]]
-    steps += [advice_text(one) for one in d.advice if one.action is Action.DIAGNOSE_AIR]
+    steps += [advice_text(advice) for advice in d.advice if advice.frames]
+    gaining = [
+        advice
+        for advice in d.advice
+        if advice.gain > 0 and advice.action is not Action.USE_EXTENDED
+    ]
+    steps += [advice_text(advice) for advice in gaining[:_MAX_CAUSES]]
+    steps += [advice_text(advice) for advice in d.advice if advice.action is Action.DIAGNOSE_AIR]
     held = [c.effect for c in d.causes if c.stage == 'frame' and c.effect in d.lens.corrections]
     if held and d.decision['lens'].say == 'use_extended':
         steps.append(f'it includes {join_names(held)}')
@@ -368,7 +372,7 @@ def _next_step(d: Diagnosis) -> str:
         if c.indistinguishable_from
     ]
     steps += [_remedy(c) for c in d.causes if c.effect_class.stage == 'noise']
-    if 'frame' in {one.variable for one in d.remaining}:
+    if 'frame' in {structure.variable for structure in d.remaining}:
         untimed = [name for name, reason in d.untestable.items() if reason == NO_TIME]
         steps += filter(None, (CATALOGUE[name].when_untestable for name in untimed))
     if d.remaining:

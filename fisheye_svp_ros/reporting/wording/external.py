@@ -47,15 +47,15 @@ def sections(diagnosis: Diagnosis) -> list[Section]:
     return found if diagnosis.against is None else [*found, _of_sets(diagnosis.against)]
 
 
-def carried_row(one: Transfer, what: str) -> tuple[str, ...]:
+def carried_row(transfer: Transfer, what: str) -> tuple[str, ...]:
     """Return where something was found, tried, what it was, rms without and with it, and less."""
-    less = one.less_px
+    less = transfer.less_px
     return (
-        one.source,
-        one.to,
+        transfer.source,
+        transfer.to,
         what,
-        f'{one.without_px:.4f}',
-        f'{one.with_px:.4f}',
+        f'{transfer.without_px:.4f}',
+        f'{transfer.with_px:.4f}',
         f'{less.value:.4f} ({less.low:.4f} to {less.high:.4f})',
     )
 
@@ -67,7 +67,9 @@ def _of_robot(found: HandEye) -> Section:
         f'{x:.2f}, {y:.2f}, {z:.2f} mm in the flange. They were not used as camera poses: '
         f'{hand_eye_sentence(found)}.'
     )
-    sentence += ''.join(f' {one[0].upper()}{one[1:]}.' for one in hand_eye_warnings(found))
+    sentence += ''.join(
+        f' {warning[0].upper()}{warning[1:]}.' for warning in hand_eye_warnings(found)
+    )
     return Section(ROBOT_TITLE, sentence, [], ROBOT_HEADER, hand_eye_rows(found))
 
 
@@ -94,7 +96,7 @@ def _of_cameras(pair: TwoCameras) -> Section:
     return Section(
         CAMERAS_TITLE,
         f'{_agreement(pair)}{_rig(pair)}.',
-        [carried_row(one, 'shape of the target') for one in pair.target],
+        [carried_row(transfer, 'shape of the target') for transfer in pair.target],
         ('', 'before', 'after', ''),
         rows,
     )
@@ -105,7 +107,10 @@ def _agreement(pair: TwoCameras) -> str:
     if pair.verdict == 'nothing':
         return f'Neither {join_names(pair.cameras, "nor")} needs another shape of the target'
     tried = join_names(
-        [f'{one.to} from {one.without_px:.3g} to {one.with_px:.3g} px' for one in pair.target]
+        [
+            f'{transfer.to} from {transfer.without_px:.3g} to {transfer.with_px:.3g} px'
+            for transfer in pair.target
+        ]
     )
     carried = f'the shape estimated from one camera changes the held-out error of {tried}'
     alike = ''
@@ -151,7 +156,8 @@ def _of_sets(against: TwoDatasets) -> Section:
     for tried in filter(None, against.tried):
         carried.append(carried_row(tried.lens, 'causes of the lens'))
         carried += [
-            carried_row(one, f'{name}, added to the others') for name, one in tried.causes.items()
+            carried_row(cause, f'{name}, added to the others')
+            for name, cause in tried.causes.items()
         ]
         carried.append(carried_row(tried.whole, 'the whole lens, intrinsics too'))
         if tried.target is not None:
@@ -159,11 +165,11 @@ def _of_sets(against: TwoDatasets) -> Section:
     rows = [
         (
             name,
-            quantity({'value': one.value, 'stderr': one.stderr, 'unit': one.unit}),
-            quantity({'value': one.other_value, 'stderr': one.other_stderr, 'unit': one.unit}),
-            f'{one.standardized_difference:.1f} standard errors apart',
+            quantity({'value': both.value, 'stderr': both.stderr, 'unit': both.unit}),
+            quantity({'value': both.other_value, 'stderr': both.other_stderr, 'unit': both.unit}),
+            f'{both.standardized_difference:.1f} standard errors apart',
         )
-        for name, one in against.parameters.items()
+        for name, both in against.parameters.items()
     ]
     return Section(
         SETS_TITLE,
@@ -179,9 +185,9 @@ def _lens_holds(against: TwoDatasets) -> str:
         return f'Neither these data nor {against.source} need a cause in the lens'
     tried = join_names(
         [
-            f'{one.lens.to} from {one.lens.without_px:.3g} to {one.lens.with_px:.3g} px'
-            for one in against.tried
-            if one is not None
+            f'{causes.lens.to} from {causes.lens.without_px:.3g} to {causes.lens.with_px:.3g} px'
+            for causes in against.tried
+            if causes is not None
         ]
     )
     said = {
@@ -210,11 +216,11 @@ def _difference_text(against: TwoDatasets) -> str:
         ),
     ):
         sizes = [
-            (abs(one.standardized_difference), name)
-            for name, one in against.parameters.items()
+            (abs(both.standardized_difference), name)
+            for name, both in against.parameters.items()
             if ('.' in name) == of_causes
         ]
-        far = sorted((one for one in sizes if one[0] > _SIGNIFICANT_RATIO), reverse=True)
+        far = sorted((entry for entry in sizes if entry[0] > _SIGNIFICANT_RATIO), reverse=True)
         each = [f'{name} by {apart:.1f} standard errors' for apart, name in far[:_MAX_PARAMETERS]]
         said += f'; {meaning.format(join_names(each))}' if each else ''
     if said or against.verdict == 'contradict':
@@ -223,10 +229,14 @@ def _difference_text(against: TwoDatasets) -> str:
 
 
 def _follows(against: TwoDatasets) -> str:
-    there = [one.target for one in against.tried if one is not None and one.target is not None]
+    there = [
+        transfer.target
+        for transfer in against.tried
+        if transfer is not None and transfer.target is not None
+    ]
     if not there:
         return ''
-    if any(one.improves for one in there):
+    if any(transfer.improves for transfer in there):
         return (
             '; the correction of the target also holds in the other set: the target is the '
             'same, or the error belongs to the lens'

@@ -163,7 +163,7 @@ def _reason(decision: Decision, d: Diagnosis) -> str:
     why = _capital(decision_reason(decision))
     if decision is not d.decision['photographs'] or not d.turned:
         return why
-    names = [one.photograph for one in d.turned]
+    names = [frame.photograph for frame in d.turned]
     more = f' and {len(names) - _MAX_NAMES} more' if len(names) > _MAX_NAMES else ''
     return f'{why}; numbered from another end of the board: {", ".join(names[:_MAX_NAMES])}{more}'
 
@@ -172,12 +172,12 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
     """Return the screen as at most ten lines, one more where there is another set."""
     lines = [*filter(None, [screen.travel]), screen.headline, screen.facts]
     lines += [f'Warning: {screen.warning}'] if screen.warning else []
-    for one in screen.actions:
-        names = ', '.join(photo.name for photo in one.photographs)
-        names += f' and {one.more} more' if one.more else ''
+    for action in screen.actions:
+        names = ', '.join(photo.name for photo in action.photographs)
+        names += f' and {action.more} more' if action.more else ''
         lines.append(
-            f'{one.about}: {one.do}{names and f": {names}"}. {one.why}'
-            f'{one.sure and f" ({one.sure})"}.'
+            f'{action.about}: {action.do}{names and f": {names}"}. {action.why}'
+            f'{action.sure and f" ({action.sure})"}.'
         )
     lines += [f'{screen.causes_title}: {screen.causes}'] if screen.causes else []
     lines += [f'Against the truth: {screen.truth}'] if screen.truth else []
@@ -189,13 +189,13 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
 def _facts(d: Diagnosis, source: str) -> str:
     figures = d.figures
     base, named, extended = (
-        one.heldout_rms_px for one in (figures.base, figures.named, figures.extended)
+        quality.heldout_rms_px for quality in (figures.base, figures.named, figures.extended)
     )
     rays, near = d.ray_error_mrad(), ''
     if rays and d.offers_extended:
         asked = d.evaluation.problem.options.range_m or 1.0
         before, after = (
-            next(one['value'] for one in rays[side] if one['range_m'] == asked)
+            next(error['value'] for error in rays[side] if error['range_m'] == asked)
             for side in ('given', 'extended')
         )
         near = f'; ray error {before:.2g} → {after:.2g} mrad at {asked:g} m'
@@ -251,30 +251,37 @@ def _causes(d: Diagnosis) -> str:
     Also which frames the others predict worse with it.
     """
     found = []
-    for one in d.causes:
-        worse = frame_ranges(d, one.refuted_by_frames)
-        every = [one.effect, *one.indistinguishable_from]
-        names = ' or '.join(with_odds(one, name) for name in every)
+    for cause in d.causes:
+        worse = frame_ranges(d, cause.refuted_by_frames)
+        every = [cause.effect, *cause.indistinguishable_from]
+        names = ' or '.join(with_odds(cause, name) for name in every)
         doubt = (
-            '' if one.status is Status.CONFIRMED else f'{belief(one.status, one.probability)}: '
+            ''
+            if cause.status is Status.CONFIRMED
+            else f'{belief(cause.status, cause.probability)}: '
         )
         harm = f'; makes {worse} worse' if worse else ''
-        found.append(f'{names} ({doubt}{size(d, one)}{harm})')
+        found.append(f'{names} ({doubt}{size(d, cause)}{harm})')
     return '; '.join(found)
 
 
 def _candidates(d: Diagnosis) -> str:
     shifts = d.evaluation.averaged_model.shifts
-    others = [one for one in d.candidates if not shifts or one.effect != 'viewpoint_shift']
+    others = [
+        candidate
+        for candidate in d.candidates
+        if not shifts or candidate.effect != 'viewpoint_shift'
+    ]
     words = [
-        f'{f"{one.camera} " if one.camera else ""}viewpoint_shift '
-        f'({belief(status_of(one.weight, False), one.weight)}: the extended lens includes '
-        f'e0 = {1e3 * one.e0:.2g} ± {1e3 * one.stderr:.2g} mm)'
-        for one in shifts
+        f'{f"{shift.camera} " if shift.camera else ""}viewpoint_shift '
+        f'({belief(status_of(shift.weight, False), shift.weight)}: the extended lens includes '
+        f'e0 = {1e3 * shift.e0:.2g} ± {1e3 * shift.stderr:.2g} mm)'
+        for shift in shifts
     ]
     words += [
-        f'{one.effect} ({belief(one.status, one.probability)}: {finding_reason(one)})'
-        for one in others[:_MAX_NAMES]
+        f'{finding.effect} ({belief(finding.status, finding.probability)}: '
+        f'{finding_reason(finding)})'
+        for finding in others[:_MAX_NAMES]
     ]
     more = len(others) - _MAX_NAMES
     return '; '.join(words) + (f'; and {more} more' if more > 0 else '')
@@ -282,11 +289,11 @@ def _candidates(d: Diagnosis) -> str:
 
 def _bound_text(decision: Decision) -> str:
     words = []
-    for one in decision.bound:
-        factor, unit = HUMAN_UNITS.get(one.unit, (1.0, ''))
+    for bound in decision.bound:
+        factor, unit = HUMAN_UNITS.get(bound.unit, (1.0, ''))
         words.append(
-            f'{one.effect} up to {factor * one.value:.2g} {unit}'.rstrip()
-            + f' ({one.edge_px:.2g} px, {one.edge_mrad:.2g} mrad at the edge)'
+            f'{bound.effect} up to {factor * bound.value:.2g} {unit}'.rstrip()
+            + f' ({bound.edge_px:.2g} px, {bound.edge_mrad:.2g} mrad at the edge)'
         )
     place = bound_place(decision.bound[0]) if decision.bound else ''
     return '; '.join(words) + (f'; {place}' if place.endswith(')') else '')
@@ -367,7 +374,9 @@ def largest_cause(d: Diagnosis) -> str:
     causes = sorted(d.causes, key=lambda cause: (-cause.share, cause.p_value))
     if causes:
         first, stage = causes[0], causes[0].stage
-        other = next((one for one in causes if {stage, one.stage} == {'lens', 'target'}), None)
+        other = next(
+            (rival for rival in causes if {stage, rival.stage} == {'lens', 'target'}), None
+        )
         second = _sentence(d, other) if other else ''
         return _sentence(d, first) + (f', and {second[0].lower()}{second[1:]}' if second else '')
     if d.frames < 2 and (d.candidates or d.decision['target'].figure.value > 0):
@@ -430,7 +439,7 @@ def _sentence(d: Diagnosis, cause: Cause) -> str:
 
 def _statement(d: Diagnosis, cause: Cause) -> str:
     if cause.effect == 'target_shape':
-        worst = max(d.board_maps((cause.effect,)), key=lambda one: one.peak_to_valley)
+        worst = max(d.board_maps((cause.effect,)), key=lambda board: board.peak_to_valley)
         several = len(np.unique(d.evaluation.problem.observations.board)) > 1
         which = f'Board {worst.board}' if several else 'The board'
         return f'{which} is bent by {1e3 * worst.peak_to_valley:.2g} mm'

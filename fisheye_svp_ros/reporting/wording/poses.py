@@ -24,8 +24,8 @@ def rig_reason(outliers: int, contradicted: bool) -> str:
 def missing_tags_note(ids: Sequence[int]) -> str:
     """Say which tags a map lacks."""
     names = ', '.join(map(str, ids))
-    one = 'tag is' if len(ids) == 1 else 'tags are'
+    tags = 'tag is' if len(ids) == 1 else 'tags are'
     return (
-        f'{len(ids)} {one} not in the map ({names}): no image shows them together with a mapped '
+        f'{len(ids)} {tags} not in the map ({names}): no image shows them together with a mapped '
         'tag; add such images'
     )
