@@ -243,7 +243,7 @@ def _clusters(values: Array) -> list[Index]:
             break
         middles, label = kmeans2(values, count, minit='++', seed=0, iter=30)
         within = float(((values - middles[label]) ** 2).sum())
-        groups = [np.flatnonzero(label == one) for one in range(count)]
+        groups = [np.flatnonzero(label == cluster) for cluster in range(count)]
         if within < _MAX_SPREAD * total and min(map(len, groups)) >= MIN_GROUP:
             return sorted(groups, key=lambda group: int(group[0]))
     return []

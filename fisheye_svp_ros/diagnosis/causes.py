@@ -91,7 +91,7 @@ class Cause:
     def is_within_error(self) -> bool:
         """Whether all of its parameters may as well be zero, by their standard errors."""
         return bool(self.parameters) and all(
-            abs(one['value']) < one['stderr'] for one in self.parameters.values()
+            abs(entry['value']) < entry['stderr'] for entry in self.parameters.values()
         )
 
     @property
@@ -122,7 +122,7 @@ def selected_causes(
     for term, (rms, gain) in zip(found, held_out, strict=True):
         effect, columns, name = term.effect, term.columns, term.name
         odds = confounded_odds(tests, name, columns)
-        alike = [one for one in odds if one != name]
+        alike = [rival for rival in odds if rival != name]
         score = tests.test_removal(tests.null.included_columns, columns, effect)
         causes.append(
             Cause(
@@ -225,7 +225,7 @@ def _survives(tests: EffectTests, effect: Effect, columns: Index) -> bool:
 
 def confounded_effects(tests: EffectTests, name: str, columns: Index) -> list[str]:
     """Return the effects with which in the model this one would no longer be needed."""
-    return [one for one in confounded_odds(tests, name, columns) if one != name]
+    return [rival for rival in confounded_odds(tests, name, columns) if rival != name]
 
 
 def confounded_odds(tests: EffectTests, name: str, columns: Index) -> dict[str, float]:
@@ -241,7 +241,8 @@ def confounded_odds(tests: EffectTests, name: str, columns: Index) -> dict[str, 
     rest = np.setdiff1d(null.included_columns, columns)
     score = tests.score_beside(rest, columns)
     others = [
-        (one.effect, null.form_columns(one.form), one.score) for one in tests.candidates(rest)
+        (candidate.effect, null.form_columns(candidate.form), candidate.score)
+        for candidate in tests.candidates(rest)
     ]
     if CATALOGUE[name].budget_stage() == 'lens':
         others += [(effect, at, tests.score_beside(rest, at)) for effect, at in null.look_alikes]

@@ -134,21 +134,21 @@ def advise(
     if evaluation.medium is not None:
         advice += _calibrate_in_air(evaluation.medium, causes)
     # Advice without a figure keeps its order, after all that has one.
-    return sorted(advice, key=lambda one: -one.gain)
+    return sorted(advice, key=lambda task: -task.gain)
 
 
 def turn_advice(turned: Sequence[TurnedFrame]) -> list[Advice]:
     """Return what to do about photographs whose board is numbered from another end."""
     advice = []
     for corrected, action in ((True, Action.NUMBER_LIKE_OTHERS), (False, Action.CHECK_NUMBERS)):
-        mine = [one for one in turned if one.corrected == corrected]
+        mine = [turn for turn in turned if turn.corrected == corrected]
         if mine:
             advice.append(
                 Advice(
                     action,
-                    frames=[one.frame for one in mine],
-                    photographs=[one.photograph for one in mine if one.has_photograph],
-                    value=min(one.odds for one in mine),
+                    frames=[turn.frame for turn in mine],
+                    photographs=[turn.photograph for turn in mine if turn.has_photograph],
+                    value=min(turn.odds for turn in mine),
                 )
             )
     return advice
@@ -333,7 +333,7 @@ class Conclusion:
     def ray_error_of(self, camera: str) -> dict[str, list[dict[str, float]]]:
         """Return the expected ray errors, mrad, of a camera's lens as given and as extended."""
         return {
-            side: [one.in_mrad() for one in found]
+            side: [error.in_mrad() for error in found]
             for side, found in self.ray_error.get(camera, {}).items()
         }
 
@@ -368,7 +368,9 @@ def conclude(
             noise_px=evaluation.noise_px,
             falling=evaluation.falling,
             frames=evaluation.frames,
-            refuted=[one.effect for one in candidates if one.status is Status.REFUTED],
+            refuted=[
+                candidate.effect for candidate in candidates if candidate.status is Status.REFUTED
+            ],
             rays=_worst_rays(ray_errors),
             written=_unnamed_parts(evaluation),
             open=open_effects,
@@ -399,10 +401,10 @@ def conclude(
 
 def advice_on_lens(advice: Sequence[Advice], conclusion: Conclusion) -> list[Advice]:
     """Return advice that agrees with the decision about the lens, what brings most first."""
-    rest = [one for one in advice if one.action is not Action.USE_EXTENDED]
+    rest = [task for task in advice if task.action is not Action.USE_EXTENDED]
     if conclusion.decision['lens'].say == 'use_extended':
         rest.append(Advice(Action.USE_EXTENDED, gain=conclusion.file.gain))
-    return sorted(rest, key=lambda one: -one.gain)
+    return sorted(rest, key=lambda task: -task.gain)
 
 
 def frames_of(advice: Sequence[Advice], kind: str) -> list[str]:
@@ -410,9 +412,9 @@ def frames_of(advice: Sequence[Advice], kind: str) -> list[str]:
     return list(
         dict.fromkeys(
             name
-            for one in advice
-            if one.kind == kind
-            for name in (one.photographs or [f'frame {n}' for n in one.frames])
+            for task in advice
+            if task.kind == kind
+            for name in (task.photographs or [f'frame {n}' for n in task.frames])
         )
     )
 
@@ -424,7 +426,7 @@ def _worst_rays(errors: Mapping[str, Mapping[str, Sequence[RayError]]]) -> tuple
     """
     each = [
         tuple(
-            1e3 * float(np.sqrt(np.mean([one.value**2 for one in sides[side]])))
+            1e3 * float(np.sqrt(np.mean([error.value**2 for error in sides[side]])))
             for side in ('given', 'extended')
         )
         for sides in errors.values()
@@ -446,11 +448,12 @@ def _unnamed_parts(evaluation: Evaluation) -> list[str]:
 def _open_effects(evaluation: Evaluation, candidates: Sequence[Finding]) -> list[str]:
     """Return effects of the lens that are likely, and not confirmed."""
     likely = {
-        one.effect
-        for one in candidates
-        if one.status is Status.LIKELY and CATALOGUE[one.effect].budget_stage() == 'lens'
+        candidate.effect
+        for candidate in candidates
+        if candidate.status is Status.LIKELY
+        and CATALOGUE[candidate.effect].budget_stage() == 'lens'
     }
-    if any(one.weight > LIKELY_PROBABILITY for one in evaluation.averaged_model.shifts):
+    if any(shift.weight > LIKELY_PROBABILITY for shift in evaluation.averaged_model.shifts):
         likely.add(ViewpointShiftEffect.name)
     return sorted(likely)
 

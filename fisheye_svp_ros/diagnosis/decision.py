@@ -145,7 +145,7 @@ def least_likely_offset(offsets: Sequence[LensOffset]) -> LensOffset | None:
     """
     if not offsets:
         return None
-    least = min(offsets, key=lambda one: (one.p_value, -one.ratio))
+    least = min(offsets, key=lambda offset: (offset.p_value, -offset.ratio))
     return least._replace(p_value=min(1.0, len(offsets) * least.p_value))
 
 

@@ -65,7 +65,7 @@ class Diagnosis(Conclusion):
         if self.causes or self.decision['lens'].say == 'recalibrate':
             return 'partly_explained' if self.remaining else 'explained'
         # Local offsets of the target alone leave the simulation of the lens adequate.
-        rest = {one.variable for one in self.remaining} - {'landmark'}
+        rest = {structure.variable for structure in self.remaining} - {'landmark'}
         # Nothing confirms what one frame shows.
         open_effects = self.frames < 2 and self.candidates
         return 'unexplained' if rest or open_effects or self.likely_effects else 'adequate'
@@ -77,7 +77,7 @@ class Diagnosis(Conclusion):
         undecided = self.decision['lens'].reason is LensReason.EFFECT_LIKELY
         if not (undecided and isinstance(facts, LensFacts)):
             return []
-        return [one.effect for one in facts.likely_effects]
+        return [bound.effect for bound in facts.likely_effects]
 
     @property
     def offers_extended(self) -> bool:

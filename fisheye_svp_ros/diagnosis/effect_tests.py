@@ -349,7 +349,7 @@ def _border_rows(null: NullModel, combination: Array, residual: Array) -> Array:
     Of the second all but what landmarks have of their own.
     """
     f, eq = null.factorization, null.equations
-    parts = [eq.split(*f.coefficients(one)) for one in (combination, residual)]
+    parts = [eq.split(*f.coefficients(column)) for column in (combination, residual)]
     frame, landmark, shared = (np.stack(both, axis=-1) for both in zip(*parts, strict=True))
     landmark[..., 1] = 0.0
     pose = null.linear.frame_columns / eq.group_scale[:, None]

@@ -306,7 +306,8 @@ class Evaluation:
     def falling(self) -> bool:
         """Whether the rms of the fitted frames falls from base to named to extended."""
         sizes = [
-            one.rms_px for one in (self.figures.base, self.figures.named, self.figures.extended)
+            quality.rms_px
+            for quality in (self.figures.base, self.figures.named, self.figures.extended)
         ]
         return all(after <= MAX_RMS_RATIO * before for before, after in pairwise(sizes))
 

@@ -72,7 +72,7 @@ def compare_lens_files(evaluation: Evaluation) -> FileFigure:
             gain.before, gain.after, gain.value, gain.low, gain.high, float(gain.low > 0)
         )
     kept = evaluation.counted_frames
-    before, after = (one.take(kept) for one in _predict_with_files(evaluation))
+    before, after = (prediction.take(kept) for prediction in _predict_with_files(evaluation))
     gain, sure = gain_and_confidence(before, after, evaluation.noise_px)
     return FileFigure(before.rms, after.rms, gain.value, gain.low, gain.high, sure)
 
@@ -305,7 +305,7 @@ def _offset(
     By the covariance of what both may be off: a small change counts where it is known well.
     noise: px; angles far below it, and what a large change is by more than linear, do not count.
     """
-    nearer = min((one[_NEAR_RANGE] for one in off), key=_rms)
+    nearer = min((errors[_NEAR_RANGE] for errors in off), key=_rms)
     fresh = expected = model.sample(_NEAR_RANGE)
     stated = _stated_sample(given, uv)
     if stated is not None and stated.shape == expected.shape:

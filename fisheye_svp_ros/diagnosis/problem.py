@@ -324,11 +324,13 @@ def _misfit_ratio(problem: Problem, poses: dict[int, Pose]) -> float:
     before, after = (
         float(
             eliminate(
-                one.information,
-                np.concatenate([one.included_columns, one.fixed.own + one.fixed.forms.generic]),
+                model.information,
+                np.concatenate(
+                    [model.included_columns, model.fixed.own + model.fixed.forms.generic]
+                ),
             )[-1, -1]
         )
-        for one in (fixed, free)
+        for model in (fixed, free)
     )
     unknown = free.full.group_rank
     return max(before - after, 0.0) / unknown / (after / (free.full.rows - unknown))

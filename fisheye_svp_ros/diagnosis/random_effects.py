@@ -140,7 +140,7 @@ class _Landmarks(NamedTuple):
     @property
     def axes(self) -> Array:
         """The axes (L, 3, 3) of the board of each."""
-        return np.stack([one.axes for one in self.boards])[self.board_of]
+        return np.stack([board.axes for board in self.boards])[self.board_of]
 
 
 class _Points(NamedTuple):
@@ -244,11 +244,11 @@ def make_random_effects(
                 NAMES.index(name)
                 for name in (
                     ('landmark_in_plane', 'landmark_in_plane', 'landmark_normal')
-                    if one.flat
+                    if board.flat
                     else ('landmark',) * 3
                 )
             ]
-            for one in landmarks.boards
+            for board in landmarks.boards
         ]
     )
     every = RandomColumns(

@@ -149,7 +149,8 @@ def diagnose_against(
     second = diagnose_one(other, options, 0.35, 0.7, 'the other set: ')
     progress('validating each data set by the other', 0.7)
     models = [
-        DatasetModel(one.evaluation.simulation, one.evaluation.null) for one in (found, second)
+        DatasetModel(answer.evaluation.simulation, answer.evaluation.null)
+        for answer in (found, second)
     ]
     datasets = compare_datasets(models[0], models[1], observations.source, other.source)
     gone = tuple(name for name in datasets.refuted_causes if name not in options.included)
@@ -256,8 +257,10 @@ def _conclude(
     if averaged.shifts:
         likeliest = max(shift.weight for shift in averaged.shifts)
         candidates = [
-            replace(one, averaged=likeliest) if one.effect == 'viewpoint_shift' else one
-            for one in candidates
+            replace(candidate, averaged=likeliest)
+            if candidate.effect == 'viewpoint_shift'
+            else candidate
+            for candidate in candidates
         ]
     advice = advise(evaluation, causes, significant, _holds_back(candidates))
     conclusion = conclude(
@@ -313,7 +316,7 @@ def _remaining(
     )
     remaining = add_outliers(remaining, selection.revision.outliers, len(observations))
     hidden = {name for cause in noise_causes for name in cause.effect_class.hidden_structure}
-    return [one for one in remaining if one.variable not in hidden]
+    return [structure for structure in remaining if structure.variable not in hidden]
 
 
 class _Doubt(NamedTuple):
@@ -330,7 +333,7 @@ def _weakest_cause(evaluation: Evaluation) -> tuple[ModelTerm, Finding] | None:
     doubts = list(_doubts(evaluation))
     if not doubts:
         return None
-    z, cause, reason, rival = min(doubts, key=lambda one: one.z)
+    z, cause, reason, rival = min(doubts, key=lambda doubt: doubt.z)
     effect = cause.effect
     tests = EffectTests(evaluation.null)
     p_value = tests.test_removal(evaluation.null.included_columns, cause.columns, effect).p_value
@@ -421,7 +424,7 @@ def find_confounder(
 
 def _holds_back(candidates: Sequence[Finding]) -> bool:
     """Say whether an effect is held back for its size: frames scatter by what it leaves."""
-    return any(one.reason is Reason.IMPLAUSIBLE for one in candidates)
+    return any(candidate.reason is Reason.IMPLAUSIBLE for candidate in candidates)
 
 
 def _is_implausible(cause: ModelTerm) -> bool:

@@ -173,7 +173,7 @@ def draw_models(
 
 def model_weights(models: Sequence[OtherModel]) -> Array:
     """Return how probable each of the models is."""
-    return np.asarray(special.softmax([one.criterion / 2 for one in models]))
+    return np.asarray(special.softmax([model.criterion / 2 for model in models]))
 
 
 def _prior_information(null: NullModel) -> Array:
@@ -185,12 +185,12 @@ def _prior_information(null: NullModel) -> Array:
 
 
 def _fit_other_model(
-    null: NullModel, one: OtherModel, reported: Array, prior: Array
+    null: NullModel, model: OtherModel, reported: Array, prior: Array
 ) -> tuple[Array, Array]:
     """Return estimates (m,) and their covariance (m, m), normalised, by another model."""
-    at = one.included[one.included < null.column_count]
+    at = model.included[model.included < null.column_count]
     estimate, covariance, _ = _estimate(
-        null.restrict_information(null.information, at) + prior, one.included, reported
+        null.restrict_information(null.information, at) + prior, model.included, reported
     )
     return estimate, covariance
 
@@ -211,14 +211,14 @@ def likely_models(null: NullModel, averaged_kinds: Collection[str] = ()) -> list
     while waiting and len(found) < _MAX_MODELS:
         forms, model = max(waiting.items(), key=lambda item: item[1].criterion)
         found[forms] = waiting.pop(forms)
-        for one in tests.candidates(
+        for candidate in tests.candidates(
             model.included, per_frame=False, worth=partial(_is_likely, tests, 0.0)
         ):
-            kinds, gain = _effect_family(one.effect), tests.log_odds(one.score)
-            if model.kinds & kinds or {*one.effect.kinds} & {*averaged_kinds}:
+            kinds, gain = _effect_family(candidate.effect), tests.log_odds(candidate.score)
+            if model.kinds & kinds or {*candidate.effect.kinds} & {*averaged_kinds}:
                 continue
-            if (larger := forms | {one.form}) not in found:
-                columns = np.concatenate([model.included, null.form_columns(one.form)])
+            if (larger := forms | {candidate.form}) not in found:
+                columns = np.concatenate([model.included, null.form_columns(candidate.form)])
                 waiting[larger] = OtherModel(model.criterion + gain, columns, model.kinds | kinds)
     # The chosen one is among them, however many are likelier.
     return [*{frozenset[int](): chosen, **found}.values()]
@@ -238,15 +238,15 @@ def _exchange_effects(null: NullModel) -> Iterator[tuple[frozenset[int], OtherMo
         score = tests.score_beside(rest, columns)
         lost = tests.log_odds(score)
         least = lost - _ODDS_WINDOW
-        for one in tests.candidates(
+        for candidate in tests.candidates(
             rest, per_frame=False, worth=partial(_is_likely, tests, least)
         ):
-            kinds = frozenset(one.effect.kinds)
-            gain = tests.log_odds(one.score) - lost
-            if _is_lasting(one.effect) and not null.effect_kinds & kinds:
-                included = np.concatenate([rest, null.form_columns(one.form)])
+            kinds = frozenset(candidate.effect.kinds)
+            gain = tests.log_odds(candidate.score) - lost
+            if _is_lasting(candidate.effect) and not null.effect_kinds & kinds:
+                included = np.concatenate([rest, null.form_columns(candidate.form)])
                 yield (
-                    frozenset({~i, one.form}),
+                    frozenset({~i, candidate.form}),
                     OtherModel(gain, included, kinds | set(effect.kinds)),
                 )
 
@@ -320,7 +320,7 @@ class LensCovariance:
                 into[[names.index(name) for name in theirs], columns] = 1 / null.scale[columns]
             elif _is_of_lens(effect):
                 missing.update(columns.tolist())
-        models = [one for one in models if missing.isdisjoint(one.included.tolist())]
+        models = [model for model in models if missing.isdisjoint(model.included.tolist())]
         covariance = np.zeros((len(names), len(names)))
         covariance[np.ix_(first, first)] = self.covariance
         others = rng.permutation(draw_models(null, models, into, rng), axis=1)
@@ -354,9 +354,9 @@ def _likely_forms(null: NullModel, models: list[OtherModel]) -> list[int]:
     weights = model_weights(models)
     found: dict[frozenset[str], tuple[float, int]] = {}
     for form, effect in enumerate(null.fixed.forms.effects):
-        if not _is_of_lens(effect) or any(one.positive for one in effect.parameters):
+        if not _is_of_lens(effect) or any(parameter.positive for parameter in effect.parameters):
             continue
-        has = [np.isin(null.form_columns(form), one.included).all() for one in models]
+        has = [np.isin(null.form_columns(form), model.included).all() for model in models]
         weight, kinds = float(weights @ has), frozenset(effect.kinds)
         if weight > max(_MIN_WEIGHT, found.get(kinds, (0.0, 0))[0]):
             found[kinds] = weight, form

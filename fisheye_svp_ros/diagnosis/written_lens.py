@@ -322,7 +322,7 @@ class WrittenField:
             'without_px': self.before,
             'with_px': self.after,
             'refuted_by_frames': [list(ends) for ends in self.refuted],
-            'rms_px': max((one.field.rms for one in self.fields.values()), default=0.0),
+            'rms_px': max((camera.field.rms for camera in self.fields.values()), default=0.0),
         }
 
 

@@ -225,7 +225,7 @@ class InAir:
 
     def squared_distance(self, lens: Lens) -> float:
         """Return how unlikely the intrinsics of a lens are: squares of standard deviations."""
-        found, own = (np.array(parameter_values(one, self.names)) for one in (lens, self.lens))
+        found, own = (np.array(parameter_values(known, self.names)) for known in (lens, self.lens))
         return float(((self._root @ (found - own)) ** 2).sum())
 
     @property
@@ -293,7 +293,7 @@ def find_medium(problem: Problem, progress: Progress) -> Medium | None:
         wet = _correct_lens(table, lens, known)
         distance = 0.0 if wet is None else known.squared_distance(wet)
         media.append(_assess_port(table, lens, wet, free, distance))
-    return min(filter(None, media), key=lambda one: one.criterion, default=None)
+    return min(filter(None, media), key=lambda fit: fit.criterion, default=None)
 
 
 def behind_port(problem: Problem, medium: Medium) -> Problem:
@@ -399,6 +399,7 @@ def _is_magnified(air: Linearization, lens: Lens, fitted: Linearization) -> bool
     theta = np.array(0.5 * air.scene.theta_max)
     model = fitted.model.camera(0).lens
     height, known = (
-        one.focal * float(one.image_height.value_and_slope(theta)[0]) for one in (model, lens)
+        given.focal * float(given.image_height.value_and_slope(theta)[0])
+        for given in (model, lens)
     )
     return height > _MIN_MAGNIFICATION * known

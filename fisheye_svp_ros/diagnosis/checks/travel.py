@@ -48,7 +48,7 @@ def measure_travel(data: RigViews, given: Lens, extended: Lens) -> Travel:
     """
     held = [_predict_if_seen(data, lens) for lens in (given, extended)]
     rows = held[0].is_predictable | held[1].is_predictable
-    return Travel(*(one.take(rows).rms if rows.any() else np.nan for one in held))
+    return Travel(*(prediction.take(rows).rms if rows.any() else np.nan for prediction in held))
 
 
 def _predict_if_seen(data: RigViews, lens: Lens) -> HeldOut:

@@ -169,7 +169,7 @@ def find_turned_views(problem: Problem) -> list[tuple[TurnedFrame, BoardTurn]]:
             trials.append((camera, turn, _cross_camera_misfits(problem, data)))
     before, found = _cross_camera_misfits(problem, problem.table), []
     for frame in torn.tolist() if trials else ():
-        camera, turn, misfits = min(trials, key=lambda one: one[2][frame])
+        camera, turn, misfits = min(trials, key=lambda trial: trial[2][frame])
         if misfits[frame] > _CONSISTENT_RATIO * usual:
             continue
         gain = (before[frame] ** 2 - misfits[frame] ** 2) / (2 * usual**2) + np.log(_PRIOR)
@@ -304,7 +304,7 @@ def _gather(
     own = np.isin(target.landmark, ids)
     where = target.points[own] + target.displacements(linear.state.terms, linear.state.lens)[own]
     slot = np.where(shown[at], np.searchsorted(ids, target.landmark[columns.unit[at]]), -1)
-    partner = [np.arange(len(ids)), *(np.searchsorted(ids, one.partner) for one in turns)]
+    partner = [np.arange(len(ids)), *(np.searchsorted(ids, turn.partner) for turn in turns)]
     frames = _Frames(
         np.where((slot >= 0)[..., None], rows, 0.0),
         np.where((slot >= 0)[..., None, None], columns.offset[at], 0.0),
@@ -312,6 +312,6 @@ def _gather(
         fixed,
         (where - board.centre) @ board.axes.T / MILLIMETRE,
         np.array(partner),
-        np.array([np.eye(3), *(one.matrix for one in turns)]),
+        np.array([np.eye(3), *(turn.matrix for turn in turns)]),
     )
     return at, frames

@@ -158,16 +158,16 @@ class TwoCameras:
             and not self.posed_alone
             and all(moved.high < 0 for moved in self.rig.values())
         )
-        if apart or any(one.worsens for one in self.target):
+        if apart or any(transfer.worsens for transfer in self.target):
             return 'contradict'
-        return 'agree' if all(one.improves for one in self.target) else 'undecided'
+        return 'agree' if all(transfer.improves for transfer in self.target) else 'undecided'
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
         return {
             'cameras': list(self.cameras),
             'verdict': self.verdict,
-            'target': [one.to_dict() for one in self.target],
+            'target': [transfer.to_dict() for transfer in self.target],
             'maps': self.maps and self.maps._asdict(),
             'rig': {name: value.to_dict() for name, value in self.rig.items()},
             'withdrawn': list(self.withdrawn),

@@ -98,18 +98,18 @@ class TwoDatasets:
     @property
     def verdict(self) -> str:
         """Whether the lens's causes hold: agree, contradict, undecided; nothing: there is none."""
-        both = [one.lens for one in self.tried if one is not None]
+        both = [transfer.lens for transfer in self.tried if transfer is not None]
         if not both:
             return 'nothing'
-        if self.withdrawn or any(one.worsens for one in both):
+        if self.withdrawn or any(transfer.worsens for transfer in both):
             return 'contradict'
-        return 'agree' if all(one.improves for one in both) else 'undecided'
+        return 'agree' if all(transfer.improves for transfer in both) else 'undecided'
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
 
-        def entry(one: Transfer | None) -> dict[str, Any] | None:
-            return None if one is None else one.to_dict()
+        def entry(transfer: Transfer | None) -> dict[str, Any] | None:
+            return None if transfer is None else transfer.to_dict()
 
         return {
             'against': self.source,
@@ -117,13 +117,13 @@ class TwoDatasets:
             'withdrawn': list(self.withdrawn),
             'tried': [
                 {
-                    'lens': entry(one.lens),
-                    'whole': entry(one.whole),
-                    'target': entry(one.target),
-                    'causes': {name: entry(cause) for name, cause in one.causes.items()},
+                    'lens': entry(transfer.lens),
+                    'whole': entry(transfer.whole),
+                    'target': entry(transfer.target),
+                    'causes': {name: entry(cause) for name, cause in transfer.causes.items()},
                 }
-                for one in self.tried
-                if one is not None
+                for transfer in self.tried
+                if transfer is not None
             ],
             'parameters': {
                 name: one._asdict() | {'apart': one.standardized_difference}
@@ -217,9 +217,9 @@ def _with_lens_effects(one: DatasetModel, other: DatasetModel) -> RigState:
     return state
 
 
-def _estimates(one: DatasetModel, state: RigState) -> dict[str, tuple[float, float, str]]:
+def _estimates(model: DatasetModel, state: RigState) -> dict[str, tuple[float, float, str]]:
     """Return value, standard error and unit of the intrinsics and the lens's causes."""
-    data, free, variances = one.null.linear.data, one.null.linear.free, one.null.variances
+    data, free, variances = model.null.linear.data, model.null.linear.free, model.null.variances
     state = refit(data, state, free, variances)
     null = NullModel.with_variances(data, state, free, variances)
     errors = standard_errors(null)
