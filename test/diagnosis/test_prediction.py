@@ -7,6 +7,7 @@ from helpers.scenes import lens, observe, scene
 from fisheye_svp_ros.diagnosis import NullModel
 from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.mixed_model import project_out
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import initial_state
@@ -20,9 +21,11 @@ def test_without_a_cause_the_rest_is_fitted_anew_however_large_it_is(size):
     """A cause that moves points by many px hides intrinsics that no linear step finds."""
     rng = np.random.default_rng(4)
     pose, views = scene(rng, 1, 12)
-    cause = CATALOGUE['decentering'](), np.array([size, size / 2])
+    cause = ModelTerm(CATALOGUE['decentering'](), np.array([size, size / 2]))
     data = group_by_frame(observe(lens(), (cause,), pose, views, 0.1, rng))
-    state = adjust(data, with_effect(initial_state(data, lens()), *cause), FREE)
+    state = adjust(
+        data, with_effect(initial_state(data, lens()), cause.effect, cause.values), FREE
+    )
     null = NullModel.with_variances(data, state, FREE)
     without = fit_without_causes(null, ['decentering'], FREE)
     assert not without.terms

@@ -21,6 +21,7 @@ from fisheye_svp_ros.diagnosis.checks.travel import measure_travel
 from fisheye_svp_ros.diagnosis.checks.two_datasets import SharedParameter
 from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, gain_and_confidence, rms_reduction
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import write_observations
@@ -50,7 +51,7 @@ def table(seed, *terms, bend=0.0, frames=8):
 
 def test_what_moves_with_the_lens_holds_in_the_other_set():
     one, other = (
-        table(seed, (SHIFT, np.array([0.02])), bend=0.002 * k, frames=14)
+        table(seed, ModelTerm(SHIFT, np.array([0.02])), bend=0.002 * k, frames=14)
         for k, seed in enumerate((31, 32))
     )
     found = diagnose_against(one, other, lens(), free_intrinsics=True, options=QUICK)
@@ -73,7 +74,7 @@ def test_what_moves_with_the_lens_holds_in_the_other_set():
 
 def test_nothing_of_the_target_is_predicted_of_another_one():
     one, other = (
-        table(seed, (SHIFT, np.array([0.02])), bend=0.004 * k, frames=14)
+        table(seed, ModelTerm(SHIFT, np.array([0.02])), bend=0.004 * k, frames=14)
         for k, seed in ((1, 31), (0, 32))
     )
     found = diagnose(
@@ -91,7 +92,7 @@ def test_nothing_of_the_target_is_predicted_of_another_one():
 
 
 def test_what_the_other_set_refutes_is_withdrawn():
-    one, other = table(33, (SKEW, np.array([0.003]))), table(34)
+    one, other = table(33, ModelTerm(SKEW, np.array([0.003]))), table(34)
     shares = []
     found = diagnose_against(
         one,
@@ -162,7 +163,9 @@ def test_a_lens_that_does_not_image_all_points_has_no_figure():
 
 def test_command(tmp_path, capsys):
     for name, seed in (('a', 35), ('b', 36)):
-        write_observations(tmp_path / f'{name}.csv', table(seed, (SKEW, np.array([0.003]))))
+        write_observations(
+            tmp_path / f'{name}.csv', table(seed, ModelTerm(SKEW, np.array([0.003])))
+        )
     save_lens(lens(), tmp_path / 'lens.yaml')
     arguments = [
         'diagnose',
