@@ -124,7 +124,10 @@ def test_a_diagnosis_and_its_lens_file_say_the_same(tmp_path):
     views, pose = fit.data.views, fit.state.pose
     said, carried = found.evaluation.model_errors.of_poses(fit), errors.of_poses(views, pose)
     np.testing.assert_allclose(carried.parameters, said.parameters, rtol=1e-6, atol=1e-15)
-    np.testing.assert_allclose(carried.misfit, said.misfit, rtol=1e-4, atol=1e-12)
+    # The file rounds; next to zero a covariance is as exact as the variances that it belongs to.
+    sd = np.sqrt(np.diagonal(said.misfit, axis1=1, axis2=2))
+    off = (carried.misfit - said.misfit) / (sd[:, :, None] * sd[:, None])
+    assert np.abs(off).max() < 2e-4
     assert errors.noise == pytest.approx(found.noise_px) and said.misfit.any()
     assert {'fx', 'k4', 'target_shape.board0.z20'} < set(errors.model.names)
 
