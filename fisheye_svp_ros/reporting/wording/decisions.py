@@ -19,6 +19,7 @@ from fisheye_svp_ros.diagnosis import (
     TargetReason,
 )
 from fisheye_svp_ros.reporting.wording.adequacy import flaw_reason
+from fisheye_svp_ros.reporting.wording.findings import pixels
 
 _SUBJECTS = {LensFacts: 'lens', TargetFacts: 'target', PhotographsFacts: 'photographs'}
 _ONE_FRAME = 'one frame does not tell errors of the lens from those of the target'
@@ -50,16 +51,16 @@ def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
         LensReason.INTRINSICS_WRONG: 'the lens as given is wrong in '
         f'{", ".join(facts.wrong_intrinsics)}',
         LensReason.PREDICTS_BETTER: 'on the same corrected target it takes the held-out error '
-        f'from {file.given_px:.3g} to {file.extended_px:.3g} px{_unnamed_parts(facts)}',
+        f'from {pixels(file.given_px)} to {pixels(file.extended_px)} px{_unnamed_parts(facts)}',
         LensReason.RAYS_BETTER: 'the expected error of its rays is '
         f'{facts.rays[1]:.2g} mrad, of the lens as given {facts.rays[0]:.2g} mrad'
         f'{_unnamed_parts(facts)}',
-        LensReason.LENS_ALONE_PREDICTS_WORSE: f'held-out error {file.extended_px:.3g} px with the '
-        f'extended lens alone, {file.given_px:.3g} px with the lens as given; only all causes '
-        'together reduce it',
+        LensReason.LENS_ALONE_PREDICTS_WORSE: f'held-out error {pixels(file.extended_px)} px with '
+        f'the extended lens alone, {pixels(file.given_px)} px with the lens as given; only '
+        'all causes together reduce it',
         LensReason.GAIN_UNCERTAIN: f'it is not certain that {", ".join(facts.lens_causes)} in the '
-        f'lens reduces the held-out error ({file.given_px:.3g} → {file.extended_px:.3g} px): its '
-        f'probability is {100 * file.sure:.0f} %',
+        f'lens reduces the held-out error ({pixels(file.given_px)} → '
+        f'{pixels(file.extended_px)} px): its probability is {100 * file.sure:.0f} %',
         LensReason.EFFECT_LIKELY: _likely_effects(facts),
         LensReason.NOTHING_CONFIRMED: _nothing_confirmed(facts),
     }

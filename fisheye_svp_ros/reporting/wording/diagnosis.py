@@ -25,7 +25,7 @@ from fisheye_svp_ros.reporting.wording.causes import (
     size,
 )
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason
-from fisheye_svp_ros.reporting.wording.findings import with_odds
+from fisheye_svp_ros.reporting.wording.findings import pixels, with_odds
 from fisheye_svp_ros.scene.observations import frame_name
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
 
@@ -113,7 +113,7 @@ def remaining_text(diagnosis: Diagnosis, variable: str) -> str:
     if variable == 'outliers' and diagnosis.gross:
         worst, count = diagnosis.gross[0], len(diagnosis.gross)
         where = worst.get('photograph') or f'frame {worst["frame"]}'
-        which = f'{where} landmark {worst["landmark"]} ({worst["px"]:.3g} px)'
+        which = f'{where} landmark {worst["landmark"]} ({pixels(worst["px"])} px)'
         return (
             f'{count} points are outliers, the largest {which}'
             if count > 1
@@ -178,7 +178,7 @@ def _field_sentence(d: Diagnosis) -> str:
     refuted = frame_ranges(d, field.refuted)
     return (
         f' The lens file holds an image field: it predicts frames left out to '
-        f'{field.after:.3g} px rms instead of {field.before:.3g}'
+        f'{pixels(field.after)} px rms instead of {pixels(field.before)}'
         + (f', but {refuted} worse' if refuted else '')
         + '.'
     )
@@ -187,7 +187,7 @@ def _field_sentence(d: Diagnosis) -> str:
 def _wrong(d: Diagnosis) -> str:
     if d.adequacy.is_misfit:
         return ' '.join(f'{flaw_headline(flaw)}.' for flaw in d.adequacy.flaws)
-    noise = f'noise of {d.noise_px:.3g} px a coordinate'
+    noise = f'noise of {pixels(d.noise_px)} px a coordinate'
     if _shows_no_cause(d):
         but = [
             what
@@ -210,7 +210,7 @@ def _wrong(d: Diagnosis) -> str:
         off = 'The intrinsics as given are wrong. Fitted to these data, the'
         return (
             f'{off if d.is_lens_off else "The"} simulation leaves residuals of '
-            f'{d.figures.base.rms_px:.3g} px rms, and no effect of the catalog explains them: '
+            f'{pixels(d.figures.base.rms_px)} px rms, and no effect of the catalog explains them: '
             f'{remains(d, 7)}{_almost(d)}.'
         )
     causes = '; '.join(
@@ -262,11 +262,13 @@ def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
     moving = [c for c in d.causes if c.effect_class.stage != 'noise']
     local = ''
     if best < 0.99 * named:
-        local = f'; with the random effects of single landmarks and of the image, to {best:.3g} px'
+        local = (
+            f'; with the random effects of single landmarks and of the image, to {pixels(best)} px'
+        )
     elif best > 1.01 * named:
         local = (
             '; the random effects of single landmarks and of the image do not transfer to '
-            f'it: with them {best:.3g} px'
+            f'it: with them {pixels(best)} px'
         )
     if not moving:
         why, times = 'no extension improved on it', before / max(2**0.5 * d.noise_px, 1e-3)
@@ -277,16 +279,16 @@ def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
         which = (
             'The lens, fitted to these data,' if d.evaluation.intrinsics else 'The lens as it is'
         )
-        text = f'{which} predicts held-out data to {before:.3g} px rms; {why}{local}'
+        text = f'{which} predicts held-out data to {pixels(before)} px rms; {why}{local}'
         return text + (_file_clause(d) if d.offers_extended else '') + '.'
     if named >= before:
         return (
-            f'Held-out data do not confirm it: {named:.3g} px rms instead of {before:.3g}; do '
-            f'not correct for the causes{local}.'
+            f'Held-out data do not confirm it: {pixels(named)} px rms instead of {pixels(before)}'
+            f'; do not correct for the causes{local}.'
         )
     text = (
-        f'Corrected, held-out data are predicted to {named:.3g} px rms instead of '
-        f'{before:.3g}{local}'
+        f'Corrected, held-out data are predicted to {pixels(named)} px rms instead of '
+        f'{pixels(before)}{local}'
     )
     if d.figures.gain.value > 0:
         value, low, high = map(percent, d.figures.gain.interval.values())
@@ -320,7 +322,7 @@ def _poor_prediction(d: Diagnosis, times: float) -> str:
 def _file_clause(d: Diagnosis) -> str:
     return (
         f'; on the same corrected target the extended lens leaves '
-        f'{d.file.extended_px:.3g} px, the lens as given {d.file.given_px:.3g} px'
+        f'{pixels(d.file.extended_px)} px, the lens as given {pixels(d.file.given_px)} px'
     )
 
 

@@ -15,6 +15,7 @@ from fisheye_svp_ros.reporting.calibration_text import (
 )
 from fisheye_svp_ros.reporting.wording.causes import quantity
 from fisheye_svp_ros.reporting.wording.diagnosis import compared_row, join_names
+from fisheye_svp_ros.reporting.wording.findings import pixels
 from fisheye_svp_ros.solve.hand_eye import HandEye
 
 CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'less by (95 %)')
@@ -108,7 +109,7 @@ def _agreement(pair: TwoCameras) -> str:
         return f'Neither {join_names(pair.cameras, "nor")} needs another shape of the target'
     tried = join_names(
         [
-            f'{transfer.to} from {transfer.without_px:.3g} to {transfer.with_px:.3g} px'
+            f'{transfer.to} from {pixels(transfer.without_px)} to {pixels(transfer.with_px)} px'
             for transfer in pair.target
         ]
     )
@@ -185,7 +186,8 @@ def _lens_holds(against: TwoDatasets) -> str:
         return f'Neither these data nor {against.source} need a cause in the lens'
     tried = join_names(
         [
-            f'{causes.lens.to} from {causes.lens.without_px:.3g} to {causes.lens.with_px:.3g} px'
+            f'{causes.lens.to} from {pixels(causes.lens.without_px)} to '
+            f'{pixels(causes.lens.with_px)} px'
             for causes in against.tried
             if causes is not None
         ]

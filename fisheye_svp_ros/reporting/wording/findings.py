@@ -1,4 +1,4 @@
-"""Why an effect was accepted, is not confirmed, or is not needed."""
+"""Why an effect was accepted, is not confirmed, or is not needed; chances, errors in pixels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _REASONS = {
     Reason.NO_LASTING_GAIN: 'removed: it does not predict better any more',
     Reason.REFUTED_BY_FRAMES: 'held-out frames refute it',
     Reason.REFUTED_BY_FILE: 'the held-out file refutes it',
-    Reason.NO_GAIN: 'its gain on held-out frames is not significant',
+    Reason.NO_GAIN: 'does not improve the prediction of left-out frames',
     Reason.NO_OTHER_FRAME: 'there is no other frame to confirm it',
     Reason.NEEDLESS_BESIDE_RIVAL: 'not significant if {effect} replaces {replaced}',
     Reason.NO_GAIN_BESIDE_RIVAL: 'no significant gain on held-out frames if {effect} replaces '
@@ -29,6 +29,11 @@ def chance(probability: float) -> str:
     if probability < 1 - _CERTAIN:
         return f'less than {100 * (1 - _CERTAIN):.0f} %'
     return f'{100 * probability:.0f} %'
+
+
+def pixels(value: float) -> str:
+    """Return an error without its unit: three decimals, or three digits where these say less."""
+    return f'{value:.3f}' if 0.0005 <= value < 9.9995 else f'{value:.3g}'
 
 
 def belief(status: Status, probability: float) -> str:

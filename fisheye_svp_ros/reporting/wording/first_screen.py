@@ -49,7 +49,13 @@ from fisheye_svp_ros.reporting.wording.diagnosis import (
     lens_words,
     only_gross,
 )
-from fisheye_svp_ros.reporting.wording.findings import belief, chance, finding_reason, with_odds
+from fisheye_svp_ros.reporting.wording.findings import (
+    belief,
+    chance,
+    finding_reason,
+    pixels,
+    with_odds,
+)
 from fisheye_svp_ros.reporting.wording.travel import travel_sentence
 from fisheye_svp_ros.scene.observations import photograph_names
 
@@ -200,11 +206,11 @@ def _facts(d: Diagnosis, source: str) -> str:
         )
         near = f'; ray error {before:.2g} → {after:.2g} mrad at {asked:g} m'
     given = d.evaluation.as_given_px
-    of_file = '' if given is None else f'{given:.3g} px as given, with intrinsics refitted '
+    of_file = '' if given is None else f'{pixels(given)} px as given, with intrinsics refitted '
     return (
         f'{source}: {d.observations} points in {count_frames(d)}; held-out error {of_file}'
-        f'{base:.3g} → {named:.3g} px ({extended:.3g} px with local offsets), '
-        f'noise {d.noise_px:.2g} px{near}'
+        f'{pixels(base)} → {pixels(named)} px ({pixels(extended)} px with local offsets), '
+        f'noise {pixels(d.noise_px)} px{near}'
     )
 
 
@@ -225,7 +231,7 @@ def _warning(d: Diagnosis) -> str:
             )
         )
     rising = [
-        f'{name}: {before:.3g} → {after:.3g} px'
+        f'{name}: {pixels(before)} → {pixels(after)} px'
         for name, before, after in pairs
         if after > MAX_RMS_RATIO * before
     ]

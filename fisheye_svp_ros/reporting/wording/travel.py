@@ -6,6 +6,7 @@ from math import isfinite
 from pathlib import Path
 
 from fisheye_svp_ros.diagnosis import TwoDatasets
+from fisheye_svp_ros.reporting.wording.findings import pixels
 
 
 def travel_sentence(against: TwoDatasets) -> str:
@@ -20,4 +21,4 @@ def travel_sentence(against: TwoDatasets) -> str:
 
 
 def _error(px: float) -> str:
-    return f'{px:.3g} px' if isfinite(px) else 'some points out of sight'
+    return f'{pixels(px)} px' if isfinite(px) else 'some points out of sight'
