@@ -162,9 +162,7 @@ def lens_contents(d: Diagnosis) -> str:
     parts = ['intrinsics fitted to these data'] if d.evaluation.intrinsics else []
     parts += [c.effect for c in d.causes if c.stage == 'lens']
     parts += (
-        ['a viewpoint shift that is likely, not confirmed']
-        if d.evaluation.averaged_model.shifts
-        else []
+        ['a viewpoint shift that is not confirmed'] if d.evaluation.averaged_model.shifts else []
     )
     parts += ['an image field'] if field is not None and field.fields else []
     return f'with {join_names(parts)}' if parts else 'as it was fitted'
