@@ -6,8 +6,10 @@ import math
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from helpers.graph import Graph, set_parameter
 
@@ -201,7 +203,8 @@ def test_a_node_says_which_lens_it_solves_with(
     node = start('localizer', *(word for one in arguments for word in ('-p', one)))
     assert node.settings.solves_svp is solves_svp
     if node.settings.lens:
-        shift = node.model(0, {}).lens.viewpoint_shift
+        points = SimpleNamespace(uv=np.full((1, 2), 500.0))
+        shift = node.model(0, {'image_points': points}).lens.viewpoint_shift
         assert (shift is None) is solves_svp
     assert said in ' '.join(capfd.readouterr().err.split())
 

@@ -500,7 +500,7 @@ class TestDask:
                         stderr=subprocess.DEVNULL,
                     )
                 )
-            until(place.exists)
+            until(lambda: place.exists() and place.read_text().strip().endswith('}'))
             process = start(write(LONG), '-o', out, '--dask', read_address(place))
             until(lambda: parts_in(out) >= 1)
             begun[0].send_signal(number)
