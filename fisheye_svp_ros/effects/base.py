@@ -332,6 +332,19 @@ class PlaneEffect(Effect):
         return values / ratio
 
 
+class PupilEffect(Effect):
+    """An effect that moves the origins of rays, in the camera frame."""
+
+    stage: ClassVar[str] = 'pupil'
+
+    @abstractmethod
+    def origin_columns(self, theta: Array) -> Array:
+        """Derivatives (..., 3, P) of the origins of rays of angles (...), m."""
+
+    def columns(self, scene: Scene) -> Array:
+        return self.origin_columns(scene.theta)
+
+
 NO_TIME = 'the observations carry no time, or too few instants'
 
 

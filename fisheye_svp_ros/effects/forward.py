@@ -14,10 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask, gather_rows
-from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
+from fisheye_svp_ros.effects.base import Effect, NoiseEffect, PupilEffect, Scene
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import Target, curved_lens
-from fisheye_svp_ros.effects.ray_effects import PupilDecenteringEffect
 from fisheye_svp_ros.effects.terms import ModelTerm, camera_terms
 from fisheye_svp_ros.optics import camera, engines
 from fisheye_svp_ros.optics.camera import Image, Incidence, LinearImage, Rays, lens_columns
@@ -222,7 +221,7 @@ class ForwardModel:
         columns = [
             term.effect.origin_columns(theta) @ term.values
             for term in self.terms
-            if isinstance(term.effect, PupilDecenteringEffect)
+            if isinstance(term.effect, PupilEffect)
         ]
         return np.asarray(np.sum(columns, axis=0))
 

@@ -11,7 +11,14 @@ from typing import Self
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.base import Effect, Parameter, PlaneEffect, Scene, Untestable
+from fisheye_svp_ros.effects.base import (
+    Effect,
+    Parameter,
+    PlaneEffect,
+    PupilEffect,
+    Scene,
+    Untestable,
+)
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.curves import FlatPort, Gennery
 from fisheye_svp_ros.optics.lens import Lens
@@ -58,7 +65,7 @@ class ViewpointShiftEffect(Effect):
 
 
 @dataclass(frozen=True)
-class PupilDecenteringEffect(Effect):
+class PupilDecenteringEffect(PupilEffect):
     """The entrance pupil moves sideways: by e0_x, e0_y times the angle's part of a Gennery shift.
 
     The same curve as that of a shift along the axis, which a sideways one adds to.
@@ -67,7 +74,6 @@ class PupilDecenteringEffect(Effect):
     name = 'pupil_decentering'
     headline = 'The entrance pupil moves sideways with the angle'
     meaning = 'The entrance pupil moves sideways with the incidence angle.'
-    stage = 'pupil'
     rarer_than = 'decentering'
     signature = (
         'residuals towards one side that grow with the angle and with 1 / range, like those of a '
@@ -83,11 +89,7 @@ class PupilDecenteringEffect(Effect):
     def prior_sigma(self, scene: Scene) -> Array:
         return np.array([parameter.large for parameter in self.parameters])
 
-    def columns(self, scene: Scene) -> Array:
-        return self.origin_columns(scene.theta)
-
     def origin_columns(self, theta: Array) -> Array:
-        """Return what moves the origins (..., 3, 2) of rays of angles (...), camera frame."""
         growth = Gennery().columns(theta)[..., 1]
         return np.asarray(growth[..., None, None] * np.eye(3)[:, :2])
 
