@@ -1,6 +1,6 @@
-"""Writes what is said about parameters twice: the tables of nodes.md and config/*.yaml.
+"""Writes the tables of parameters in nodes.md, from those in the code; a test compares.
 
-Both come from the tables in the code; a test compares.  Run: python docs/parameters.py
+Run: python docs/parameters.py
 What at least `_SHARED` nodes have alike stands in a table of its own.
 """
 
@@ -17,6 +17,7 @@ from typing import Any
 import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / 'docs' / 'reference' / 'nodes.md'
 sys.path.insert(0, str(ROOT))
 
 from fisheye_svp_ros.io.parameters import Row  # noqa: E402
@@ -56,26 +57,9 @@ def node_section(table: list[Row], common: list[Row]) -> str:
     return '\n'.join([*([markdown(own)] if own else []), *([shared + '\n'] if names else [])])
 
 
-def parameter_file(node: str, table: list[Row]) -> str:
-    """Return a commented parameter file that holds the defaults."""
-    lines = [
-        f'# Parameters of {node}, with their defaults; see docs/reference/nodes.md.',
-        '/**:',
-        '  ros__parameters:',
-    ]
-    for row in table:
-        unit = f' [{row.unit}]' if row.unit else ''
-        allowed = f' ({row.constraint()})' if row.constraint() else ''
-        text = f'{row.description}{unit}{allowed}.'
-        lines += [f'    # {line}' for line in textwrap.wrap(text, 90)]
-        lines.append(f'    {row.name}: {_yaml(row.default)}')
-    return '\n'.join(lines) + '\n'
-
-
-def documents() -> dict[Path, str]:
-    """Return what the files should hold."""
-    page = ROOT / 'docs' / 'reference' / 'nodes.md'
-    text = page.read_text(encoding='utf-8')
+def nodes_page() -> str:
+    """Return what nodes.md should hold."""
+    text = PAGE.read_text(encoding='utf-8')
     tables = {
         node: executables.parameters(node)
         for node in NODES
@@ -86,16 +70,10 @@ def documents() -> dict[Path, str]:
     for node, section in {_COMMON: markdown(common), **sections}.items():
         pattern = re.escape(_TABLE.format(node=node, table='\0')).replace('\0', '.*?')
         new = _TABLE.format(node=node, table=section)
-        text, found = re.subn(pattern, lambda _, new=new: new, text, flags=re.DOTALL)
-        if not found:
-            raise SystemExit(f'docs/reference/nodes.md has no place for the parameters of {node}')
-    return {
-        page: text,
-        **{
-            ROOT / 'config' / f'{node}.yaml': parameter_file(node, table)
-            for node, table in tables.items()
-        },
-    }
+        text, places = re.subn(pattern, lambda _, new=new: new, text, flags=re.DOTALL)
+        if not places:
+            raise SystemExit(f'{PAGE.name} has no place for the parameters of {node}')
+    return text
 
 
 def _yaml(value: Any) -> str:
@@ -105,5 +83,4 @@ def _yaml(value: Any) -> str:
 
 
 if __name__ == '__main__':
-    for path, content in documents().items():
-        path.write_text(content, encoding='utf-8')
+    PAGE.write_text(nodes_page(), encoding='utf-8')

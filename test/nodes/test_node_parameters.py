@@ -14,13 +14,14 @@ import pytest
 from helpers.graph import Graph, set_parameter
 
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
-from fisheye_svp_ros.io.parameters import Row, rows, sweep_of, with_values
+from fisheye_svp_ros.io.parameters import Row, read_parameter_file, rows, sweep_of, with_values
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.nodes import NODES
 from fisheye_svp_ros.scene.rigs import rig
 from fisheye_svp_ros.simulate.scenario import Scenario
 from fisheye_svp_ros.study.settings import SolverSettings
 
+ROOT = Path(__file__).resolve().parents[2]
 OBSERVATIONS = 'frame,landmark,u,v,x,y,z\n' + ''.join(
     f'0,{i},{100 + 7 * i},{200 - 3 * i},{0.1 * i},{0.01 * i * i},1\n' for i in range(6)
 )
@@ -34,7 +35,7 @@ def node_class(name: str) -> Any:
 TABLES = {
     name: rows(node_class(name).SETTINGS)
     for name in NODES
-    if (Path(__file__).parents[2] / f'fisheye_svp_ros/nodes/{name}.py').exists()
+    if (ROOT / f'fisheye_svp_ros/nodes/{name}.py').exists()
 }
 
 
@@ -375,11 +376,22 @@ def test_the_lens_is_said_when_it_changes(
     assert capfd.readouterr().err.count('solving with the lens') == 2
 
 
-def test_parameter_files_and_documentation_say_what_the_code_says() -> None:
-    folder = Path(__file__).resolve().parents[2] / 'docs'
+def test_the_documentation_lists_the_parameters_of_the_code() -> None:
+    folder = ROOT / 'docs'
     space: dict[str, Any] = {'__file__': str(folder / 'parameters.py'), '__name__': 'parameters'}
     exec((folder / 'parameters.py').read_text(encoding='utf-8'), space)
-    for path, wanted in space['documents']().items():
-        assert path.read_text(encoding='utf-8') == wanted, (
-            f'{path.name} is stale; run: python docs/parameters.py'
-        )
+    page = folder / 'reference' / 'nodes.md'
+    assert page.read_text(encoding='utf-8') == space['nodes_page'](), (
+        f'{page.name} is stale; run: python docs/parameters.py'
+    )
+
+
+@pytest.mark.parametrize('name', TABLES)
+def test_a_parameter_file_holds_defaults_of_its_node(name: str) -> None:
+    by_node = read_parameter_file(ROOT / 'config' / f'{name}.yaml')
+    assert [*by_node] == ['/**']
+    defaults = {row.name: row.default for row in TABLES[name]}
+    for parameter, value in by_node['/**'].items():
+        default = defaults[parameter]
+        plain = [*default] if isinstance(default, tuple) else default
+        assert (type(value), value) == (type(plain), plain), parameter
