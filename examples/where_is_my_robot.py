@@ -44,7 +44,7 @@ LENS = Lens(
 )
 SIZE, SIGMA = 0.30, 0.10  # m, side of a tag; px, noise of a corner that the detector leaves
 ROOM = (3.0, 2.2)  # m, half of length and width
-STEP = 0.5  # s between images
+STEP, TWISTS = 0.5, 10  # s between images; odometry in between
 MOUNT = Pose(  # the camera in the base: 0.4 m up, looking ahead and a little up
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     @ rotation_from_vector(np.array([0.25, 0.0, 0.0])),
@@ -134,18 +134,20 @@ class Renderer:
 class Filter:
     """The extended Kalman filter of robot_localization in the plane: x, y, yaw."""
 
+    step = STEP / TWISTS  # s
+
     def __init__(self, state: np.ndarray, covariance: np.ndarray) -> None:
         self.state, self.covariance = state, covariance
 
     def predict(self, twist: np.ndarray, noise: np.ndarray) -> None:
-        """Move by a twist (forward m/s, yaw rad/s) over STEP, with variances of it."""
-        yaw = self.state[2] + 0.5 * twist[1] * STEP
+        """Move by a twist (forward m/s, yaw rad/s) over a step, with variances of it."""
+        yaw = self.state[2] + 0.5 * twist[1] * self.step
         move = np.array([np.cos(yaw), np.sin(yaw)])
-        self.state = self.state + STEP * np.array([*(twist[0] * move), twist[1]])
+        self.state = self.state + self.step * np.array([*(twist[0] * move), twist[1]])
         f = np.eye(3)
-        f[:2, 2] = STEP * twist[0] * np.array([-move[1], move[0]])
-        g = STEP * np.array([[move[0], 0], [move[1], 0], [0, 1]])
-        g[:2, 1] = 0.5 * STEP**2 * twist[0] * np.array([-move[1], move[0]])
+        f[:2, 2] = self.step * twist[0] * np.array([-move[1], move[0]])
+        g = self.step * np.array([[move[0], 0], [move[1], 0], [0, 1]])
+        g[:2, 1] = 0.5 * self.step**2 * twist[0] * np.array([-move[1], move[0]])
         self.covariance = f @ self.covariance @ f.T + g @ np.diag(noise) @ g.T
 
     def correct(self, measured: np.ndarray, covariance: np.ndarray) -> None:
@@ -212,28 +214,27 @@ def planar(pose: Pose, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def run_filter(
-    base: Pose, posed: np.ndarray, measured: np.ndarray, covariance: np.ndarray
+    path: Pose, posed: np.ndarray, measured: np.ndarray, covariance: np.ndarray
 ) -> Track:
-    """Filter odometry with a poor scale and the poses; return the errors of the filter."""
-    true, rng = planar(base, np.zeros((len(base.position), 6, 6)))[0], np.random.default_rng(1)
-    noise = np.array([0.03, 0.03])  # m/s, rad/s
-    first = int(posed[0])
+    """Filter odometry along a path (TWISTS F,) and poses; return the errors beside each image."""
+    true = planar(path, np.zeros((len(path.position), 6, 6)))[0]
+    rng, noise = np.random.default_rng(1), np.array([0.03, 0.03])  # m/s, rad/s
     ekf = Filter(measured[0].copy(), covariance[0].copy())
     errors, covariances = [], []
-    for i in range(first, len(true)):
-        if i > first:
+    for i in range(TWISTS * int(posed[0]), len(true)):
+        if errors:
             change = true[i] - true[i - 1]
             turn = (change[2] + np.pi) % (2 * np.pi) - np.pi
-            twist = np.array([np.linalg.norm(change[:2]), turn]) / STEP + rng.normal(0, noise)
-            ekf.predict(twist, noise**2)
-            here = np.flatnonzero(posed == i)
+            twist = np.array([np.linalg.norm(change[:2]), turn]) / ekf.step
+            ekf.predict(twist + rng.normal(0, noise), noise**2)
+            here = np.flatnonzero(TWISTS * posed == i)
             if here.size:
                 ekf.correct(measured[here[0]], covariance[here[0]])
         off = ekf.state - true[i]
         off[2] = (off[2] + np.pi) % (2 * np.pi) - np.pi
         errors.append(off)
         covariances.append(ekf.covariance)
-    return Track(np.array(errors), np.stack(covariances))
+    return Track(np.array(errors)[::TWISTS], np.stack(covariances)[::TWISTS])
 
 
 def draw(
@@ -262,7 +263,8 @@ def main() -> None:
     parser.add_argument('output', type=Path, nargs='?', default=Path('robot'))
     parser.add_argument('--images', type=int, default=24)
     args = parser.parse_args()
-    tags, base = room_tags(), drive(args.images)
+    tags, path = room_tags(), drive(TWISTS * args.images)
+    base = path.take(np.arange(0, TWISTS * args.images, TWISTS))
     images = photographs(tags, base, args.output / 'walk')
     save_lens(LENS, args.output / 'lens.yaml')
     write_tag_map(tags, args.output / 'true_tags.yaml')
@@ -282,7 +284,7 @@ def main() -> None:
     posed, pose, covariance = localize_bases(tags, found)
     measured, planar_covariance = planar(pose, covariance)
     alone = Track(pose.difference(base.take(posed)), covariance)
-    filtered = run_filter(base, posed, measured, planar_covariance)
+    filtered = run_filter(path, posed, measured, planar_covariance)
     flat_error = np.column_stack([alone.error[:, :2], alone.error[:, 5]])
     draw(
         args.output / 'where_is_my_robot.png',
@@ -297,6 +299,7 @@ def main() -> None:
         'tags_mapped': len(mapped.ids),
         'map_rms_px': mapped.rms_px,
         'map_error_mm': 1e3 * float(map_error.mean()),
+        'map_stderr_mm': 1e3 * float(mapped.stderr.mean()),
         'base_error_mm': 1e3 * float(np.linalg.norm(alone.error[:, :3], axis=1).mean()),
         'base_nees_of_6': float(alone.nees().mean()),
         'base_within_95': float((alone.nees() < 12.59).mean()),

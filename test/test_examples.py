@@ -23,15 +23,15 @@ EXAMPLES = ROOT / 'examples'
 SCRIPTS = {
     'svp_error_by_range': ('range [m]', ['svp_error_by_range.png']),
     'diagnose_observations': ('viewpoint_shift: p = ', ['extended.yaml']),
-    'where_is_my_robot': ('tags_mapped: 12', ['robot']),
     'stereo_depth_error': ('full lens: baseline 150.0', []),
 }
+ROBOT = 'where_is_my_robot'
 NODE_SCRIPTS = {'publish_image_points', 'compose_nodes', 'localizer_launch_test'}
 NOTEBOOKS = ('viewpoint_shift', 'diagnosis', 'paper_result', 'real_data')
 
 
 def test_every_example_is_tested() -> None:
-    assert {path.stem for path in EXAMPLES.glob('*.py')} == {*SCRIPTS, *NODE_SCRIPTS}
+    assert {path.stem for path in EXAMPLES.glob('*.py')} == {*SCRIPTS, ROBOT, *NODE_SCRIPTS}
     assert {path.stem for path in EXAMPLES.glob('*.ipynb')} == {*NOTEBOOKS}
 
 
@@ -49,6 +49,20 @@ def test_a_script_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert done.returncode == 0, done.stderr
     assert line in done.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == files
+
+
+def test_a_robot_knows_how_wrong_its_map_and_poses_are(tmp_path: Path) -> None:
+    environment = os.environ | {'PYTHONPATH': str(ROOT), 'MPLBACKEND': 'agg'}
+    subprocess.run(
+        [sys.executable, str(EXAMPLES / f'{ROBOT}.py')],
+        cwd=tmp_path,
+        env=environment,
+        check=True,
+    )
+    figures = json.loads((tmp_path / 'robot' / 'figures.json').read_text())
+    assert figures['tags_mapped'] == 12
+    assert figures['map_error_mm'] < 2 * figures['map_stderr_mm'] < 25
+    assert 3 < figures['base_nees_of_6'] < 9 and 1 < figures['filter_nees_of_3'] < 6
 
 
 def test_poses_come_for_published_points(

@@ -14,6 +14,7 @@ from fisheye_svp_ros.detect.finders import Grey, detect_markers
 from fisheye_svp_ros.detect.patterns import LOOSE_TAGS, Pattern
 from fisheye_svp_ros.detect.photographs import Photograph, Pixels
 from fisheye_svp_ros.detect.points import Points, eight_bit
+from fisheye_svp_ros.detect.tag_edges import fit_quads
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.tag_maps import CORNERS
 from fisheye_svp_ros.scene.observations import Landmarks
@@ -21,7 +22,6 @@ from fisheye_svp_ros.scene.observations import Landmarks
 # libapriltag goes round a tag from its lower left, against the clock; OpenCV's print of a tag is
 # that of libapriltag turned by half.
 _ORDER = [1, 0, 3, 2]
-_WINDOW_SHARE, _MIN_WINDOW, _MAX_WINDOW = 0.06, 2, 8  # of a side; px around a corner
 _MIN_SIDE = 12.0  # px; the corners of a smaller tag run into its code
 _SPEC = re.compile(r'tags:(?:36h11:)?([0-9.]+) *(mm|cm|m)', re.IGNORECASE)
 _UNITS = {'mm': 1e-3, 'cm': 1e-2, 'm': 1.0}
@@ -54,15 +54,7 @@ def find_tags(image: Grey) -> tuple[Index, Array]:
     side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).min(axis=1)
     once = np.array([(ids == one).sum() == 1 for one in ids], dtype=bool)
     keep = once & (side > _MIN_SIDE)
-    ids, corners, side = ids[keep], corners[keep][:, _ORDER], side[keep]
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
-    refined = corners.copy()
-    for i, length in enumerate(side):
-        half = int(np.clip(_WINDOW_SHARE * length, _MIN_WINDOW, _MAX_WINDOW))
-        start = corners[i].astype(np.float32).reshape(-1, 1, 2)
-        found = cv2.cornerSubPix(image, start, (half, half), (-1, -1), criteria)
-        refined[i] = found.reshape(-1, 2)
-    return ids, refined
+    return ids[keep], fit_quads(image, corners[keep][:, _ORDER])
 
 
 def tag_pattern(spec: str, landmarks: Landmarks) -> Pattern:

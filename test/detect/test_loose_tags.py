@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from fisheye_svp_ros.detect.photographs import Photograph
+from fisheye_svp_ros.detect.tag_edges import fit_quads
 from fisheye_svp_ros.detect.tags import find_tag_views, find_tags, tag_size
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 
@@ -27,6 +28,54 @@ def test_corners_go_round_from_the_lower_left():
     low, high = np.array([49.5, 59.5]), np.array([209.5, 219.5])
     expected = [[low[0], high[1]], high, [high[0], low[1]], low]
     np.testing.assert_allclose(corners[ids.tolist().index(3)], expected, atol=0.15)
+
+
+def slanted_tags():
+    """Return a photograph of small slanted tags, and their corners by id (20, 4, 2), px."""
+    rng, fine = np.random.default_rng(2), 8
+    large = np.full((fine * 400, fine * 500), 225, np.uint8)
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    corners = []
+    for number in range(20):
+        middle = np.array([50 + 100 * (number % 5), 50 + 100 * (number // 5)])
+        turn = rng.uniform(-0.5, 0.5)
+        axes = 12 * np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        axes *= [[1.0], [rng.uniform(0.7, 1.0)]]  # seen from one side
+        corners.append(
+            middle + rng.uniform(-0.5, 0.5, 2) + [[-1, 1], [1, 1], [1, -1], [-1, -1]] @ axes
+        )
+        print_ = np.rot90(cv2.aruco.generateImageMarker(family, number, 8), 2).copy()
+        ends = np.array([[-0.5, 7.5], [7.5, 7.5], [7.5, -0.5], [-0.5, -0.5]], np.float32)
+        warp = cv2.getPerspectiveTransform(
+            ends, (fine * (corners[-1] + 0.5) - 0.5).astype(np.float32)
+        )
+        size = large.shape[::-1]
+        ink = cv2.warpPerspective(print_, warp, size, flags=cv2.INTER_NEAREST)
+        inside = cv2.warpPerspective(
+            np.full_like(print_, 255), warp, size, flags=cv2.INTER_NEAREST
+        )
+        large[inside > 0] = np.where(ink[inside > 0] > 127, 225, 25)
+    photograph = cv2.resize(large, (500, 400), interpolation=cv2.INTER_AREA).astype(float)
+    photograph = cv2.GaussianBlur(photograph, (0, 0), 0.7) + rng.normal(0, 2, photograph.shape)
+    return np.clip(np.round(photograph), 0, 255).astype(np.uint8), np.array(corners)
+
+
+def test_corners_of_small_tags_do_not_lie_inwards():
+    image, expected = slanted_tags()
+    ids, corners = find_tags(image)
+    assert len(ids) >= 15
+    off, arm = corners - expected[ids], expected[ids] - expected[ids].mean(axis=1, keepdims=True)
+    outwards = (off * arm).sum(axis=-1) / np.linalg.norm(arm, axis=-1)
+    assert abs(outwards.mean()) < 0.05  # cornerSubPix: -0.3 px
+    assert np.sqrt((off**2).sum(axis=-1).mean()) < 0.2
+
+
+def test_a_tag_without_edges_stays_where_it_was():
+    corners = np.array([[[20.0, 40], [40, 40], [40, 20], [20, 20]]])
+    for image in (np.full((60, 60), 9, np.uint8), np.eye(60, dtype=np.uint8)):
+        fitted = fit_quads(image, corners)
+        assert np.isfinite(fitted).all() and np.abs(fitted - corners).max() < 5
+    assert fit_quads(image, corners[:0]).shape == (0, 4, 2)
 
 
 def test_an_id_that_is_there_twice_is_left_out():
