@@ -334,7 +334,8 @@ def test_boofcv() -> None:
         ),
         ('%YAML:1.0\n---\na: ' + '[' * 100_000, 'nested deeper|nesting depth'),
         (
-            '<opencv_storage><K>3</K><D>3</D><width>4</width><height>4.5</height></opencv_storage>',
+            '<opencv_storage><K>3</K><D>3</D><width>4</width><height>4.5</height>'
+            '</opencv_storage>',
             'a matrix of 3 x 3',
         ),
         (CAMCHAIN.replace('[512, 512]', '[512, 512.5]', 1), 'whole numbers are needed'),

@@ -39,7 +39,7 @@ def check(path: Path, camera: str = '') -> None:
 
 @pytest.mark.parametrize('form', ['yml', 'xml', 'json'])
 def test_arrays_of_one_dimension(form: str, tmp_path: Path) -> None:
-    """OpenCV 5 writes them by their sizes."""
+    """Version 5 of OpenCV writes them by their sizes."""
     path = tmp_path / f'o.{form}'
     if form == 'yml':
         path.write_text(
