@@ -72,7 +72,7 @@ def unpack_usable(cloud: Any, layout: np.dtype[np.void], what: str) -> UsablePoi
     for name in layout.names or ():
         _check_field(raw.dtype, layout, name, what)
         good = _representable(raw[name], layout[name])
-        if not good.all() and not reason:
+        if np.count_nonzero(good) < good.size and not reason:
             bad = int(np.argmin(good))
             reason = (
                 f'{what}: field {name!r} of point {bad} is {raw[name][bad]}; leave out '

@@ -15,7 +15,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import (
     Point,
     PoseStamped,
-    PoseWithCovariance,
     PoseWithCovarianceStamped,
     Quaternion,
     TransformStamped,
@@ -139,8 +138,15 @@ def pose_message(pose: Pose, stamp: int, frame: str) -> Any:
 
 def pose_with_covariance_message(pose: Pose, covariance: Array, stamp: int, frame: str) -> Any:
     """Return PoseWithCovarianceStamped; covariance (6, 6), m and rad, in the order of ROS."""
-    inner = PoseWithCovariance(pose=_pose(pose), covariance=covariance.ravel().tolist())
-    return PoseWithCovarianceStamped(header=header(stamp, frame), pose=inner)
+    # Filled in place: a message that is given its parts makes them anew first, which takes longer.
+    message = PoseWithCovarianceStamped()
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, _NS)
+    message.header.frame_id = frame
+    message.pose.covariance = covariance.ravel()
+    at, turn = message.pose.pose.position, message.pose.pose.orientation
+    at.x, at.y, at.z = pose.position.tolist()
+    turn.x, turn.y, turn.z, turn.w = quaternion_from_rotation(pose.rotation).tolist()
+    return message
 
 
 def transform_message(pose: Pose, stamp: int, frame: str, child: str) -> Any:

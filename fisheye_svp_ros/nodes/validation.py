@@ -7,6 +7,8 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
 from fisheye_svp_ros.io.decoding import FramedPose, ImagePoints, LandmarkSet, frames_differ
@@ -103,7 +105,7 @@ class SetValidation:
             self.rejected[f'{topic}: points without a value'] += seen.rejected
             count = len(seen.landmark) + seen.rejected
             texts.append(wording.points_without_value(topic, seen.rejected, count))
-        if known.all():
+        if np.count_nonzero(known) == known.size:
             return KnownPoints(seen.landmark, seen.uv, points, seen.frame), texts
         unknown = seen.landmark[~known]
         if settings.strict or not known.any():

@@ -34,7 +34,7 @@ class Curve:
         """Largest angle, rad, up to which a height grows or a ray gets through."""
         return np.pi
 
-    @property
+    @cached_property
     def coefficients(self) -> tuple[float, ...]:
         """Values of the coefficients, in the order of `coefficient_names`."""
         return tuple(getattr(self, name) for name in self.coefficient_names)

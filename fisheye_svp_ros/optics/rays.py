@@ -120,7 +120,7 @@ def _shifted_rays(
     theta, sin, cos, clearance, settled = _newton(shift, r, z, *start)
     limit = search_limit(shift, lens.max_incidence)
     apart = ~settled | (theta <= 0) | (distance < caustic_range(shift, limit))
-    if apart.any():
+    if np.count_nonzero(apart):
         found = _scan(shift, limit, r[apart], z[apart])
         theta[apart], sin[apart], cos[apart] = found, np.sin(found), np.cos(found)
         value, rise = shift_at(shift, found, sin[apart], cos[apart])
@@ -153,7 +153,7 @@ def _newton(
     cos -= step * sin
     found = (theta, turned, cos, clearance, np.abs(step, out=step) < STEP_TOLERANCE)
     late = ~found[-1]
-    if more and late.any():
+    if more and np.count_nonzero(late):
         start = theta[late], *_sine_and_cosine(theta[late])
         again = _newton(shift, r[late], z[late], *start, 1, more - 1)
         for field, values in zip(found, again, strict=True):

@@ -74,29 +74,24 @@ def levenberg_marquardt(
     systems = start[0].shape[0]
     active: Index = np.arange(systems)
     total, normal = problem.linearise(start, active)
-    found = Minimum(
-        tuple(array.copy() for array in start),
-        total,
-        np.zeros(systems, dtype=np.bool_),
-        np.zeros(systems, dtype=np.int64),
-        normal,
-    )
+    state = tuple(array.copy() for array in start)
+    converged, iterations = np.zeros(systems, dtype=np.bool_), np.zeros(systems, dtype=np.int64)
     damping, growth = np.full(systems, FIRST_DAMPING), np.full(systems, FIRST_GROWTH)
     moved_before = np.zeros(systems)
     active = active[np.isfinite(total)]
     for _ in range(max_iterations):
         if not active.size:
             break
-        found.iterations[active] += 1
-        step, moved = problem.step(_rows(found.normal, active), damping[active])
-        trial = problem.retract(_rows(found.state, active), step)
+        iterations[active] += 1
+        step, moved = problem.step(_rows(normal, active), damping[active])
+        trial = problem.retract(_rows(state, active), step)
         before = total[active]
         done = is_last(moved, moved_before[active], before, damping[active])
-        if done.any():
+        if np.count_nonzero(done):
             last, on = active[done], ~done
-            found.converged[last] = True
+            converged[last] = True
             total[last] = np.maximum(before - moved, 0.0)[done]
-            found = found._replace(state=_with_rows(found.state, last, trial, done))
+            state = _with_rows(state, last, trial, done)
             active, before, moved = active[on], before[on], moved[on]
             trial = tuple(array[on] for array in trial)
             if not active.size:
@@ -105,20 +100,18 @@ def levenberg_marquardt(
         better = is_better(cost, before)
         accepted = active[better]
         total[accepted], moved_before[accepted] = cost[better], moved[better]
-        found = found._replace(
-            state=_with_rows(found.state, accepted, trial, better),
-            normal=_with_rows(found.normal, accepted, fresh, better),
-        )
+        state = _with_rows(state, accepted, trial, better)
+        normal = _with_rows(normal, accepted, fresh, better)
         damping[active], growth[active] = update_damping(
             damping[active], growth[active], better, before - cost, moved
         )
         active = active[damping[active] < STUCK]
-    rest = np.flatnonzero(~found.converged & np.isfinite(total))
+    rest = np.flatnonzero(~converged & np.isfinite(total))
     if rest.size:
         # Some effects have derivatives that are not exact: no step keeps what it promises.
-        _, moved = problem.step(_rows(found.normal, rest), np.zeros(len(rest)))
-        found.converged[rest] = moved <= _STALL_TOLERANCE * total[rest]
-    return found
+        _, moved = problem.step(_rows(normal, rest), np.zeros(len(rest)))
+        converged[rest] = moved <= _STALL_TOLERANCE * total[rest]
+    return Minimum(state, total, converged, iterations, normal)
 
 
 def solve_damped(hessian: Array, gradient: Array, damping: Array) -> Array:
@@ -148,10 +141,14 @@ def with_unit_diagonal(hessian: Array, damping: Array | float) -> tuple[Array, A
 
     damping (...): added to the diagonal.
     """
-    diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
+    size = hessian.shape[-1]
+    diagonal = hessian.reshape(*hessian.shape[:-2], size * size)[..., :: size + 1]
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    scaled = hessian / (scale[..., :, None] * scale[..., None, :])
-    np.einsum('...ii->...i', scaled)[...] = np.asarray(1 + _FLOOR + damping)[..., None]
+    outer = scale[..., :, None] * scale[..., None, :]
+    scaled = np.divide(hessian, outer, order='C')  # so that reshaping it makes no copy
+    scaled.reshape(*outer.shape[:-2], size * size)[..., :: size + 1] = np.asarray(
+        1 + _FLOOR + damping
+    )[..., None]
     return scaled, scale
 
 

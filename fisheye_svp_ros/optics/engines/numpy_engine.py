@@ -1,4 +1,7 @@
-"""The reference engine: NumPy, in blocks that stay in a processor's cache."""
+"""The reference engine: NumPy, in blocks that stay in a processor's cache.
+
+For single views masks are counted: that takes a tenth of the time of `any` and `all`.
+"""
 
 from __future__ import annotations
 
@@ -102,7 +105,7 @@ def pose_equations(
     for part in _tiles(systems, count):
         own, weights = part[0], weight[part]
         local = _to_cameras(rotation, position, points, part)
-        if not weights.all():
+        if np.count_nonzero(weights) < weights.size:
             local[:, weights == 0] = np.array([[0.0], [0.0], [1.0]])
         met = _solved_incidence(lens, local, False)
         height, slope = met.height(lens.image_height)
@@ -112,14 +115,14 @@ def pose_equations(
         _add_up(sums[own], met, (height, slope), rows[:, :12], rows[:, 12:])
         off = rows[:, 12:].transpose(1, 0, 2)
         off -= (uv[part].transpose(2, 0, 1) - centre) * weights
-        if not met.valid.all():
+        if np.count_nonzero(met.valid) < met.valid.size:
             off[:, ~met.valid] = np.nan
         cost[own] += np.einsum('usn,usn->s', off, off)
         flat = rows.reshape(len(rows), 7, -1)
         # All seven times all seven would be BLAS's syrk, which is slower at this size.
         gram[own] += flat[:, :6] @ flat.swapaxes(1, 2)
     outside = ~np.isfinite(cost)
-    if outside.any():
+    if np.count_nonzero(outside):
         cost[outside], gram[outside] = np.inf, np.eye(6, 7)
     return cost, gram[..., :6], gram[..., 6]
 
@@ -171,7 +174,7 @@ def _to_cameras(
 def _centre(lens: Lens, valid: Mask, uv: Array) -> None:
     """Move image points (2, ...), px, from around the origin; NaN where there is none."""
     uv += _pair(lens.cx, lens.cy, uv.ndim)
-    if not valid.all():
+    if np.count_nonzero(valid) < valid.size:
         uv[:, ~valid] = np.nan
 
 
