@@ -10,7 +10,7 @@ import argparse
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from typing import NoReturn
@@ -62,9 +62,9 @@ EXAMPLES = {
     'plot': 'recording -o pictures',
     'record': '-o recording --sweep noise',
     'render': '--lens fish180 --board chessboard:9x6:25mm --count 12 -o rendered',
-    'run': 'localizer --ros-args -p lens:=fish180',
+    'run': 'synthetic_camera localizer',
     'sweep': 'noise -o sweep',
-    'table': 'recording -o table.csv',
+    'table': 'recording -o table',
     'undistort': 'lens.yaml photographs --as pinhole -o undistorted',
     'watch': '',
 }
@@ -150,6 +150,8 @@ def _run(arguments: Sequence[str]) -> None:
         module.add_arguments(commands.choices[named])
         commands.choices[named].set_defaults(run=module.run)
         commands.choices[named].epilog = f'example: fisheye-svp {named} {EXAMPLES[named]}'.rstrip()
+    elif named:
+        _refuse(parser, named, COMMANDS, 'command')
     if named in _SOLVING:
         commands.choices[named].add_argument(
             '--engine',
@@ -160,7 +162,8 @@ def _run(arguments: Sequence[str]) -> None:
         )
     parsed, unknown = parser.parse_known_args(arguments)
     if unknown:
-        _refuse(commands.choices[named], unknown[0])
+        chosen = commands.choices[named]
+        _refuse(chosen, unknown[0], chosen.format_help().split(), 'argument')
     import_module('fisheye_svp_ros.commands.outputs').check_output(parsed)
     if named in _SOLVING and parsed.engine:
         import_module('fisheye_svp_ros.optics.engines').use(parsed.engine)
@@ -185,12 +188,14 @@ def _tidy(command: str) -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _refuse(parser: argparse.ArgumentParser, word: str) -> NoReturn:
-    """End with the help of the command that does not know a word, and an option like it."""
+def _refuse(
+    parser: argparse.ArgumentParser, word: str, known: Iterable[str], kind: str
+) -> NoReturn:
+    """End with the help of a parser that does not know a word, and a known one like it."""
     from difflib import get_close_matches
 
-    near = get_close_matches(word.partition('=')[0], parser.format_help().split(), 1, 0.8)
-    parser.error(f'unknown argument {word}' + (f'; did you mean {near[0]}?' if near else ''))
+    near = get_close_matches(word.partition('=')[0], known, 1, 0.8)
+    parser.error(f'unknown {kind} {word}' + (f'; did you mean {near[0]}?' if near else ''))
 
 
 if __name__ == '__main__':

@@ -69,7 +69,8 @@ TASKS = (
     ),
     Task(
         'calibration',
-        'Stereo calibration as SVP. error: of the place of the left camera; image: mean residual',
+        'Stereo calibration as SVP. error: of the place of the left camera, which depends on ten '
+        'poses that are not published; image: mean residual',
         'style',
         STYLE_NAMES,
         'stereo_calibrator',

@@ -124,8 +124,8 @@ def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
     lens = setup.lens
     if lens.is_svp:
         raise LensError(
-            f'lens {lens.name!r} has no viewpoint_shift: SVP is exact for it; '
-            'whether the camera has one is found by `fisheye-svp diagnose`'
+            f'lens {lens.name!r} has no viewpoint_shift, so nothing is known of the error '
+            'that SVP makes; `fisheye-svp diagnose` measures it: give its extended_lens.yaml'
         )
     if not (np.isfinite(setup.noise) and setup.noise > 0):
         raise ParameterError(f'noise is {setup.noise} px; it must be above 0')

@@ -148,7 +148,7 @@ def test_impossible_questions(budget, spread, working_range, limits, reason):
 
 
 def test_a_lens_without_a_shift_needs_no_budget():
-    with pytest.raises(LensError, match=r"lens 'fish214' has no viewpoint_shift: .*diagnose"):
+    with pytest.raises(LensError, match=r"lens 'fish214' has no viewpoint_shift, .*diagnose"):
         make_budget(Setup(LENS.svp(), rig('parallel'), 0.3))
 
 
