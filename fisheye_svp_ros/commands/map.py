@@ -12,7 +12,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_together
 from fisheye_svp_ros.io.readers import check_sizes, write_poses
 from fisheye_svp_ros.reporting.terminal import print_table, progress
-from fisheye_svp_ros.reporting.wording.poses import missing_tags_note
+from fisheye_svp_ros.reporting.wording.poses import map_notes
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,8 +75,8 @@ def run(args: argparse.Namespace) -> None:
             )
         ],
     )
-    if found.missing:
-        say(missing_tags_note(found.missing))
+    for note in map_notes(found.missing, found.outside, found.rms_px, found.focal):
+        say(note)
     if args.output:
         with write_together():
             write_tag_map(tags, args.output, found.stderr, 'fisheye-svp map')

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.forward import ForwardModel, back_project_corrected
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.pose import Pose, cross_matrix, identity
 from fisheye_svp_ros.scene.observations import Views, views_of
@@ -29,7 +29,9 @@ class TagMapping(NamedTuple):
     """Tags (T,): id, pose in the frame of the first, standard error of position, m.
 
     images (F,): numbers of those that could be posed; cameras (F,); rms_px over inlying corners;
-    missing: ids of tags that no image ties to the others.
+    missing: ids of tags that no image ties to the others; outside: how many sightings of a tag
+    reach beyond the field of view of the lens, and were left out; focal: by which share the tags
+    would have the focal length larger, and its standard error.
     """
 
     ids: Index
@@ -39,6 +41,8 @@ class TagMapping(NamedTuple):
     cameras: Pose
     rms_px: float
     missing: tuple[int, ...]
+    outside: int
+    focal: tuple[float, float]
 
 
 class _Scene(NamedTuple):
@@ -65,8 +69,12 @@ def map_tags(
     """Map tags of one size, m, from corners uv (R, 4, 2), px, by image (R,) and id (R,).
 
     origin: id of the tag whose frame is that of the map; None: the one that most images show.
-    Raises GeometryError where nothing ties two tags together.
+    Raises GeometryError where nothing ties two tags together, or the lens sees none.
     """
+    inside = back_project_corrected(model.lens, uv).valid.all(axis=1)
+    if not inside.any():
+        raise GeometryError('no tag lies in the field of view of the lens; is it of this camera?')
+    image, ids, uv = image[inside], ids[inside], uv[inside]
     known, slot = np.unique(ids, return_inverse=True)
     numbers, row = np.unique(image, return_inverse=True)
     corners = np.full((len(numbers), len(known), _CORNERS, 2), np.nan)
@@ -87,9 +95,8 @@ def map_tags(
     kept = np.flatnonzero(mapped)
     scene = _Scene(scene.uv[images][:, kept], scene.local[kept])
     anchor = int(np.flatnonzero(kept == first)[0])
-    tags, cameras, stderr, rms = _adjust(
-        model, scene, tags.take(kept), cameras.take(images), anchor
-    )
+    tags, cameras = _adjust(model, scene, tags.take(kept), cameras.take(images), anchor)
+    stderr, rms, focal = _assess(model, scene, tags, cameras, anchor)
     return TagMapping(
         known[kept],
         tags,
@@ -98,6 +105,8 @@ def map_tags(
         cameras,
         rms,
         tuple(known[~mapped].tolist()),
+        int((~inside).sum()),
+        focal,
     )
 
 
@@ -159,13 +168,11 @@ def _place_tag(
 
 def _adjust(
     model: ForwardModel, scene: _Scene, tags: Pose, cameras: Pose, anchor: int
-) -> tuple[Pose, Pose, Array, float]:
-    """Adjust all poses but that of the anchor; return them, standard errors (T,), rms, px."""
+) -> tuple[Pose, Pose]:
+    """Adjust all poses but that of the anchor, and return them."""
     frames, count = scene.uv.shape[:2]
-    free = np.delete(
-        np.arange(6 * (frames + count)), slice(6 * (frames + anchor), 6 * (frames + anchor + 1))
-    )
-    damping, (residual, jacobian) = 1e-4, _linearize(model, scene, tags, cameras)
+    free = _free_columns(frames, count, anchor)
+    damping, (residual, jacobian, _) = 1e-4, _linearize(model, scene, tags, cameras)
     cost = _cost(residual)
     for _ in range(_MAX_ITERATIONS):
         weight = 1 / (1 + (residual / _CAUCHY_PX) ** 2)
@@ -181,22 +188,46 @@ def _adjust(
         lower = _cost(fresh[0])
         if lower <= cost:
             done = cost - lower <= _TOLERANCE * cost
-            (tags, cameras), (residual, jacobian), cost = trial, fresh, lower
+            (tags, cameras), (residual, jacobian, _), cost = trial, fresh, lower
             damping = max(damping / 5, 1e-12)
             if done:
                 break
         else:
             damping *= 8
+    return tags, cameras
+
+
+def _free_columns(frames: int, count: int, anchor: int) -> Index:
+    """Return which of the 6 (F + T) columns of poses are free: all but those of the anchor."""
+    held = slice(6 * (frames + anchor), 6 * (frames + anchor + 1))
+    return np.delete(np.arange(6 * (frames + count)), held)
+
+
+def _assess(
+    model: ForwardModel, scene: _Scene, tags: Pose, cameras: Pose, anchor: int
+) -> tuple[Array, float, tuple[float, float]]:
+    """Return standard errors of places (T,), m, the rms of corners, px, and the focal length.
+
+    The last: by which share the corners would have it larger, one step with all poses free, and
+    its standard error.
+    """
+    frames, count = scene.uv.shape[:2]
+    residual, jacobian, uv = _linearize(model, scene, tags, cameras)
     weight = 1 / (1 + (residual / _CAUCHY_PX) ** 2)
+    free = _free_columns(frames, count, anchor)
     columns = jacobian[:, free]
     variance = float((weight * residual**2).sum()) / max(len(residual) - len(free), 1)
-    covariance = variance * np.linalg.pinv((columns * weight[:, None]).T @ columns)
+    covariance = np.linalg.pinv((columns * weight[:, None]).T @ columns)
     variances = np.zeros(6 * (frames + count))
-    variances[free] = np.diag(covariance)
+    variances[free] = variance * np.diag(covariance)
     stderr = np.sqrt(variances.reshape(-1, 6)[frames:, :3].max(axis=1))
     inlying = np.abs(residual) < 5 * _CAUCHY_PX
     rms = float(np.sqrt(2 * (residual[inlying] ** 2).mean()))
-    return tags, cameras, stderr, rms
+    growth = (uv - (model.lens.cx, model.lens.cy)).ravel()
+    growth = growth - columns @ (covariance @ (columns.T @ (weight * growth)))  # what poses leave
+    information = float((weight * growth**2).sum())
+    change = -float((weight * growth * residual).sum()) / information
+    return stderr, rms, (change, float(np.sqrt(variance / information)))
 
 
 def _cost(residual: Array) -> float:
@@ -205,8 +236,11 @@ def _cost(residual: Array) -> float:
 
 def _linearize(
     model: ForwardModel, scene: _Scene, tags: Pose, cameras: Pose
-) -> tuple[Array, Array]:
-    """Return residuals (M,), px, and their derivatives (M, 6 (F + T)) by cameras, then tags."""
+) -> tuple[Array, Array, Array]:
+    """Return residuals (M,), px, their derivatives (M, 6 (F + T)) by cameras, then tags.
+
+    And the pixels (M / 2, 2) that they belong to.
+    """
     frames, count = scene.uv.shape[:2]
     views = scene.views(tags, np.ones(count, dtype=bool), np.arange(frames))
     linear = model.linearise(cameras, views)
@@ -223,5 +257,6 @@ def _linearize(
     rows = np.arange(len(frame))
     jacobian[rows, :, frame] = by_camera
     jacobian[rows, :, frames + tag] = by_tag
-    residual = linear.uv[frame, point] - views.uv[frame, point]
-    return residual.ravel(), jacobian.reshape(2 * len(frame), -1)
+    uv = linear.uv[frame, point]
+    residual = uv - views.uv[frame, point]
+    return residual.ravel(), jacobian.reshape(2 * len(frame), -1), uv

@@ -28,6 +28,7 @@ from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
 from fisheye_svp_ros.reporting.wording.decisions import decision_reason, target_error
 from fisheye_svp_ros.reporting.wording.findings import finding_reason
 from fisheye_svp_ros.reporting.wording.metrics import metric_text
+from fisheye_svp_ros.reporting.wording.poses import map_notes
 
 LENS = LensFacts(
     lens_causes=['sensor_tilt'],
@@ -228,3 +229,12 @@ def test_people_read_mm_and_degrees() -> None:
     assert (quantity, unit, round(factor, 3)) == ('rotation_error', 'deg', 57.296)
     assert metric_text('rms_px').title() == 'rms, px'
     assert metric_text('ambiguous').title() == 'ambiguous'
+
+
+def test_a_map_says_where_it_cannot_be_relied_on():
+    assert not [*map_notes((), 0, 0.2, (0.001, 0.002))]
+    missing, outside, corners, focal = map_notes((4, 7), 3, 0.7, (0.02, 0.001))
+    assert '2 tags are not in the map (4, 7)' in missing and 'add such images' in missing
+    assert '3 sightings' in outside and 'field of view' in outside
+    assert '0.70 px' in corners
+    assert 'focal length +2.0 ± 0.1 %: calibrate the lens again' in focal

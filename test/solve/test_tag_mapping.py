@@ -1,5 +1,7 @@
 """Tags and cameras are solved together from the corners of tags alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -77,3 +79,24 @@ def test_tags_that_nothing_ties_are_named():
         map_tags(MODEL, image, ids, corners, SIZE, origin=99)
     with pytest.raises(GeometryError, match='no image shows tag 5'):
         map_tags(MODEL, image, ids, corners, SIZE, origin=5)
+
+
+def test_a_tag_beyond_the_field_of_view_is_left_out():
+    image, ids, corners, true = walk(0.0)
+    far = replace(MODEL.lens, max_incidence=0.8)
+    found = map_tags(ForwardModel(far), image, ids, corners, SIZE, origin=10)
+    assert 0 < found.outside < len(ids)
+    assert map_errors(found, true).max() < 1e-6
+    nothing = replace(MODEL.lens, max_incidence=0.01)
+    with pytest.raises(GeometryError, match='no tag lies in the field of view'):
+        map_tags(ForwardModel(nothing), image, ids, corners, SIZE)
+
+
+def test_a_wrong_focal_length_is_seen():
+    image, ids, corners, _ = walk(0.1)
+    lens = MODEL.lens
+    change, error = map_tags(MODEL, image, ids, corners, SIZE, origin=10).focal
+    assert abs(change) < 3 * error < 0.01
+    wrong = ForwardModel(replace(lens, fx=lens.fx / 1.03, fy=lens.fy / 1.03))
+    change, error = map_tags(wrong, image, ids, corners, SIZE, origin=10).focal
+    assert change == pytest.approx(0.03, abs=0.005) and error < 0.003

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+
+_POOR_CORNERS = 0.5  # px rms; sharp images leave 0.1 to 0.3
+_SURE, _LARGE_CHANGE = 4.0, 0.003  # standard errors; share of the focal length
 
 
 def second_pose_note(frames: str, count: int) -> str:
@@ -21,11 +24,32 @@ def rig_reason(outliers: int, contradicted: bool) -> str:
     return '; '.join(filter(None, (points, rig if contradicted else '')))
 
 
-def missing_tags_note(ids: Sequence[int]) -> str:
-    """Say which tags a map lacks."""
-    names = ', '.join(map(str, ids))
-    tags = 'tag is' if len(ids) == 1 else 'tags are'
-    return (
-        f'{len(ids)} {tags} not in the map ({names}): no image shows them together with a mapped '
-        'tag; add such images'
-    )
+def map_notes(
+    missing: Sequence[int], outside: int, rms_px: float, focal: tuple[float, float]
+) -> Iterator[str]:
+    """Yield what a map lacks, and whether it can be relied on.
+
+    missing: ids of tags; outside: sightings beyond the field of view; rms_px: of the
+    corners; focal: by which share they would have the focal length larger, its standard error.
+    """
+    if missing:
+        names = ', '.join(map(str, missing))
+        tags = 'tag is' if len(missing) == 1 else 'tags are'
+        yield (
+            f'{len(missing)} {tags} not in the map ({names}): no image shows them together with a '
+            'mapped tag; add such images'
+        )
+    if outside:
+        yield f'{outside} sightings of a tag reach beyond the field of view of the lens: left out'
+    if rms_px > _POOR_CORNERS:
+        yield (
+            f'corners are off by {rms_px:.2f} px, more than those of flat tags (under '
+            f'{_POOR_CORNERS:g} px): standard errors do not cover that; is the lens of this '
+            'camera, are the tags flat and of one size, do they hang still?'
+        )
+    change, error = focal
+    if abs(change) > max(_SURE * error, _LARGE_CHANGE):
+        yield (
+            f'the tags would have the focal length {100 * change:+.1f} ± {100 * error:.1f} %: '
+            'calibrate the lens again; standard errors of the map do not cover that'
+        )
