@@ -218,7 +218,7 @@ def _flatten(node: yaml.Node, prefix: str) -> dict[str, Any]:
         new = (
             _flatten(value, f'{name}.')
             if isinstance(value, yaml.MappingNode)
-            else {name: _value(value)}
+            else {name: _value(value, name)}
         )
         if new.keys() & values.keys():
             raise ValueError(
@@ -236,12 +236,17 @@ def _items(node: yaml.Node | None) -> list[tuple[str, yaml.Node]]:
     return [(str(key.value), value) for key, value in node.value]
 
 
-def _value(node: yaml.Node | None) -> Any:
+def _value(node: yaml.Node | None, name: str) -> Any:
     """Return a parameter value with the type that rcl gives it, which is not always YAML's."""
     if isinstance(node, yaml.SequenceNode):
-        values = [_value(item) for item in node.value]
-        if len({type(value) for value in values}) > 1:
-            raise ValueError(f'the values in line {node.start_mark.line + 1} differ in type')
+        values = [_value(item, name) for item in node.value]
+        kinds = {type(value) for value in values}
+        if len(kinds) > 1:
+            whole = [value for value in values if isinstance(value, int)]
+            remedy = f'; write {whole[0]} as {whole[0]}.0' if kinds == {int, float} else ''
+            raise ValueError(
+                f'{name}: the values in line {node.start_mark.line + 1} differ in type{remedy}'
+            )
         return values or None
     if not isinstance(node, yaml.ScalarNode):
         raise ValueError('a parameter holds a value or a list, nothing nested')
