@@ -1,34 +1,30 @@
-"""The messages of a recording's file as far as they are whole: cut short, damaged or neither.
+"""The messages of a recording's file as far as they can be read.
 
-Readers of MCAP trust the index at its end, which has no checksum in many a file; here the file is
-read from its beginning, and a chunk is believed where its checksum fits.  Source: mcap.dev/spec.
-SQLite is read as rosbag2 writes it.
+MCAP is read from its beginning by the reader of the package `mcap`, chunk by chunk: readers that
+trust the index at its end get nothing of a recording that was cut short.  SQLite is read as
+rosbag2 writes it.
 """
 
 from __future__ import annotations
 
 import sqlite3
-import struct
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
-from io import BytesIO
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 from urllib.parse import quote
 
 import lz4.frame
 import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
+from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message, Schema, Statistics
+from mcap.stream_reader import StreamReader, breakup_chunk
 
 from fisheye_svp_ros.errors import BagError
 
 MAX_BYTES = 1 << 28  # bytes of a chunk or a message, decompressed
-_MAGIC = b'\x89MCAP0\r\n'
-_HEAD = struct.Struct('<BQ')  # of a record: opcode, length
 
 _Note = Callable[[str], None]
 _Passed = Callable[[int], None]
@@ -70,8 +66,11 @@ def whole_messages(
 
 def listed_topics(path: Path) -> set[tuple[str, str]]:
     """Return the topics and types that the summary of an MCAP file lists; empty without one."""
-    with path.open('rb') as stream:
-        summary = _summary(stream)
+    try:
+        with path.open('rb') as stream:
+            summary = make_reader(stream).get_summary()
+    except Exception:  # whatever mcap makes of what is damaged, or no MCAP file at all
+        return set()
     if summary is None:
         return set()
     return {
@@ -87,7 +86,7 @@ def _batches(path: Path, note: _Note, passed: _Passed) -> Iterator[list[RawMessa
     channels: dict[int, tuple[str, str]] = {}
     count, promised, place = 0, None, 0
     with path.open('rb') as stream:
-        for records in _groups(stream, path.stat().st_size, note):
+        for records in _groups(stream, path, note):
             passed(stream.tell() - place)
             place = stream.tell()
             batch = []
@@ -98,79 +97,58 @@ def _batches(path: Path, note: _Note, passed: _Passed) -> Iterator[list[RawMessa
                     channels[record.id] = record.topic, schemas.get(record.schema_id, '')
                 elif isinstance(record, Statistics):
                     promised = record.message_count
-                elif record.channel_id in channels:
+                elif isinstance(record, Message) and record.channel_id in channels:
                     where = channels[record.channel_id]
                     batch.append(RawMessage(*where, record.log_time, record.data))
             count += len(batch)
             if batch:
                 yield batch
     if promised not in (None, count):
-        note(f'{promised} messages were written, {count} are found')
+        note(f'{promised} messages were written, {count} can be read')
 
 
-def _groups(stream: IO[bytes], size: int, note: _Note) -> Iterator[list[Any]]:
+def _groups(stream: IO[bytes], path: Path, note: _Note) -> Iterator[list[Any]]:
     """Yield the records of each chunk, and each record that is in none, as lists."""
-    place, data = len(_MAGIC), True
-    if stream.read(place) != _MAGIC:
-        note('it does not begin as an MCAP file does')
-    while head := stream.read(_HEAD.size):
-        opcode, length = _HEAD.unpack(head.ljust(_HEAD.size, b'\0'))
-        body = stream.read(min(length, size))
-        if len(body) < length or len(head) < _HEAD.size:
-            if opcode == Opcode.CHUNK:
-                yield _contents(body, f'the chunk at byte {place}', note)
-            break
-        if opcode == Opcode.FOOTER:
-            if stream.read(len(_MAGIC) + 1) == _MAGIC:
-                return
-            break
-        # What the summary repeats of the data is not looked at.
-        data = data and opcode != Opcode.DATA_END
-        if opcode == Opcode.CHUNK and data:
-            yield _contents(body, f'the chunk at byte {place}', note)
-        elif opcode == Opcode.STATISTICS or data:
-            yield _parse_record(opcode, body, f'the record at byte {place}', note)
+    whole: Any = _WholeReads(stream, path.stat().st_size)
+    records, place = iter(StreamReader(whole, emit_chunks=True).records), 0
+    while True:
+        try:
+            record = next(records)
+        except StopIteration:
+            return
+        except Exception as cause:  # of whatever a damaged file leads a parser to
+            note(
+                f'{path.name} cannot be read from byte {place} on ({cause!s:.100}); '
+                f'`mcap recover {path.name} -o FILE` may save more'
+            )
+            return
+        try:
+            group = _contents(record) if isinstance(record, Chunk) else [record]
+        except Exception as cause:
+            note(f'the chunk at byte {place} of {path.name} is damaged ({cause!s:.100})')
+        else:
+            yield group
         place = stream.tell()
-    note(f'it cannot be read from byte {place} on')
-    summary = _summary(stream)
-    chunks = summary.chunk_indexes if summary else ()
-    for start in sorted(chunk.chunk_start_offset for chunk in chunks):
-        if place < start < size:
-            stream.seek(start)
-            opcode, length = _HEAD.unpack(stream.read(_HEAD.size).ljust(_HEAD.size, b'\0'))
-            if opcode == Opcode.CHUNK:
-                body = stream.read(min(length, size))
-                yield _contents(body, f'the chunk at byte {start}', note)
 
 
-def _summary(stream: IO[bytes]) -> Any:
-    try:
-        stream.seek(0)
-        return make_reader(stream).get_summary()
-    except Exception:  # whatever mcap makes of what is damaged, or no MCAP file at all
-        return None
+class _WholeReads:
+    """A stream that raises EndOfFile where it ends, in place of returning less than was asked."""
+
+    def __init__(self, stream: IO[bytes], size: int) -> None:
+        self._stream, self._size = stream, size
+
+    def read(self, length: int) -> bytes:
+        """Return so many bytes; a length that is damaged takes no memory."""
+        data = self._stream.read(min(length, self._size))
+        if len(data) < length:
+            raise EndOfFile('it ends early')
+        return data
 
 
-def _contents(body: bytes, where: str, note: _Note) -> list[Any]:
-    """Return the records of a chunk; of one that is cut short, where it is not compressed."""
-    try:
-        chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-        data = _decompress(chunk)
-    except Exception as cause:
-        note(f'{where} is damaged ({cause or type(cause).__name__})')
-        return []
-    if len(data) < chunk.uncompressed_size and not chunk.compression:
-        note(f'{where} is cut short')
-    elif chunk.uncompressed_crc not in (0, zlib.crc32(data)):
-        note(f'{where} is damaged (its checksum does not fit)')
-        return []
-    records, place = [], 0
-    while place + _HEAD.size <= len(data):
-        opcode, length = _HEAD.unpack_from(data, place)
-        place += _HEAD.size + length
-        if place <= len(data):
-            records += _parse_record(opcode, data[place - length : place], where, note)
-    return records
+def _contents(chunk: Chunk) -> list[Any]:
+    """Return the records of a chunk; raise ValueError and others for one that is damaged."""
+    data = _decompress(chunk)
+    return breakup_chunk(replace(chunk, compression='', data=data), validate_crc=True)
 
 
 def _decompress(chunk: Chunk) -> bytes:
@@ -178,36 +156,17 @@ def _decompress(chunk: Chunk) -> bytes:
     size: int = chunk.uncompressed_size
     if size > MAX_BYTES:
         raise ValueError(f'it has {size} bytes; up to {MAX_BYTES} are read')
-    if not chunk.compression:
-        return bytes(chunk.data)
-    data: bytes
+    data = bytes(chunk.data)
     if chunk.compression == 'zstd':
         with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
             data = stream.read(size + 1)
     elif chunk.compression == 'lz4':
         data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
-    else:
+    elif chunk.compression:
         raise ValueError(f'compression {chunk.compression!r} is unknown')
     if len(data) != size:
         raise ValueError('its size is not the announced one')
     return data
-
-
-def _parse_record(opcode: int, body: bytes, where: str, note: _Note) -> list[Any]:
-    """Return the record of a body in a list; empty for one that tells nothing of messages."""
-    stream = ReadDataStream(BytesIO(body))
-    kinds: dict[int, Any] = {
-        Opcode.SCHEMA: Schema,
-        Opcode.CHANNEL: Channel,
-        Opcode.STATISTICS: Statistics,
-    }
-    try:
-        if opcode == Opcode.MESSAGE:
-            return [Message.read(stream, len(body))]
-        return [kinds[opcode].read(stream)] if opcode in kinds else []
-    except Exception as cause:
-        note(f'{where} is damaged ({cause or type(cause).__name__})')
-        return []
 
 
 def database_messages(
