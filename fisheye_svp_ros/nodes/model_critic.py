@@ -222,7 +222,7 @@ class ModelCritic(SolverNode):
         try:
             found = done.future.result()
         except FisheyeSvpError as error:
-            self.drop(f'{self.cameras[0]}image_points', error)
+            self._complain(error, 'not diagnosed: ')
             self.publish_result(done.stamp, {}, str(error))
             return
         self._verdict = found

@@ -450,7 +450,7 @@ class SolverNode(ManagedNode):
         missing = [topic for topic in self._image_points if topic not in one.items]
         for topic, stamp in one.stamps.items():
             reason = self._reason(missing[0], stamp) if missing else 'too many sets wait'
-            self.drop(topic, ObservationError(f'{topic}: {reason}'))
+            self._complain(ObservationError(f'{topic}: {reason}'), 'incomplete: ')
 
     def _reason(self, missing: str, stamp: int) -> str:
         off = self._join.distance(missing, stamp)

@@ -194,6 +194,17 @@ def test_dropped_counts_unusable_messages_alone(graph: Callable[..., Graph]) -> 
     assert counts['sets: not solved'] == '2' and counts['sets: dropped'] == '0'
 
 
+def test_an_image_without_its_partner_is_no_unusable_message(graph: Callable[..., Graph]) -> None:
+    told = Told(graph(*SOLVING), StereoDepth, ('left/', 'right/'))
+    told.world()
+    message = messages.image_points_message(SEEN.landmark, SEEN.uv, 1, 'left')
+    told.points[0].publish(message)
+    report = told.report(lambda text: 'no message on right/image_points' in text)
+    counts = read_key_values(report)
+    assert counts['left/image_points: dropped'] == counts['sets: dropped'] == '0'
+    assert counts['sets: incomplete'] == counts['sets: taken'] == '1'
+
+
 def test_a_slot_is_a_topic_and_a_reason() -> None:
     lines: list[str] = []
     complaints = Complaints(lines.append)
