@@ -31,6 +31,7 @@ from fisheye_svp_ros.study.sweep import (
     Plan,
     column_types,
     fingerprint,
+    part_check,
     solve_rows,
     tasks,
     work,
@@ -106,7 +107,7 @@ def run(args: argparse.Namespace) -> None:
                 'compute them again with --resume'
             )
         with write_together():
-            metrics = parts.join(args.output / 'sweep', _metrics(plan))
+            metrics = parts.join(args.output / 'sweep', _metrics(plan), part_check(plan))
             _report(path, args.output, plan, mine, metrics)
         note_formats()
     shutil.rmtree(parts.folder, ignore_errors=True)

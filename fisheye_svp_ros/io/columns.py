@@ -6,12 +6,13 @@ than most commands need to start.
 
 from __future__ import annotations
 
+import csv
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from importlib import import_module
-from io import BytesIO
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
 _ROWS = 1 << 16  # of a row group
+_BLOCK_BYTES = 1 << 20  # bytes
 _MOST_CELLS = 100_000_000
 _MIN_PYARROW = 15  # of pyarrow: from there on pages have checksums
 _KINDS: Mapping[type, Any] = {int: np.int64, float: np.float64, str: object}
@@ -102,10 +104,16 @@ class TableParts:
         with replacing(self._path(number)) as path, path.open('wb') as stream:
             _to_csv(table, stream)
 
-    def join(self, path: Path, names: Sequence[str] = ()) -> DataFrame:
+    def join(
+        self,
+        path: Path,
+        names: Sequence[str] = (),
+        is_whole: Callable[[int, DataFrame], bool] = lambda *_: True,
+    ) -> DataFrame:
         """Write all parts in order as `write_table` does; return the columns of some names.
 
-        No more than one part is held, and those columns.  Raises OutputError for a bad part.
+        is_whole: asked of each part, by its number, whether it holds all its rows.  No more than
+        one part is held, and those columns.  Raises OutputError for a bad part.
         """
         from pandas import DataFrame, concat
 
@@ -113,13 +121,15 @@ class TableParts:
         with _writing(path) as (text, write_parquet, _):
             for number in sorted(self.numbers()):
                 data = read_bytes(self._path(number), OutputError)
-                part = self._parse(number, data)
+                part = self._parse(number, data, is_whole)
                 text.write(data[data.index(b'\n') + 1 :] if text.tell() else data)
                 write_parquet(part)
                 kept.append(part[[*names]])
         return concat(kept[1:] or kept, ignore_index=True)
 
-    def _parse(self, number: int, data: bytes) -> DataFrame:
+    def _parse(
+        self, number: int, data: bytes, is_whole: Callable[[int, DataFrame], bool]
+    ) -> DataFrame:
         kinds = {name: _KINDS[kind] for name, kind in self._types.items()}
         try:
             part = _read_csv(BytesIO(data), dtype=kinds)
@@ -128,6 +138,8 @@ class TableParts:
             for name, kind in kinds.items():
                 if part[name].dtype != kind:  # what pandas 2 makes of a number above 2^63
                     raise ValueError(f'{name} holds a number out of range')
+            if not is_whole(number, part):
+                raise ValueError('rows are missing')
         except Exception as cause:  # whatever pandas makes of what is damaged
             raise OutputError(
                 f'{self._path(number)}: a part of the table is damaged ({_brief(cause)}); remove '
@@ -147,6 +159,7 @@ def read_table(path: Path, wanted: Callable[[str], bool] = lambda _: True) -> Da
     with open_bytes(path, OutputError) as stream:
         try:
             if path.suffix == '.csv':
+                _check_rows(stream)
                 return _read_in_pieces(stream, wanted)
             return _read_parquet(pyarrow, stream, wanted)
         except Exception as cause:  # whatever pandas or pyarrow makes of what is damaged
@@ -160,6 +173,35 @@ def _read_csv(stream: IO[bytes], **options: Any) -> DataFrame:
     if tuple(map(int, pandas.__version__.split('.')[:2])) < _EXACT_BY_DEFAULT:
         options['float_precision'] = 'round_trip'
     return pandas.read_csv(stream, keep_default_na=False, na_values=[''], **options)
+
+
+def _check_rows(stream: IO[bytes]) -> None:
+    """Raise ValueError for what pandas passes over: columns of one name, rows of other lengths."""
+    text = TextIOWrapper(stream, encoding='utf-8', newline='')
+    header = next(csv.reader(text), [])
+    if twice := [name for name in header if header.count(name) > 1]:
+        raise ValueError(f'two columns are named {twice[0]!r}; rename one')
+    text.seek(0)
+    if not _has_even_rows(stream, len(header)):
+        text.seek(0)
+        reader = csv.reader(text)
+        for row in reader:
+            if row and len(row) != len(header):
+                raise ValueError(
+                    f'line {reader.line_num} has {len(row)} cells, the header {len(header)}; '
+                    'write it again'
+                )
+    text.detach().seek(0)
+
+
+def _has_even_rows(stream: IO[bytes], columns: int) -> bool:
+    """Say whether commas and lines are as many as they should be, in a tenth of the time."""
+    commas = lines = 0
+    while block := stream.read(_BLOCK_BYTES):
+        if b'"' in block:
+            return False
+        commas, lines = commas + block.count(b','), lines + block.count(b'\n')
+    return commas == (columns - 1) * lines
 
 
 def _read_in_pieces(stream: IO[bytes], wanted: Callable[[str], bool]) -> DataFrame:

@@ -291,6 +291,17 @@ def tasks(plan: Plan) -> list[range]:
     return [range(start, min(start + step, count)) for start in range(0, count, step)]
 
 
+def part_check(plan: Plan) -> Callable[[int, DataFrame], bool]:
+    """Return what tells whether a task's part of the table, by its number, has all its rows."""
+    scenarios = {numbers.start: len(numbers) for numbers in tasks(plan)}
+
+    def is_whole(number: int, part: DataFrame) -> bool:
+        firsts = part.drop_duplicates('scenario')
+        return len(firsts) == scenarios.get(number) and firsts['sets'].sum() == len(part)
+
+    return is_whole
+
+
 def work(plan: Plan) -> int:
     """Return about how many points a sweep will project, for `engines.settle`."""
     scenario = _scenario(plan, 0)

@@ -58,6 +58,23 @@ def test_an_empty_table_is_said_to_be_one(tmp_path: Path) -> None:
         read_table(tmp_path / 'a.csv')
 
 
+@pytest.mark.parametrize(
+    ('text', 'reason'),
+    [
+        ('a,b,a\n1,2,3\n', "two columns are named 'a'; rename one"),
+        ('a,b\n1,2\n3\n', 'line 3 has 1 cells, the header 2; write it again'),
+        ('a,b\n1,2,3\n', 'line 2 has 3 cells, the header 2; write it again'),
+    ],
+)
+def test_columns_of_one_name_and_rows_of_another_length_are_refused(
+    text: str, reason: str, tmp_path: Path
+) -> None:
+    (tmp_path / 'a.csv').write_text(text)
+    with pytest.raises(OutputError) as told:
+        read_table(tmp_path / 'a.csv')
+    assert str(told.value) == f'{tmp_path}/a.csv: not a table ({reason})'
+
+
 def test_a_table_reads_back_as_it_was(tmp_path: Path) -> None:
     table = make_table(
         {

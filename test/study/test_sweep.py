@@ -29,7 +29,14 @@ from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.simulate.scenario import Scenario, model_of, simulate_scenario
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.study.solutions import localization_metrics
-from fisheye_svp_ros.study.sweep import plan_sweep, sweep_rows, tasks
+from fisheye_svp_ros.study.sweep import (
+    column_types,
+    part_check,
+    plan_sweep,
+    sweep_rows,
+    tasks,
+    write_rows,
+)
 
 # What a sweep leaves behind for scripts.
 FILES = ['sweep.csv', *(['sweep.parquet'] if tables.arrow()[0] else [])]
@@ -610,6 +617,25 @@ def test_a_damaged_part_is_named(tmp_path: Path) -> None:
         (tmp_path / 'parts' / '000000001.csv').write_text(damaged)
         with pytest.raises(OutputError, match=r'000000001.csv: a part of the table is damaged'):
             parts.join(tmp_path / 'whole')
+
+
+def test_a_part_that_ends_with_a_line_before_its_last_one_is_named(
+    write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    text = '{sweep.radius: [1.0, 0.5], poses_file: calibration}'
+    plan = read_sweep(write(f'/**: {{ros__parameters: {text}}}'))
+    parts = tables.TableParts(tmp_path / 'parts', column_types(plan))
+    write_rows(parts, 'numpy', plan, range(2))
+    parts.join(tmp_path / 'whole', (), part_check(plan))
+    (file,) = parts.folder.iterdir()
+    lines = file.read_text().splitlines(keepends=True)
+    assert len(lines) == 1 + 2 * 10
+    for kept in (lines[:-1], lines[:11]):
+        file.write_text(''.join(kept))
+        with pytest.raises(
+            OutputError, match=r'000000000.csv: .* \(rows are missing\); remove it'
+        ):
+            parts.join(tmp_path / 'whole', (), part_check(plan))
 
 
 def test_nodes_of_one_namespace_are_those_of_the_sweep(tmp_path: Path) -> None:
