@@ -165,10 +165,25 @@ def _run(arguments: Sequence[str]) -> None:
         chosen = commands.choices[named]
         _refuse(chosen, unknown[0], chosen.format_help().split(), 'argument')
     import_module('fisheye_svp_ros.commands.outputs').check_output(parsed)
-    if named in _SOLVING and parsed.engine:
-        import_module('fisheye_svp_ros.optics.engines').use(parsed.engine)
+    if named not in _SIGNAL_HANDLERS:  # nodes have it compiled in the background
+        _choose_engine(getattr(parsed, 'engine', None))
     with _tidy(named):
         parsed.run(parsed)
+
+
+def _choose_engine(name: str | None) -> None:
+    """Take the engine that a command is given into use; have it say when it has to compile."""
+    from fisheye_svp_ros.optics import engines
+
+    engines.before_compiling = _tell_compilation
+    if name:
+        engines.use(name)
+
+
+def _tell_compilation() -> None:
+    from fisheye_svp_ros.reporting.wording.inputs import compiling_first
+
+    print(f'fisheye-svp: note: {compiling_first()}', file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -162,7 +162,9 @@ class ModelCritic(SolverNode):
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Take in one more frame; start over where the scenario is another one."""
         seen = make_set(stamp, items, self.cameras)
-        self.lens(stamp, items)  # raises where nobody names one
+        lens = self.lens(stamp, items)  # raises where nobody names one
+        for camera in self.cameras:
+            self.warn_of_extrapolation(lens, items, camera)
         scenario = scenario_of(items)
         if scenario != self._scenario:
             self._scenario, self._frames, self._repeated = scenario, {}, 0

@@ -209,11 +209,17 @@ class SolverNode(ManagedNode):
         lens, known = self.lens(stamp, items, camera), self._models.get(camera)
         if known is None or known[0] is not lens:
             known = self._models[camera] = lens, ForwardModel(lens)
-        topic = f'{camera}image_points'
-        if beyond := extrapolated_points(lens, items[topic].uv):
-            self._left_out.append(wording.points_extrapolated(topic, beyond))
-            self.warn(self._left_out[-1])
+        self._left_out += self.warn_of_extrapolation(lens, items, camera)
         return known[1]
+
+    def warn_of_extrapolation(self, lens: Lens, items: Items, camera: str = '') -> list[str]:
+        """Warn of image points where the curve of a lens is a guess; return what was said."""
+        topic = f'{camera}image_points'
+        beyond = extrapolated_points(lens, items[topic].uv)
+        texts = [wording.points_extrapolated(topic, beyond)] if beyond else []
+        for text in texts:
+            self.warn(text)
+        return texts
 
     def models(self, stamp: int, items: Items) -> Pair:
         """Return what to solve with for each camera of a rig, as `lens` does."""

@@ -46,6 +46,8 @@ _Kind = tuple[bool, bool]  # of a subscription: reliable, latched
 LIMIT = 5.0  # s without a message after which it is said
 _MAX_PROPOSALS = 3  # topics to propose
 _MAX_LOSS = 0.1  # of the messages between two reports, lost on the way
+# The same of so many messages or more: what is seldom lost is told as well
+_MAX_LOSS_OF_MANY, _MANY = 0.01, 200
 _PROFILE_VARIABLE, _PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE', 'fastdds/images.xml'
 _LARGE = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 
@@ -143,7 +145,8 @@ class Input:
         self._heard = 0
         self._has_one_publisher = False
         self._number: int | None = None  # of the latest message, as its publisher counts
-        self._reported = Count()
+        self._reported, self._window = Count(), Count()
+        self._seldom_lost = ''
 
     @property
     def profiles(self) -> list[Any]:
@@ -227,16 +230,30 @@ class Input:
                 self._add_subscription(needed, qos)
 
     def losses(self) -> str:
-        """Say how many messages have been lost since the last call, where that is many."""
-        lost, received = (
-            getattr(self.count, name) - getattr(self._reported, name)
-            for name in ('lost', 'received')
-        )
+        """Say how many messages have been lost, where that is many; call it for each report.
+
+        Many of those since the last call, or some of the latest `_MANY`, until there are as many
+        more.
+        """
+        lost, total = self._lost_since(self._reported)
         self._reported = copy(self.count)
-        if lost <= _MAX_LOSS * (lost + received):
-            return ''
+        few, of_many = self._lost_since(self._window)
+        if of_many >= _MANY:
+            self._window = copy(self.count)
+            seldom = few > _MAX_LOSS_OF_MANY * of_many
+            self._seldom_lost = self._tell_losses(few, of_many) if seldom else ''
+        if lost > _MAX_LOSS * total:
+            return self._tell_losses(lost, total)
+        return self._seldom_lost if total else ''
+
+    def _lost_since(self, before: Count) -> tuple[int, int]:
+        """Return how many messages were lost since a count, and how many there should be."""
+        lost = self.count.lost - before.lost
+        return lost, lost + self.count.received - before.received
+
+    def _tell_losses(self, lost: int, total: int) -> str:
         remedy = _loss_remedy(self.typename, self.resolved)
-        return wording.messages_lost(self.name, lost, lost + received, remedy)
+        return wording.messages_lost(self.name, lost, total, remedy)
 
     def _count_losses(self, number: int | None) -> None:
         """Count what is missing between two messages of one publisher, which numbers them.

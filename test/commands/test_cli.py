@@ -25,8 +25,10 @@ from fisheye_svp_ros.io.csv_files import CsvTable
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
 from fisheye_svp_ros.library.functions import calibrate
+from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.camera import back_project
 from fisheye_svp_ros.optics.curves import Equidistant
+from fisheye_svp_ros.optics.engines import numpy_engine
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.optics.ports import DomeGlass
 from fisheye_svp_ros.simulate.simulation import simulate
@@ -156,6 +158,18 @@ class TestLocalize:
         arguments = [folder / 'observations.csv', '--lens', tmp_path / 'lens.yaml']
         assert cli.main(['localize', *map(str, arguments)]) == 0
         assert 'image points of the calibration reach 10 deg' in capsys.readouterr().err
+
+    def test_numba_does_not_compile_in_silence(self, scene, capsys, monkeypatch):
+        monkeypatch.setattr(engines, 'find_spec', lambda _: 'there')
+        monkeypatch.setattr(engines.cache, 'is_compiled', lambda: False)
+        monkeypatch.setattr(engines.cache, 'mark_filled', lambda: None)
+        monkeypatch.setattr(engines, 'numba_engine', numpy_engine, raising=False)
+        monkeypatch.setattr(engines, 'before_compiling', engines.before_compiling)
+        monkeypatch.setattr(engines, '_engine', None)
+        monkeypatch.setenv(engines.VARIABLE, 'numba')
+        arguments = [scene[0] / 'observations.csv', '--lens', 'fish214']
+        assert cli.main(['localize', *map(str, arguments)]) == 0
+        assert capsys.readouterr().err.startswith('fisheye-svp: note: Numba compiles first')
 
     def test_the_standard_errors_are_those_of_the_worst_direction(self, output, scene, capsys):
         folder, _, _ = scene

@@ -120,6 +120,24 @@ def test_the_verdict_is_published(graph: Callable[..., Graph], scene: Path) -> N
     assert 'viewpoint_shift (e0 = ' in status.message and 'mm' in status.message
 
 
+def test_points_beyond_what_is_known_of_the_lens_are_told(
+    graph: Callable[..., Graph], scene: Path, tmp_path: Path
+) -> None:
+    save_lens(replace(LENS, calibration={'reached_deg': 5.0}), tmp_path / 'lens.yaml')
+    g = graph(
+        f'synthetic_camera:lens:={scene}/given.yaml', f'model_critic:lens:={tmp_path}/lens.yaml'
+    )
+    reports = g.hear(DiagnosticArray, '/diagnostics')
+    g.start(ModelCritic)
+    g.start(SyntheticCamera)
+    g.until(
+        lambda: any(
+            'image points of the calibration reach 5 deg' in report.status[0].message
+            for report in reports
+        )
+    )
+
+
 def test_a_right_lens_is_adequate_and_another_scenario_starts_anew(
     graph: Callable[..., Graph], scene: Path
 ) -> None:

@@ -149,6 +149,23 @@ def test_images_that_are_lost_are_told(graph: Callable[..., Graph]) -> None:
     assert one.count.lost >= before + 50
 
 
+def test_images_that_are_seldom_lost_are_told_too(graph: Callable[..., Graph]) -> None:
+    one = graph('board:=chessboard:9x6:25mm').start(Detector)._inputs['image']
+
+    def report(received: int, lost: int) -> str:
+        one.count.received += received
+        one.count.lost += lost
+        return one.losses()
+
+    assert report(98, 2) == ''
+    assert 'image: 4 of 200 messages were lost; start both' in report(98, 2)
+    assert 'image: 4 of 200' in report(99, 1), 'until there are as many more'
+    assert report(0, 0) == '', 'nothing comes, which is told apart'
+    assert 'image: 20 of 100' in report(80, 20)
+    assert 'image: 21 of 200' in report(100, 0)
+    assert [report(100, 1) for _ in range(2)][1] == '', 'less than one in a hundred'
+
+
 def said(reports: list[Any]) -> str:
     return ' '.join(status.message for report in reports for status in report.status)
 

@@ -11,6 +11,7 @@ FISHEYE_SVP_ENGINE or `use` have the last word; nothing outside this package ask
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from importlib.util import find_spec
 from types import ModuleType
@@ -29,6 +30,14 @@ LOADING = 4_000_000  # points that the reference projects while Numba loads what
 _COMPILING = 400_000_000  # while it compiles
 
 pose_equations = numpy_engine.pose_equations
+
+
+def _say_nothing() -> None:
+    pass
+
+
+# Called before this process waits for Numba to compile, for whoever has somebody to tell.
+before_compiling: Callable[[], None] = _say_nothing
 
 
 def use(name: str) -> None:
@@ -131,6 +140,8 @@ def _load_engine(name: str) -> ModuleType:
         raise ParameterError(f'{VARIABLE} is {name!r}; known are {", ".join(ENGINES)}')
     if name != 'numba':
         return numpy_engine
+    if find_spec('numba') is not None and not cache.is_compiled():
+        before_compiling()
     try:
         from fisheye_svp_ros.optics.engines import numba_engine
     except ImportError as cause:  # also where Numba does not go with this NumPy

@@ -107,6 +107,11 @@ def compiling() -> str:
     )
 
 
+def compiling_first() -> str:
+    """Say why a command does not begin yet."""
+    return 'Numba compiles first, once on this machine: about a minute; --engine numpy needs none'
+
+
 def compiled(state: str) -> str:
     """Say that it has, or why not; state: of `optics.engines.compilation.Compilation`."""
     if state == 'compiled':
