@@ -42,6 +42,7 @@ _DECIMAL = re.compile(
     r'[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|nan|inf)', re.IGNORECASE
 )
 _FRAME = re.compile(r'^frame \d+ ')
+_EXCESS = re.compile(r'\S+ sigma_px, (?=above the gate)')
 _NUMBER = re.compile(r'\d[\d.]*(e[-+]?\d+)?(?<!\.)')
 _LIST = re.compile(r'# \(# px\)(, # \(# px\))*|#(, #)+(, \.\.\.)?')
 
@@ -97,7 +98,7 @@ def tabulate(records: Iterable[Any]) -> DataFrame:
 
 def note_of_set(reason: str) -> str:
     """Return why a set has no solution, the same for every set that lacks one for that reason."""
-    return _FRAME.sub('the set ', reason)
+    return _EXCESS.sub('', _FRAME.sub('the set ', reason))
 
 
 def _warning(text: str) -> dict[str, str]:

@@ -33,6 +33,7 @@ from fisheye_svp_ros.nodes.subscriptions import (
     explain_silence,
     silent_inputs,
 )
+from fisheye_svp_ros.reporting.wording import inputs as wording
 from fisheye_svp_ros.study.settings import Settings, SolverSettings
 
 _OF_ROS = ('use_sim_time', 'start_type_description_service')
@@ -351,7 +352,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):  # type: ignore[misc]
 
     def __init__(self, node_name: str | None = None, **options: Any) -> None:
         BaseNode.__init__(self, node_name, **options)
-        self._active = not self.settings.lifecycle
+        self._active = self._configured = not self.settings.lifecycle
         if self.settings.lifecycle:
             LifecycleNodeMixin.__init__(self)
 
@@ -366,9 +367,15 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):  # type: ignore[misc]
             super().take_up()
 
     def introduce(self) -> None:
-        """Say what the node listens to, once it does."""
+        """Say what the node listens to, or what has to be done before it does."""
         if self._active:
             super().introduce()
+        else:
+            self.get_logger().info(self.inactive_reason())
+
+    def inactive_reason(self) -> str:
+        """Say that the node listens to nothing, and what to do."""
+        return wording.inactive(self.get_fully_qualified_name(), self._configured)
 
     def has_listeners(self) -> bool:
         """Say whether there is anybody to work for; there is nobody for an inactive node."""
@@ -381,7 +388,13 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):  # type: ignore[misc]
         except FisheyeSvpError as error:
             self.get_logger().error(f'not configured: {error}')
             return TransitionCallbackReturn.FAILURE
+        self._configured = True
         return super().on_configure(state)
+
+    def on_cleanup(self, state: Any) -> Any:
+        """Be as before it was configured."""
+        self._configured = False
+        return super().on_cleanup(state)
 
     def on_activate(self, state: Any) -> Any:
         """Listen."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
+from typing import NamedTuple
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
@@ -17,6 +19,16 @@ from fisheye_svp_ros.pose import Pose, carried_pose
 from fisheye_svp_ros.study.settings import RobotSettings
 
 _MAX_WAITING = 30  # poses that wait for odometry of their time
+_LONGEST_WAIT = 2.0  # s that a pose does
+
+
+class _Waiting(NamedTuple):
+    """The pose of a base in its world, the stamp, ns, and since when it waits, s."""
+
+    base: Pose
+    stamp: int
+    world: str
+    since: float
 
 
 class BasePose:
@@ -37,7 +49,7 @@ class BasePose:
             )
         self._node, self._base, self._odom = node, base, odom
         self._frames = FrameListener(node, self._publish_odometry)
-        self._waiting: deque[tuple[Pose, int, str]] = deque(maxlen=_MAX_WAITING)
+        self._waiting: deque[_Waiting] = deque(maxlen=_MAX_WAITING)
         if not base:
             return
         topics = [topic for topic in TRANSFORMS if odom or topic == '/tf_static']
@@ -63,20 +75,29 @@ class BasePose:
             messages.pose_with_covariance_message(base, covariance, stamp, world)
         )
         if self._odom:
-            if len(self._waiting) == _MAX_WAITING:
-                self._node.warn(
-                    f'no transform to {self._odom!r} (odom_frame): /tf has no {self._base!r} in '
-                    f'it at the time of the images; check the odometry'
-                )
-            self._waiting.append((base, stamp, world))
+            self._drop_expired()
+            self._waiting.append(_Waiting(base, stamp, world, time.monotonic()))
             self._publish_odometry()
+
+    def _drop_expired(self) -> None:
+        """Drop the pose that has waited too long, or is one too many, and tell of it."""
+        now, expired = time.monotonic(), len(self._waiting) == _MAX_WAITING
+        while self._waiting and now - self._waiting[0].since > _LONGEST_WAIT:
+            self._waiting.popleft()
+            expired = True
+        if expired:
+            self._node.warn(
+                f'no transform to {self._odom!r} (odom_frame): /tf has no {self._base!r} in '
+                f'it at the time of the images; check the odometry'
+            )
 
     def _publish_odometry(self) -> None:
         """Publish where the odometry stands in the world, for each pose that has odometry."""
         for _ in range(len(self._waiting)):
-            base, stamp, world = self._waiting.popleft()
+            one = self._waiting.popleft()
+            base, stamp, world, _ = one
             there = self._frames.find(self._odom, self._base, stamp)
             if there is None:
-                self._waiting.append((base, stamp, world))
+                self._waiting.append(one)
             else:
                 self._transforms.publish(base.compose(there.inverse()), stamp, world, self._odom)

@@ -285,7 +285,7 @@ class SolverNode(ManagedNode):
         counts, overload = self._pace.report(len(self._backlog) + len(self._join))
         if overload:
             self.warn(overload)
-        inactive = '' if self.listening else wording.inactive(self.get_fully_qualified_name())
+        inactive = '' if self.listening else self.inactive_reason()
         troubles = filter(None, (inactive, self._latched_landmarks.trouble))
         return {
             **counts,

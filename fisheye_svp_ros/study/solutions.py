@@ -90,7 +90,7 @@ class SetSolutions(NamedTuple, Generic[T]):
         if not self.solved.all():
             raise GeometryError(self.unsolved)
         if not self.passes(gate).all():
-            raise GeometryError(gate_reason(gate))
+            raise GeometryError(gate_reason(gate, float(self.sigmas.max())))
         return self
 
     def passes(self, gate: float) -> Mask:
@@ -164,13 +164,15 @@ def check_gate(residual: Array, gate: float) -> None:
     """Raise GeometryError where whitened residuals (1, N, 2) of a pose are above a gate."""
     known = np.isfinite(residual)
     cost = np.where(known, residual, 0.0) ** 2
-    if gate and _residual_sigmas(cost.sum(), known.sum() - 6) > gate:
-        raise GeometryError(gate_reason(gate))
+    sigmas = float(_residual_sigmas(cost.sum(), known.sum() - 6))
+    if gate and sigmas > gate:
+        raise GeometryError(gate_reason(gate, sigmas))
 
 
-def gate_reason(gate: float) -> str:
-    """Say why a set that was solved has no pose."""
-    return f'image_points: their residuals are above the gate ({gate:g} sigma_px): no pose'
+def gate_reason(gate: float, sigmas: float | None = None) -> str:
+    """Say why a set that was solved has no pose; sigmas: its residuals, left out in tables."""
+    size = '' if sigmas is None else f'{sigmas:.3g} sigma_px, '
+    return f'image_points: their residuals are {size}above the gate ({gate:g} sigma_px): no pose'
 
 
 def measure_points(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.graph import LATCHED, Graph
 
+from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 from geometry_msgs.msg import PoseWithCovarianceStamped  # isort: skip
 
 from fisheye_svp_ros.errors import ParameterError
@@ -131,3 +132,19 @@ def test_base_pose_and_odometry_are_published(
     base = next(b for b in bases if stamp_of(b) == stamp_of(one))
     there = read_transform(one).compose(TILT)
     assert there.position == pytest.approx(read_pose(base.pose, 'pose').position)
+
+
+def test_odometry_that_does_not_come_is_told_soon(
+    graph: Callable[..., Graph], tf_message: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr('fisheye_svp_ros.nodes.base_pose._LONGEST_WAIT', 0.3)
+    frames = ('world_frame:=map', 'base_frame:=base_link', 'odom_frame:=odom')
+    g = graph('svp:=false', 'rate:=5.0', *frames)
+    bases = g.hear(PoseWithCovarianceStamped, 'localizer/base_pose')
+    reports = g.hear(DiagnosticArray, '/diagnostics')
+    g.start(Localizer)
+    mount = messages.transform_message(MOUNT, 0, 'base_link', 'camera_optical_frame')
+    g.tell(tf_message, '/tf_static', LATCHED).publish(tf_message(transforms=[mount]))
+    g.start(SyntheticCamera)
+    g.until(lambda: any("no transform to 'odom'" in one.status[0].message for one in reports))
+    assert len(bases) < 30, 'not only when thirty poses wait'

@@ -300,13 +300,18 @@ def another_board(hour: Hour, pattern: str) -> None:
     node = g.start(Detector)
     images = g.tell(Image, 'image', SENSOR)
     told = messages.image_message(photograph(poses(1, 4).take(0)), 7, 'camera')
-    hour.says(pattern, lambda: images.publish(told))
+
+    def publish() -> None:
+        g.idle(0.1)  # what is not taken before the next comes would be told as lost
+        images.publish(told)
+
+    hour.says(pattern, publish)
     hour.logs(pattern)
     assert set_parameter(node, 'board', BOARD).successful
     hour.reports.clear()
     g.until(
         lambda: (
-            images.publish(told),
+            publish(),
             any(m.status[0].message == 'all inputs usable' for m in hour.reports[1:]),
         )[1]
     )
@@ -450,6 +455,41 @@ def another_size(hour: Hour, pattern: str) -> None:
     )
     image = messages.image_message(np.zeros((400, 424), np.uint8), 7, 'camera')
     hour.says(pattern, lambda: (driver.publish(info), images.publish(image)))
+
+
+@tries('Doubtful poses: landmarks are in mm')
+def millimeters(hour: Hour, pattern: str) -> None:
+    told, points = framed_sets(hour, *SOLVING)
+    told.publish(landmarks(radius=2000.0))
+    hour.says(pattern, lambda: points.publish(image_points()))
+
+
+@tries('Results are late or missing: the node is too slow')
+def too_slow(hour: Hour, pattern: str) -> None:
+    node = hour.begin(*SOLVING).start(Localizer)
+    hour.says(pattern, lambda: node._pace.counts.update(dropped=1))
+
+
+@tries('No base_pose: /tf_static lacks the camera')
+def no_mount(hour: Hour, pattern: str) -> None:
+    need_tf2()
+    _, points = framed_sets(hour, *SOLVING, 'base_frame:=base_link')
+    hour.says(pattern, lambda: points.publish(image_points()))
+
+
+@tries('No transform to the odometry: /tf lacks it')
+def no_odometry(hour: Hour, pattern: str) -> None:
+    kind = need_tf2()
+    frames = ('base_frame:=base_link', 'odom_frame:=odom')
+    _, points = framed_sets(hour, *SOLVING, *frames)
+    static = hour.graph.tell(kind, '/tf_static', LATCHED)
+    mount = messages.transform_message(identity(), 0, 'base_link', 'camera')
+    static.publish(kind(transforms=[mount]))
+    hour.says(pattern, lambda: points.publish(image_points()))
+
+
+def need_tf2() -> Any:
+    return pytest.importorskip('tf2_msgs.msg', reason='tf2_msgs is not installed').TFMessage
 
 
 @tries('No progress: use_sim_time without a clock')

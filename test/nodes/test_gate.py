@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +17,7 @@ from sensor_msgs.msg import PointCloud2  # isort: skip
 from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.recording import note_of_set
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.localizer import Localizer
@@ -25,6 +27,7 @@ from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.rigs import rig
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
+from fisheye_svp_ros.study.solutions import gate_reason
 from fisheye_svp_ros.study.sweep import plan_sweep, sweep_rows
 
 SEEN = simulate_scenario(Scenario(noise_px=0.3)).observations
@@ -84,7 +87,8 @@ def test_the_warning_of_a_result_is_on_diagnostics_and_in_the_log(
 def test_what_fails_the_gate_has_a_reason_and_no_pose(graph: Callable[..., Graph]) -> None:
     driven = Driven(graph(*SOLVING, 'gate:=3.0'))
     status = driven.tell(1, longer(1.05))
-    assert 'above the gate (3 sigma_px)' in status.message and not status.values
+    assert 'sigma_px, above the gate (3 sigma_px)' in status.message and not status.values
+    assert float(re.findall(r'are (\S+) sigma_px', status.message)[0]) > 3
     status = driven.tell(2, SEEN.uv[:, ::-1])  # u and v exchanged
     assert not status.values
     assert driven.tell(3, SEEN.uv).values
@@ -111,6 +115,7 @@ def test_a_sweep_offline_has_the_same_gate() -> None:
     assert notes(0.0) == [None, None]
     sound, shifted = notes(1.5)
     assert sound is None and 'above the gate' in shifted
+    assert note_of_set(gate_reason(1.5, 157.2)) == shifted, 'as in a table of live results'
 
 
 def test_exchanged_cameras_of_a_pair_are_told(graph: Callable[..., Graph]) -> None:

@@ -41,6 +41,17 @@ def test_only_an_active_node_listens(graph: Graph, kind: type) -> None:
     assert node.trigger_cleanup() == success and node.trigger_shutdown() == success
 
 
+def test_what_an_inactive_node_asks_for_can_be_done(
+    graph: Graph, capfd: pytest.CaptureFixture[str]
+) -> None:
+    node = graph.start(Localizer)
+    assert 'set /localizer configure, then' in capfd.readouterr().err, 'at its start'
+    node.trigger_configure()
+    assert 'run ros2 lifecycle set /localizer activate' in node.report()[1]
+    node.trigger_cleanup()
+    assert 'set /localizer configure, then' in node.report()[1]
+
+
 def test_results_come_while_it_is_active(graph: Graph) -> None:
     results = graph.hear(DiagnosticArray, 'localizer/result')
     node = graph.start(Localizer)

@@ -117,9 +117,7 @@ def test_a_node_that_is_not_active_is_not_ok(graph: Callable[..., Graph]) -> Non
     g.start(Localizer)
     status = g.until(lambda: reports)[0].status[0]
     assert status.level == status.WARN
-    assert 'not active, so no set is solved; run ros2 lifecycle set /localizer activate' in (
-        status.message
-    )
+    assert 'not active, so no set is solved; run ros2 lifecycle set /localizer' in status.message
 
 
 def test_overload_is_in_the_log(

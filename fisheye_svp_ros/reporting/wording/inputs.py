@@ -68,9 +68,10 @@ def cameras_exchanged(distance: float) -> str:
     )
 
 
-def inactive(node: str) -> str:
+def inactive(node: str, configured: bool) -> str:
     """Tell of a managed node that listens to nothing."""
-    return f'not active, so no set is solved; run ros2 lifecycle set {node} activate'
+    first = '' if configured else f'configure, then ros2 lifecycle set {node} '
+    return f'not active, so no set is solved; run ros2 lifecycle set {node} {first}activate'
 
 
 def messages_lost(topic: str, count: int, of: int, remedy: str) -> str:
