@@ -110,7 +110,10 @@ def compiling() -> str:
 
 def compiling_first() -> str:
     """Say why a command does not begin yet."""
-    return 'Numba compiles first, once on this machine: about a minute; --engine numpy needs none'
+    return (
+        'Numba compiles first, once on this machine: about a minute; FISHEYE_SVP_ENGINE=numpy '
+        'avoids it'
+    )
 
 
 def compiled(state: str) -> str:
