@@ -14,10 +14,13 @@ from fisheye_svp_ros.arrays import Array, Index, flat_rows
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.effect_tests import RARITY_ODDS, SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.findings import Status, probability_of, status_of
+from fisheye_svp_ros.diagnosis.random_effects import SAG
+from fisheye_svp_ros.diagnosis.sagging import SagOdds, bend_over_sag
 from fisheye_svp_ros.diagnosis.variance_budget import NoiseGrowth
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import FlatPortEffect, RadialProfileEffect
+from fisheye_svp_ros.effects.target_effects import TargetShapeEffect
 from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.mixed_model import project_out, pseudo_inverse
 from fisheye_svp_ros.scene.observations import Observations, photograph_entry
@@ -53,7 +56,8 @@ class Cause:
     gain: of what held-out frames lose without it; imitations: effects
     that are not tested and that it may stand for; refuted_by_frames: first and last frame of
     contiguous thirds that are predicted worse with it; odds: of each of the confounded set, of
-    which this is the first, where one of them is there; {} of a cause alone.
+    which this is the first, where one of them is there; of a bend also against a sag of the board,
+    where it sags; {} of a cause alone.
     """
 
     form: str
@@ -123,6 +127,10 @@ def selected_causes(
         effect, columns, name = term.effect, term.columns, term.name
         odds = confounded_odds(tests, name, columns)
         alike = [rival for rival in odds if rival != name]
+        sag = bend_over_sag(tests, columns) if name == TargetShapeEffect.name else None
+        if sag is not None:
+            odds = _with_sag(odds or {name: 1.0}, name, sag)
+            alike += [SAG] * sag.confounded
         score = tests.test_removal(tests.null.included_columns, columns, effect)
         causes.append(
             Cause(
@@ -260,6 +268,13 @@ def confounded_odds(tests: EffectTests, name: str, columns: Index) -> dict[str, 
         return {}
     shares = special.softmax(np.array([*odds.values()]) / 2)
     return dict(zip(odds, shares.tolist(), strict=True))
+
+
+def _with_sag(odds: Mapping[str, float], name: str, sag: SagOdds) -> dict[str, float]:
+    """Return the odds of a confounded set with a sag of the board against the bend of a name."""
+    logs = np.log(np.maximum([*odds.values()], 1e-300))
+    logs = np.append(logs, logs[[*odds].index(name)] - sag.log_odds / 2)
+    return dict(zip([*odds, SAG], special.softmax(logs).tolist(), strict=True))
 
 
 def _plain_cause(

@@ -132,9 +132,17 @@ class EffectTests:
         linear models (1998), for the number; Scott and Berger, Bayes and empirical-Bayes
         multiplicity adjustment in the variable-selection problem (2010), for the prior.
         """
-        frames = max(self.null.linear.data.frames, _MIN_FRAMES)
-        prior = 2 * np.log(max(self.effect_count, 1))
-        return float(score.statistic - score.rank * np.log(frames) - prior)
+        return float(score.statistic - score.rank * self.parameter_cost - self.prior_log_odds)
+
+    @property
+    def parameter_cost(self) -> float:
+        """What a parameter gains by chance, in twice the log likelihood."""
+        return float(np.log(max(self.null.linear.data.frames, _MIN_FRAMES)))
+
+    @property
+    def prior_log_odds(self) -> float:
+        """Twice the log odds against any one effect before the data."""
+        return float(2 * np.log(max(self.effect_count, 1)))
 
     def candidates(
         self,

@@ -150,8 +150,9 @@ def _choose_question(
     fitted = {term.name for term in after.state.terms}
     mine = [c for c in causes if c.effect in fitted and c.stage in ('lens', 'target')]
     for cause in mine:
-        if cause.indistinguishable_from:
-            alike = tuple(cause.indistinguishable_from)
+        # How a board sags, no photograph that is planned can tell.
+        alike = tuple(name for name in cause.indistinguishable_from if name in CATALOGUE)
+        if alike:
             return cause.effect, alike, confounded_effects(after, alike)
     if mine:
         return mine[0].effect, (), []

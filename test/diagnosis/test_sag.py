@@ -39,6 +39,16 @@ def test_a_board_that_sags_is_to_be_supported():
     assert 0.8e-3 < advice.value < 1.2e-3 and advice.boards == [0]
 
 
+@pytest.mark.parametrize(('sag', 'bend'), [(1e-3, 0.0), (1e-3, 2e-3)])
+def test_a_bend_beside_a_sag_has_odds(sag, bend):
+    """Of a board that only sags, the mean bend was called one that stays."""
+    found = diagnose(photographs(8, sag, bend, frames=12), AIR, free_intrinsics=True)
+    (cause,) = (cause for cause in found.causes if cause.effect == 'target_shape')
+    assert sum(cause.odds.values()) == pytest.approx(1)
+    assert (cause.odds['frame_sag'] > 0.9) == (bend == 0)
+    assert cause.indistinguishable_from == ['frame_sag'] * (bend == 0)
+
+
 def test_a_board_whose_bend_stays_does_not_sag():
     data = group_by_frame(photographs(1, 0.0, 2e-3))
     null = NullModel.estimate(data, adjust(data, initial_state(data, AIR), FREE), FREE)
