@@ -364,7 +364,10 @@ def conclude(
             named_gain=(gain.value, gain.low),
             file=file,
             offset=offset if evaluation.free else None,
-            bounds=find_bounds(evaluation.null, open_effects),
+            bounds=find_bounds(
+                evaluation.null,
+                [name for name, chance in open_effects.items() if chance > LIKELY_PROBABILITY],
+            ),
             noise_px=evaluation.noise_px,
             falling=evaluation.falling,
             frames=evaluation.frames,
@@ -445,17 +448,18 @@ def _unnamed_parts(evaluation: Evaluation) -> list[str]:
     return [name for name, there in parts.items() if there]
 
 
-def _open_effects(evaluation: Evaluation, candidates: Sequence[Finding]) -> list[str]:
-    """Return effects of the lens that are likely, and not confirmed."""
-    likely = {
-        candidate.effect
+def _open_effects(evaluation: Evaluation, candidates: Sequence[Finding]) -> dict[str, float]:
+    """Return how probable each effect of the lens is that is neither confirmed nor refuted."""
+    found = {
+        candidate.effect: candidate.probability
         for candidate in candidates
-        if candidate.status is Status.LIKELY
+        if candidate.status is not Status.REFUTED
         and CATALOGUE[candidate.effect].budget_stage() == 'lens'
     }
-    if any(shift.weight > LIKELY_PROBABILITY for shift in evaluation.averaged_model.shifts):
-        likely.add(ViewpointShiftEffect.name)
-    return sorted(likely)
+    shifts = evaluation.averaged_model.shifts
+    if shifts:
+        found[ViewpointShiftEffect.name] = max(shift.weight for shift in shifts)
+    return found
 
 
 def _target_facts(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from math import erf, inf
+from types import MappingProxyType
 from typing import Literal, NamedTuple
 
+from fisheye_svp_ros.diagnosis.findings import LIKELY_PROBABILITY
 from fisheye_svp_ros.diagnosis.flaws import Flaw
 
 LensAnswer = Literal['keep', 'use_extended', 'recalibrate', 'undecided']
@@ -17,8 +18,8 @@ PhotographsAnswer = Literal['enough', 'more', 'retake']
 _INTRINSIC = ('focal_length', 'principal_point', 'aspect')
 _OFF_P = 0.04  # of the offset by chance: below, the lens is another one
 _OFF_PX = 0.2  # of the noise: a difference that matters
-_RAY_RATIO = 2.0  # of expected ray errors: a lens so much better is worth the change
-_HINT = 2.4  # standard errors: an effect that is not named, and yet likely there
+RAY_RATIO = 2.0  # of expected ray errors: a lens so much better is worth the change
+_HINT = 2.4  # standard errors: an effect that is not named, and may well be there
 MIN_FRAMES = 8  # frames
 _MAX_REJECTED_SHARE = 0.1  # of the frames
 _TARGET_RATIO = 1.5  # times noise and scatter: a held-out error that needs a reason
@@ -34,7 +35,7 @@ class LensReason(Enum):
     PREDICTS_BETTER = 5
     LENS_ALONE_PREDICTS_WORSE = 6
     GAIN_UNCERTAIN = 7
-    EFFECT_LIKELY = 8
+    EFFECT_POSSIBLE = 8
     NOTHING_CONFIRMED = 9
     RAYS_BETTER = 10
 
@@ -109,11 +110,10 @@ class Decision:
 class LensOffset(NamedTuple):
     """How far the lens as given is off what the data say.
 
-    mrad: least rms of the errors of its rays at 1 m (95 % sure), by the fit with causes or one
-    without, whichever is nearest; ratio: of the distance over what the stated errors and those of
-    the fit let expect, by their covariance; p_value: of so much by chance; px: mrad in the image;
-    stated: whether the lens file states errors; camera: whose lens, of several; gain: its expected
-    error over that of a fresh calibration.
+    mrad: least rms of the errors of its rays at 1 m (95 % sure); ratio: of the distance over what
+    the stated errors and those of the fit let expect, by their covariance; p_value: of so much by
+    chance; px: mrad in the image; stated: whether the lens file states errors; camera: whose lens,
+    of several; better: how probably a fresh calibration is at least twice as good.
     """
 
     mrad: float
@@ -122,20 +122,25 @@ class LensOffset(NamedTuple):
     px: float
     stated: bool = True
     camera: str = ''
-    gain: float = inf
+    better: float = 1.0
 
     @property
     def is_chance(self) -> bool:
         """Whether chance alone may set the lens off by so much."""
         return self.p_value >= _OFF_P
 
+    @property
+    def is_fresh_better(self) -> bool:
+        """Whether a fresh calibration is more likely than not at least twice as good."""
+        return self.better > LIKELY_PROBABILITY
+
     def matters(self, noise_px: float) -> bool:
-        """Say whether the lens is another one, and a fresh calibration clearly better.
+        """Say whether the lens is another one, and a fresh calibration likely twice as good.
 
         Of a lens without errors only what costs counts.
         """
         least = _OFF_PX if self.stated else 1.0
-        return not self.is_chance and self.px > least * noise_px and self.gain >= _RAY_RATIO
+        return not self.is_chance and self.px > least * noise_px and self.is_fresh_better
 
 
 def least_likely_offset(offsets: Sequence[LensOffset]) -> LensOffset | None:
@@ -173,7 +178,7 @@ class LensFacts(NamedTuple):
     many; refuted: effects that held-out data, or their size, refute;
     rays: expected errors, mrad, of the lens as given and the extended one, over all ranges,
     zeros where unknown; written: what the extended lens has without a confirmed cause;
-    open: effects of the lens that are likely, and not confirmed.
+    open: how probable each effect of the lens is that was tried, and is not confirmed.
     """
 
     lens_causes: Sequence[str]
@@ -188,7 +193,7 @@ class LensFacts(NamedTuple):
     refuted: Sequence[str] = ()
     rays: tuple[float, float] = (0.0, 0.0)
     written: Sequence[str] = ()
-    open: Sequence[str] = ()
+    open: Mapping[str, float] = MappingProxyType({})
 
     @property
     def is_better_held_out(self) -> bool:
@@ -199,7 +204,7 @@ class LensFacts(NamedTuple):
     def has_better_rays(self) -> bool:
         """Whether the expected error of the rays halves, and held-out frames agree."""
         given, extended = self.rays
-        return extended > 0 and given >= _RAY_RATIO * extended and self.file.gain > 0
+        return extended > 0 and given >= RAY_RATIO * extended and self.file.gain > 0
 
     @property
     def wrong_intrinsics(self) -> list[str]:
@@ -207,16 +212,20 @@ class LensFacts(NamedTuple):
         return [name for name in self.causes if name in _INTRINSIC]
 
     @property
-    def likely_effects(self) -> list[EffectBound]:
-        """Effects that are not named and yet likely there, the costliest first."""
-        likely = (
+    def possible_effects(self) -> list[EffectBound]:
+        """Effects that are not named and may well be there, the costliest first."""
+        possible = (
             one
             for one in self.bounds
-            if (one.z > _HINT or one.effect in self.open)
+            if (one.z > _HINT or self.is_likely(one.effect))
             and one.edge_px > self.noise_px
             and one.effect not in self.refuted
         )
-        return sorted(likely, key=lambda bound: -bound.edge_px)
+        return sorted(possible, key=lambda bound: -bound.edge_px)
+
+    def is_likely(self, effect: str) -> bool:
+        """Whether an effect that is not confirmed is more likely there than not."""
+        return self.open.get(effect, 0.0) > LIKELY_PROBABILITY
 
 
 def decide_lens(facts: LensFacts) -> Decision:
@@ -233,7 +242,7 @@ def decide_lens(facts: LensFacts) -> Decision:
         return decide('undecided', LensReason.FITTED_ERROR_RISES, 0.0, bounded=True)
     if off is not None and off.matters(facts.noise_px):
         figure = Figure('ray_error', off.mrad, 'mrad')
-        return Decision('recalibrate', LensReason.OFF, facts, figure, 1 - off.p_value)
+        return Decision('recalibrate', LensReason.OFF, facts, figure, off.better)
     if facts.frames < 2 and not facts.causes:
         return decide('undecided', LensReason.ONE_FRAME, None)
     if facts.wrong_intrinsics:
@@ -247,9 +256,9 @@ def decide_lens(facts: LensFacts) -> Decision:
         return decide('undecided', reason, 1 - sure, bounded=True)
     if facts.lens_causes:
         return decide('undecided', LensReason.GAIN_UNCERTAIN, sure, bounded=True)
-    if facts.likely_effects:
-        certainty = erf(facts.likely_effects[0].z / 2**0.5)
-        return decide('undecided', LensReason.EFFECT_LIKELY, certainty, bounded=True)
+    if facts.possible_effects:
+        probability = facts.open.get(facts.possible_effects[0].effect)
+        return decide('undecided', LensReason.EFFECT_POSSIBLE, probability, bounded=True)
     return decide('keep', LensReason.NOTHING_CONFIRMED, 0.95, bounded=True)
 
 

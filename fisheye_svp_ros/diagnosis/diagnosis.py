@@ -68,16 +68,14 @@ class Diagnosis(Conclusion):
         rest = {structure.variable for structure in self.remaining} - {'landmark'}
         # Nothing confirms what one frame shows.
         open_effects = self.frames < 2 and self.candidates
-        return 'unexplained' if rest or open_effects or self.likely_effects else 'adequate'
+        return 'unexplained' if rest or open_effects or self.open_lens is not None else 'adequate'
 
     @property
-    def likely_effects(self) -> list[str]:
-        """Effects for which, likely and not confirmed, the lens is undecided."""
-        facts = self.decision['lens'].facts
-        undecided = self.decision['lens'].reason is LensReason.EFFECT_LIKELY
-        if not (undecided and isinstance(facts, LensFacts)):
-            return []
-        return [bound.effect for bound in facts.likely_effects]
+    def open_lens(self) -> LensFacts | None:
+        """What is known of a lens that is undecided for effects that are not confirmed."""
+        lens = self.decision['lens']
+        possible = lens.reason is LensReason.EFFECT_POSSIBLE
+        return lens.facts if possible and isinstance(lens.facts, LensFacts) else None
 
     @property
     def offers_extended(self) -> bool:

@@ -17,6 +17,7 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
     sum_squares,
 )
 from fisheye_svp_ros.diagnosis.decision import (
+    RAY_RATIO,
     EffectBound,
     FileFigure,
     LensOffset,
@@ -52,6 +53,7 @@ _NEGLIGIBLE = 1e-8  # of a variance
 _SAME_RMS = 1e-3  # relative
 _ROUNDING = 1e-10  # of the variance of an angle: below it, a covariance has no root
 _BOUND_QUANTILE = 0.95
+_BISECTIONS = 20
 _NEAR_RANGE = 1  # of ray_errors.RANGES: 1 m
 
 
@@ -206,10 +208,7 @@ def find_lens_rays(
     known = LensCovariance.from_model(
         evaluation.null, evaluation.averaged_model, None if quick else evaluation.other_models
     )
-    fits = [
-        evaluation.extended_lenses(state)
-        for state in (evaluation.simulation.state, _generalized_fit(evaluation.selection.first))
-    ]
+    fresh = evaluation.extended_lenses(_generalized_fit(evaluation.selection.first))
     views = known.linear.data.views
     errors, offsets, asked = {}, [], evaluation.problem.options.range_m
     for number, (name, given) in enumerate(lenses.items()):
@@ -225,17 +224,14 @@ def find_lens_rays(
             errors[name]['extended'].append(wider.errors()[-1])
         if _is_of_these_data(evaluation, given):
             continue  # a fresh calibration is this one
-        nearer = [off - _difference(model, points_on_rays(fit[name], uv[there])) for fit in fits]
-        one = _offset(model, (off, *nearer), given, uv[there], evaluation.noise_px)
+        new = _difference(model, points_on_rays(fresh[name], uv[there]))
+        one = _offset(model, off, new, given, uv[there], evaluation.noise_px)
         offsets.append(one._replace(camera=name if len(lenses) > 1 else ''))
     return errors, least_likely_offset(offsets)
 
 
 def _generalized_fit(null: NullModel) -> RigState:
-    """Return the state that generalized least squares finds, as `calibrate` writes it.
-
-    Least squares bends the lens to the board, and is far from it for that.
-    """
+    """Return the state that generalized least squares finds: nearly what `calibrate` writes."""
     own, linear = null.included_columns, null.linear
     inverse = pseudo_inverse(null.information[np.ix_(own, own)], 1e-13)
     step = inverse @ null.information[own, -1] / null.scale[own]
@@ -298,29 +294,52 @@ def _difference(model: RayModel, points: Array) -> Array:
 
 
 def _offset(
-    model: RayModel, off: Sequence[Array], given: Lens, uv: Array, noise: float
+    model: RayModel, off: Array, fresh: Array, given: Lens, uv: Array, noise: float
 ) -> LensOffset:
-    """Return how far a lens is off the nearest of some fits, and how often chance does as much.
+    """Return how far a lens is off the written one, and how often chance does as much.
 
     By the covariance of what both may be off: a small change counts where it is known well.
-    noise: px; angles far below it, and what a large change is by more than linear, do not count.
+    off, fresh (R, G, 3), rad: of the lens, and of a fresh calibration, to the written one; noise:
+    px; angles far below it, and what a large change is by more than linear, do not count.
     """
-    nearer = min((errors[_NEAR_RANGE] for errors in off), key=_rms)
-    fresh = expected = model.sample(_NEAR_RANGE)
+    near, errors = off[_NEAR_RANGE], model.sample(_NEAR_RANGE)
+    expected = errors
     stated = _stated_sample(given, uv)
     if stated is not None and stated.shape == expected.shape:
         expected = expected + stated
     focal = float(np.sqrt(given.fx * given.fy))
-    floor = float(np.hypot(_FLOOR * noise / focal, _LINEARITY * _rms(nearer)))
-    distance, drawn = _distances(nearer, expected, floor)
+    floor = float(np.hypot(_FLOOR * noise / focal, _LINEARITY * _rms(near)))
+    distance, drawn = _distances(near, expected, floor)
     p_value = float((1 + (drawn >= distance).sum()) / (1 + len(drawn)))
     ratio = distance / max(float(np.sqrt((drawn**2).mean())), 1.0)
-    # What the fit errs by along the difference may be a part of it.
-    size, error = _rms(nearer), float(np.sqrt((fresh**2).sum(axis=1).mean()))
-    along = (nearer[..., None] * fresh).sum(axis=(0, 1)) / (len(nearer) * max(size, 1e-300))
-    least = max(size - float(np.quantile(along, _BOUND_QUANTILE)), 0.0)
-    gain = float(np.hypot(size, error)) / max(error, 1e-300)
-    return LensOffset(1e3 * least, ratio, p_value, least * focal, stated is not None, gain=gain)
+    least = _least_size(near, errors)
+    # Over all ranges together, as likely models have it.
+    squares = [(model.draw_sizes(one) ** 2).mean(axis=0) for one in (off, fresh)]
+    better = float((squares[0] >= RAY_RATIO**2 * squares[1]).mean())
+    return LensOffset(
+        1e3 * least, ratio, p_value, least * focal, stated is not None, better=better
+    )
+
+
+def _least_size(off: Array, errors: Array) -> float:
+    """Return the rms of the least multiple of angles (G, 3) that these do not exclude (95 %).
+
+    What is seen beside a true difference d is d + e; errors (G, 3, S): drawn ones.  The least d
+    along the angles is that beside which the rms of 95 % of d + e is below what is seen.
+    """
+    square = _rms(off) ** 2
+    across = (off[..., None] * errors).sum(axis=(0, 1)) / len(off)
+    own = (errors**2).sum(axis=(0, 1)) / len(off)
+
+    def is_excluded(share: float) -> bool:
+        seen = share**2 * square + 2 * share * across + own
+        return bool(np.quantile(seen, _BOUND_QUANTILE) < square)
+
+    low, high = 0.0, 1.0
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if is_excluded(middle) else (low, middle)
+    return float(low * np.sqrt(square))
 
 
 def _distances(off: Array, samples: Array, floor: float) -> tuple[float, Array]:

@@ -64,7 +64,21 @@ class RayModel(NamedTuple):
         return np.asarray(np.sqrt(squares))
 
     def errors(self, difference: Array | None = None) -> list[RayError]:
-        """Return the expected error at each range.
+        """Return the expected error at each range, of this lens or one that differs from it.
+
+        difference: see `draw_sizes`.
+        """
+        return [
+            RayError(
+                range_m,
+                float(sizes.mean()),
+                *np.quantile(sizes, (0.025, 0.975)).tolist(),
+            )
+            for range_m, sizes in zip(self.ranges, self.draw_sizes(difference), strict=True)
+        ]
+
+    def draw_sizes(self, difference: Array | None = None) -> Array:
+        """Return what the rms over the points may be at each range, (R, SAMPLES), rad.
 
         difference (R, G, 3), rad: of a lens to this one; None for this lens itself.
         """
@@ -75,15 +89,7 @@ class RayModel(NamedTuple):
             draws = np.concatenate([draws, np.ones((1, SAMPLES))])
         # The mean square over the points is a quadratic form of the parameters.
         form = np.swapaxes(columns, -1, -2) @ columns / points
-        rms = np.sqrt(np.maximum((draws * (form @ draws)).sum(axis=1), 0.0))
-        return [
-            RayError(
-                range_m,
-                float(one.mean()),
-                *np.quantile(one, (0.025, 0.975)).tolist(),
-            )
-            for range_m, one in zip(self.ranges, rms, strict=True)
-        ]
+        return np.asarray(np.sqrt(np.maximum((draws * (form @ draws)).sum(axis=1), 0.0)))
 
     def with_field(
         self, lens: Lens, uv: Array, bumps: Array, covariance: Array, cross: Array

@@ -20,22 +20,37 @@ def moved(step):
     return replace(LENS, fx=400 + step[0], fy=400 + step[0], cx=640 + step[1], cy=480 + step[2])
 
 
-def test_off_by_at_least_is_a_bound_and_the_gain_that_of_a_fresh_lens():
+def offsets(count):
+    """Yield the offset of a lens, what its rays are off by and that over those of a fresh fit."""
     rng = np.random.default_rng(3)
     model, _ = ray_model(moved, np.diag(STDERR**2), UV)
-    excess, gains, sizes = [], [], []
-    for _ in range(200):
+    for _ in range(count):
         true = 3 * STDERR * rng.normal(size=3)
         error = STDERR * rng.normal(size=3)
         off = model.columns @ (true - error)
-        found = _offset(model, (off, off), LENS, UV, 0.1)
+        found = _offset(model, off, np.zeros_like(off), LENS, UV, 0.1)
         size, fresh = (
             1e3 * np.sqrt(((model.columns[1] @ step) ** 2).sum(axis=-1).mean())
             for step in (true, error)
         )
-        excess.append(found.mrad > size)
-        sizes.append(found.mrad / size)
-        gains.append((found.gain, size / fresh))
-    assert np.mean(excess) < 0.08 and np.median(sizes) > 0.4
-    stated, real = np.array(gains).T
-    assert np.median(real[stated >= 2]) > 2 > np.median(real[stated < 2])
+        yield found, size, size / fresh
+
+
+def test_off_by_at_least_is_a_bound():
+    shares = np.array([found.mrad / size for found, size, _ in offsets(200)])
+    assert np.mean(shares > 1) < 0.08 and np.median(shares) > 0.35
+
+
+def test_a_fresh_calibration_is_as_often_twice_as_good_as_is_said():
+    stated, real = np.array([(found.better, ratio >= 2) for found, _, ratio in offsets(200)]).T
+    sure, unsure = stated > 0.9, (stated > 0.3) & (stated < 0.7)
+    assert real[sure].mean() > 0.85 and 0.25 < real[unsure].mean() < 0.75
+
+
+def test_a_fresh_calibration_that_is_off_as_much_is_no_remedy():
+    """Beside a shift that no calibration knows of, lenses were to be calibrated again."""
+    model, _ = ray_model(moved, np.diag(STDERR**2), UV)
+    off = model.columns @ (8 * STDERR)
+    found = _offset(model, off, off, LENS, UV, 0.1)
+    assert found.p_value < 0.01 and found.better == 0.0 and not found.matters(0.1)
+    assert _offset(model, off, np.zeros_like(off), LENS, UV, 0.1).matters(0.1)

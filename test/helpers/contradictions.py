@@ -81,13 +81,15 @@ def _moves_predictions(cause: Mapping[str, Any]) -> bool:
 
 
 def _confounded(document: Document) -> Iterator[str]:
-    names = {cause['effect'] for cause in document['causes']}
+    causes = {cause['effect'] for cause in document['causes']}
     for cause in document['causes']:
         alike, odds = set(cause['indistinguishable_from']), cause.get('odds')
-        if odds and ({*odds} != {cause['effect'], *alike} or abs(sum(odds.values()) - 1) > 1e-9):
+        names = {cause['effect'], *alike}
+        told = names <= {*odds} <= {*names, 'frame_sag'} if odds else True
+        if not told or (odds and abs(sum(odds.values()) - 1) > 1e-9):
             yield f'{cause["effect"]} or {alike}: {odds}'
-        if alike & names:
-            yield f'{cause["effect"]} is not told from {alike & names}, a cause too'
+        if alike & causes:
+            yield f'{cause["effect"]} is not told from {alike & causes}, a cause too'
 
 
 def _lens(document: Document) -> Iterator[str]:
@@ -195,7 +197,15 @@ def _screen(document: Document, screen: str) -> Iterator[str]:
         if cause['status'] != 'confirmed' and f'{cause["status"]}, ' not in causes:
             yield f'{cause["effect"]} is {cause["status"]}, which the screen does not say'
     for entry in document['candidates']:
-        if entry['status'] == 'refuted' and f'likely but not confirmed: {entry["effect"]}' in (
-            screen
+        for word in re.findall(
+            rf'(\w+)(?: \([^)]*\))? but not confirmed: {entry["effect"]}', screen
         ):
-            yield f'{entry["effect"]} is refuted and likely'
+            if entry['status'] == 'refuted':
+                yield f'{entry["effect"]} is refuted and {word}'
+            if word.lower() == 'likely' and entry['probability'] < 0.5:
+                yield f'{entry["effect"]} is {word} at {entry["probability"]:.2f}'
+    for shift in document['lens'].get('averaged_shift', []):
+        if shift['weight'] < 0.5 and re.search(
+            'ikely[^;]* not confirmed: viewpoint_shift', screen
+        ):
+            yield f'a shift of weight {shift["weight"]:.2f} is likely'

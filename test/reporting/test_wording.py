@@ -96,9 +96,22 @@ def test_every_reason_is_a_short_clause(
             'on the same corrected target it takes the held-out error from 0.123 to 0.081 px',
         ),
         (
-            LensReason.EFFECT_LIKELY,
+            LensReason.EFFECT_POSSIBLE,
             LENS,
-            'likely but not confirmed: viewpoint_shift, which may cause up to 0.32 px at the edge',
+            'possible but not confirmed: viewpoint_shift, which may cause up to 0.32 px at the '
+            'edge',
+        ),
+        (
+            LensReason.EFFECT_POSSIBLE,
+            LENS._replace(open={'viewpoint_shift': 0.23}),
+            'possible (23 %) but not confirmed: viewpoint_shift, which may cause up to 0.32 px at '
+            'the edge',
+        ),
+        (
+            LensReason.EFFECT_POSSIBLE,
+            LENS._replace(open={'viewpoint_shift': 0.78}),
+            'likely (78 %) but not confirmed: viewpoint_shift, which may cause up to 0.32 px at '
+            'the edge',
         ),
         (
             LensReason.NOTHING_CONFIRMED,

@@ -19,7 +19,7 @@ from fisheye_svp_ros.diagnosis import (
     TargetReason,
 )
 from fisheye_svp_ros.reporting.wording.adequacy import flaw_reason
-from fisheye_svp_ros.reporting.wording.findings import pixels
+from fisheye_svp_ros.reporting.wording.findings import chance, pixels
 
 _SUBJECTS = {LensFacts: 'lens', TargetFacts: 'target', PhotographsFacts: 'photographs'}
 _ONE_FRAME = 'one frame does not tell errors of the lens from those of the target'
@@ -61,7 +61,7 @@ def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
         LensReason.GAIN_UNCERTAIN: f'it is not certain that {", ".join(facts.lens_causes)} in the '
         f'lens reduces the held-out error ({pixels(file.given_px)} → '
         f'{pixels(file.extended_px)} px): its probability is {100 * file.sure:.0f} %',
-        LensReason.EFFECT_LIKELY: _likely_effects(facts),
+        LensReason.EFFECT_POSSIBLE: _possible_effects(facts),
         LensReason.NOTHING_CONFIRMED: _nothing_confirmed(facts),
     }
 
@@ -87,13 +87,22 @@ def _offset(facts: LensFacts) -> str:
     )
 
 
-def _likely_effects(facts: LensFacts) -> str:
-    likely = facts.likely_effects
-    if not likely:
+def unconfirmed_effects(facts: LensFacts) -> str:
+    """Return the effects for which the lens is undecided, as a clause that says how likely."""
+    effects = [bound.effect for bound in facts.possible_effects]
+    how = 'likely' if any(map(facts.is_likely, effects)) else 'possible'
+    if len(effects) == 1 and effects[0] in facts.open:
+        how += f' ({chance(facts.open[effects[0]])})'
+    return f'{how} but not confirmed: {" or ".join(effects)}'
+
+
+def _possible_effects(facts: LensFacts) -> str:
+    possible = facts.possible_effects
+    if not possible:
         return ''
     return (
-        f'likely but not confirmed: {" or ".join(bound.effect for bound in likely)}, '
-        f'which may cause up to {likely[0].edge_px:.2g} px {bound_place(likely[0])}'
+        f'{unconfirmed_effects(facts)}, '
+        f'which may cause up to {possible[0].edge_px:.2g} px {bound_place(possible[0])}'
     )
 
 

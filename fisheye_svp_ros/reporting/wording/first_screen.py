@@ -39,7 +39,11 @@ from fisheye_svp_ros.reporting.wording.causes import (
     percent,
     size,
 )
-from fisheye_svp_ros.reporting.wording.decisions import bound_place, decision_reason
+from fisheye_svp_ros.reporting.wording.decisions import (
+    bound_place,
+    decision_reason,
+    unconfirmed_effects,
+)
 from fisheye_svp_ros.reporting.wording.diagnosis import (
     LENS_FILE,
     count_frames,
@@ -345,8 +349,8 @@ def verdict_words(d: Diagnosis) -> str:
         return 'Unexplained: outliers; nothing else is wrong'
     if d.verdict == 'adequate' and d.offers_extended:
         return f'Adequate: {NO_CONFIRMED_ERROR}'
-    if d.verdict == 'unexplained' and d.likely_effects:
-        return f'Unexplained: {likely_effects(d)}'
+    if d.verdict == 'unexplained' and d.open_lens is not None:
+        return f'Unexplained: {unconfirmed_effects(d.open_lens)}'
     if not d.causes and d.decision['lens'].say == 'recalibrate':
         rest = '; some of the residual error is unexplained' if d.remaining else ''
         return f'{_VERDICTS[d.verdict].partition(":")[0]}: the lens as given is off{rest}'
@@ -389,8 +393,8 @@ def largest_cause(d: Diagnosis) -> str:
         return 'Errors show in one frame, which does not tell their cause'
     if d.decision['lens'].say == 'recalibrate':
         return _capital(decision_reason(d.decision['lens']))
-    if d.likely_effects:
-        return _capital(likely_effects(d))
+    if d.open_lens is not None:
+        return _capital(unconfirmed_effects(d.open_lens))
     if only_gross(d):
         count = len(d.gross)
         return (
@@ -410,11 +414,6 @@ def largest_cause(d: Diagnosis) -> str:
             else 'No model error shows in these data'
         )
     return 'No effect of the catalog explains the residual error'
-
-
-def likely_effects(d: Diagnosis) -> str:
-    """Return what is likely and not confirmed, as a clause."""
-    return f'likely, not confirmed: {" or ".join(d.likely_effects)}'
 
 
 def _displaced_landmarks(d: Diagnosis) -> str:
@@ -439,7 +438,8 @@ def _sentence(d: Diagnosis, cause: Cause) -> str:
         doubt = '' if confirmed else f' ({belief(cause.status, cause.probability)})'
     if cause.odds.get(cause.effect, 1.0) < CONFIRMED_PROBABILITY:
         others = ' or '.join(with_odds(cause, name) for name in cause.indistinguishable_from)
-        doubt += f', {chance(cause.odds[cause.effect])} sure, or it is {others}'
+        sure = chance(cause.odds[cause.effect])
+        doubt += f', {sure} sure, or it is {others}'
     return _statement(d, cause) + doubt
 
 
