@@ -251,13 +251,18 @@ def _all_corners(ok: bool, corners: Any) -> Found | None:
     return Found(np.arange(len(uv)), uv)
 
 
-def dictionary_of(pattern: Pattern) -> Any:
-    """Return the ArUco dictionary of a pattern."""
+def need_markers(spec: str) -> None:
+    """Raise ParameterError where OpenCV has no markers, which a board is made of."""
     if _ARUCO is None:
         raise ParameterError(
-            f'board {pattern.spec!r}: OpenCV {cv2.__version__} has no markers; '
+            f'board {spec!r}: OpenCV {cv2.__version__} has no markers; '
             'install 4.7 or newer, or opencv-contrib'
         )
+
+
+def dictionary_of(pattern: Pattern) -> Any:
+    """Return the ArUco dictionary of a pattern."""
+    need_markers(pattern.spec)
     named = [name for name in dir(_ARUCO) if name.upper() == pattern.dictionary]
     if not named:
         raise ParameterError(

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.detect.finders import Grey, detect_markers
+from fisheye_svp_ros.detect.finders import Grey, detect_markers, need_markers
 from fisheye_svp_ros.detect.patterns import LOOSE_TAGS, Pattern
 from fisheye_svp_ros.detect.photographs import Photograph, Pixels
 from fisheye_svp_ros.detect.points import Points, eight_bit
@@ -39,6 +39,7 @@ class TagViews(NamedTuple):
 
 def tag_size(spec: str) -> float:
     """Return the side of loose tags, m, from `tags:36h11:160mm`; raise ParameterError."""
+    need_markers(spec)
     match = _SPEC.fullmatch(spec)
     size = float(match[1]) * _UNITS[match[2].lower()] if match else 0.0
     if not 0 < size < 10:
@@ -58,7 +59,11 @@ def find_tags(image: Grey) -> tuple[Index, Array]:
 
 
 def tag_pattern(spec: str, landmarks: Landmarks) -> Pattern:
-    """Return what a detector looks for where loose tags hang as a map says."""
+    """Return what a detector looks for where loose tags hang as a map says.
+
+    Raises ParameterError where OpenCV has no markers.
+    """
+    need_markers(spec)
     count = len(landmarks.ids)
     none = np.zeros((count, 2))
     return Pattern(LOOSE_TAGS, spec, 0, 0, landmarks.points, 0.0, none, none[:, 0], 0.0)

@@ -9,6 +9,8 @@ from fisheye_svp_ros.detect.tag_edges import fit_quads
 from fisheye_svp_ros.detect.tags import find_tag_views, find_tags, tag_size
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 
+pytestmark = pytest.mark.skipif(not hasattr(cv2, 'aruco'), reason='this OpenCV has no markers')
+
 
 def sheet(*tags):
     """Return white paper with tags, each an id and the pixel of its upper left cell."""
@@ -100,3 +102,9 @@ def test_the_size_is_part_of_the_name():
     for spec in ('tags', 'tags:36h11', 'tags:25h9:1cm', 'chessboard:9x6:25mm', 'tags:36h11:0mm'):
         with pytest.raises(ParameterError, match='tags:36h11:160mm'):
             tag_size(spec)
+
+
+def test_an_opencv_without_markers_is_named(monkeypatch):
+    monkeypatch.setattr('fisheye_svp_ros.detect.finders._ARUCO', None)
+    with pytest.raises(ParameterError, match=r"board 'tags:36h11:160mm': OpenCV .* no markers"):
+        tag_size('tags:36h11:160mm')
