@@ -17,13 +17,13 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from scipy.stats import binomtest
 
+import fisheye_svp_ros as fsvp
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.terminal import progress
 from fisheye_svp_ros.scene.observations import Observations
-from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.ray_errors import RANGES, points_on_rays, without_motion
 
 DOCS = Path(__file__).parents[1] / 'docs'
@@ -233,9 +233,9 @@ class Rate(NamedTuple):
         return f'{100 * self.value:.1f} % ({self.successes}/{self.trials})' if self.trials else '-'
 
 
-def calibrated(observations: Observations, size: tuple[int, int]) -> Lens:
-    """Return the Kannala-Brandt lens that is fitted to observations."""
-    return calibrate(observations, 'kannala_brandt', size).adjusted.lens
+def calibrated(observations: Observations, size: tuple[int, int], plain: bool = False) -> Lens:
+    """Return the Kannala-Brandt lens that `calibrate` writes; plain: by least squares."""
+    return fsvp.calibrate(observations, 'kannala_brandt', size, plain=plain).lens
 
 
 def calibrated_and_diagnosed(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -162,20 +163,35 @@ def image_points(lens: Lens, points: Array) -> tuple[Array, Array]:
     return [lens.cx, lens.cy] + (height / radius)[:, None] * points[:, :2], theta
 
 
+class BoardErrors(NamedTuple):
+    """Whether a board is bent, and whether its landmarks are off."""
+
+    bent: bool
+    off: bool
+
+
 def draw_set(
-    seed: int, frames: tuple[int, int] = FEW, warp: Callable[[Array], Array] | None = None
+    seed: int,
+    frames: tuple[int, int] = FEW,
+    warp: Callable[[Array], Array] | None = None,
+    errors: BoardErrors | None = None,
 ) -> tuple[Observations, Lens]:
     """Draw photographs of a board that may be bent, and the lens that took them.
 
-    warp: displacements (N, 2), px, of image points (N, 2).
+    warp: displacements (N, 2), px, of image points (N, 2); errors: of the board, through a lens
+    whose viewpoint stands still; None for landmarks that are off, a bend and a shift by chance.
     """
     rng = np.random.default_rng(seed)
     lens, count, noise = draw_lens(rng), int(rng.integers(*frames)), rng.uniform(0.03, 0.2)
+    if errors is not None:
+        lens = lens.with_shift(Gennery(0.0, 0.0))
     columns, rows = int(rng.integers(7, 11)), int(rng.integers(6, 9))
     flat = grid(columns, rows, rng.uniform(0.02, 0.035))
     u, v = flat[:, :2].T / flat.max()
-    bend = rng.normal(0, 4e-4, 3) * (rng.random() < 0.7)
-    true = flat + rng.normal(0, 2.5e-5, flat.shape)
+    bend, may_bend = rng.normal(0, 4e-4, 3), rng.random() < 0.7
+    offsets = rng.normal(0, 2.5e-5, flat.shape)
+    bent, off = (may_bend, True) if errors is None else errors
+    bend, true = bend * bent, flat + offsets * off
     true[:, 2] += bend @ [u * u, u * v, v * v]
     seen: list[Seen] = []
     while len(seen) < count:

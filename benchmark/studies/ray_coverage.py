@@ -5,7 +5,9 @@ five to eight or fourteen to eighteen of them; the image points of every other s
 waves of .05 to .4 px, rms. Each set is calibrated and diagnosed. The ray errors that the diagnosis
 states of both lenses at 0.3, 1 and 5 m are compared with the true ones: the share of true errors
 below, within and above their 95 % intervals, and the geometric means of the true error over the
-stated one and of the extended lens's error over that of the lens as calibrated.
+stated one, and of the errors of both lenses over those of least squares (`calibrate --plain`). A
+second table has that ratio for such photographs through a lens whose viewpoint stands still, of a
+board as it is said to be, or off in one way.
 
 Writes docs/results/ray_coverage.md.
 """
@@ -19,15 +21,32 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmark import study
-from benchmark.studies.boards import FEW, FRAMES, HEIGHT, WIDTH, draw_warped_set
+from benchmark.studies.boards import (
+    FEW,
+    FRAMES,
+    HEIGHT,
+    WIDTH,
+    BoardErrors,
+    draw_set,
+    draw_warped_set,
+)
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.solve.ray_errors import RANGES, typical_points
+
+SIZE = (WIDTH, HEIGHT)
+BOARDS = {
+    'as it is said to be': BoardErrors(bent=False, off=False),
+    'landmarks off': BoardErrors(bent=False, off=True),
+    'bent': BoardErrors(bent=True, off=False),
+}
 
 
 class Outcome(NamedTuple):
     """Of one set: its kind, whether the extended lens is offered, and the ray errors.
 
-    true, value, low, high (2, R), mrad: of the lens as calibrated and of the extended one.
+    true, value, low, high (2, R), mrad: of the lens as calibrated and of the extended one; plain
+    (R,), mrad: of that by least squares; ratios (B,): of the errors of both for each of `BOARDS`,
+    none of a warped set.
     """
 
     few: bool
@@ -37,6 +56,8 @@ class Outcome(NamedTuple):
     value: Array
     low: Array
     high: Array
+    plain: Array
+    ratios: Array
 
     @property
     def outside(self) -> Mask:
@@ -48,16 +69,39 @@ def trial(number: int) -> Outcome:
     """Calibrate and diagnose one set: of four, two have few frames and two a warp."""
     number, few = divmod(number, 2)
     seen, truth, size = draw_warped_set(number, FEW if few else FRAMES)
-    given, found = study.calibrated_and_diagnosed(seen, (WIDTH, HEIGHT), free_intrinsics=True)
-    uv = typical_points(seen.uv)
-    true = [study.ray_errors(lens, truth, uv) for lens in (given, found.lens)]
+    given, found = study.calibrated_and_diagnosed(seen, SIZE, free_intrinsics=True)
+    uv, plain = typical_points(seen.uv), study.calibrated(seen, SIZE, plain=True)
+    *true, least_squares = (
+        study.ray_errors(lens, truth, uv) for lens in (given, found.lens, plain)
+    )
     stated = found.ray_error_mrad()
     value, low, high = (
         np.array([[one[name] for one in stated[lens]] for lens in ('given', 'extended')])
         for name in ('value', 'low', 'high')
     )
     offered = found.decision['lens'].say in ('use_extended', 'recalibrate')
-    return Outcome(bool(few), bool(size), offered, np.array(true), value, low, high)
+    ratios = [] if size else [_over_plain(number // 2, few, errors) for errors in BOARDS.values()]
+    return Outcome(
+        bool(few),
+        bool(size),
+        offered,
+        np.array(true),
+        value,
+        low,
+        high,
+        least_squares,
+        np.array(ratios),
+    )
+
+
+def _over_plain(seed: int, few: int, errors: BoardErrors) -> float:
+    """Return the ray error of the lens that `calibrate` writes over that by least squares."""
+    seen, truth = draw_set(seed, FEW if few else FRAMES, errors=errors)
+    ours, plain = (
+        study.ray_error(study.calibrated(seen, SIZE, plain=plain), truth, typical_points(seen.uv))
+        for plain in (False, True)
+    )
+    return ours / plain
 
 
 def report(outcomes: Sequence[Outcome], command: str) -> str:
@@ -73,7 +117,10 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
         if some:
             sides = np.mean([one.outside for one in some], axis=(0, 3))
             ratio = np.exp(np.mean([np.log(one.true / one.value) for one in some], axis=(0, 2)))
-            gain = np.exp(np.mean([np.log(one.true[1] / one.true[0]) for one in some]))
+            gains = [
+                np.exp(np.mean([np.log(after / before) for after, before in pairs]))
+                for pairs in ([(one.true[side], one.plain) for one in some] for side in (0, 1))
+            ]
             cells = [
                 cell
                 for (below, above), size in zip(sides, ratio, strict=True)
@@ -84,7 +131,7 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
                     f'{size:.2f}',
                 )
             ]
-            rows.append([name, len(some), *cells, f'{gain:.2f}'])
+            rows.append([name, len(some), *cells, *(f'{gain:.2f}' for gain in gains)])
     lines = [
         '# Coverage of ray errors',
         '',
@@ -94,7 +141,7 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
         *study.table(
             'sets | number | given: below | within | above | true / stated '
             '| extended: below | within | above | true / stated '
-            '| extended / given',
+            '| given / least squares | extended / least squares',
             rows,
         ),
     ]
@@ -115,7 +162,22 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
             f'More than 10 % worse than the lens as calibrated, of {name}: '
             f'{int((rms[:, 1] > 1.1 * rms[:, 0]).sum())} of {len(some)}.',
         ]
-    return '\n'.join([*lines, ''])
+    return '\n'.join([*lines, '', *_boards_table(outcomes), ''])
+
+
+def _boards_table(outcomes: Sequence[Outcome]) -> list[str]:
+    """Return the lines of the table of lenses by least squares and by `calibrate`."""
+    rows = []
+    for i, name in enumerate(BOARDS):
+        for few in (False, True):
+            ratios = [one.ratios[i] for one in outcomes if one.few == few and len(one.ratios)]
+            if ratios:
+                low, high = np.quantile(ratios, (0.05, 0.95))
+                mean = np.exp(np.mean(np.log(ratios)))
+                frames = '5 to 8' if few else '14 to 18'
+                rows.append([name, frames, len(ratios), f'{mean:.2f}', f'{low:.2f} to {high:.2f}'])
+    head = 'board | frames | number | calibrate / least squares | 90 % of the sets'
+    return study.table(head, rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

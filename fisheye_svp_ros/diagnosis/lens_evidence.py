@@ -273,7 +273,9 @@ def _written_rays(
         return lens if written is None else written.add_to(lens, camera)
 
     covariance = known.covariance[np.ix_(of_lens, of_lens)]
-    model, there = ray_model(extend_lens, covariance, uv, ranges, known.others[of_lens])
+    model, there = ray_model(
+        extend_lens, covariance, uv, ranges, known.others[of_lens], known.freedom
+    )
     field = None if written is None else written.fields.get(camera)
     if field is None:
         return model, there

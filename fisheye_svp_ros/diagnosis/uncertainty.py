@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy import special
 from fisheye_svp_ros.arrays import Array, Index, symmetric_root
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.model_errors import parameter_names, shared_names
-from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.diagnosis.null_model import NullModel, cluster_frames
 from fisheye_svp_ros.diagnosis.written_lens import AveragedModel, CameraField
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.mixed_model import Score, pseudo_inverse
@@ -24,6 +25,7 @@ from fisheye_svp_ros.solve.ray_errors import SAMPLES
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, with_effect
 
 _MAX_MODELS = 40
+_PRIOR_FREEDOM = 16.0  # frames that say that errors are as the model has them
 _SEED = 0
 _MIN_WEIGHT = 0.01  # probability of an effect below which it moves no ray worth counting
 _ODDS_WINDOW = 6.0  # of the criterion: odds of 20, beyond which a model counts for nothing
@@ -268,7 +270,8 @@ class LensCovariance:
     linear: the written model, with these effects at zero after its own; covariance (N, N) of all
     that it shares, by the chosen model; others (N, SAMPLES): by what they are off where another
     model is true, drawn; ratios (K,): by how much standard errors are larger than by the chosen
-    model, as frames left out say; place (K,): where what that model shares stands among the N.
+    model, as frames left out say; place (K,): where what that model shares stands among the N;
+    freedom: degrees of freedom of the size of these errors.
     """
 
     linear: Linearization
@@ -276,25 +279,36 @@ class LensCovariance:
     others: Array
     ratios: Array
     place: Index
+    freedom: float = inf
 
     @classmethod
     def from_model(
         cls, null: NullModel, averaged: AveragedModel, models: list[OtherModel] | None
     ) -> LensCovariance:
-        """Gather what is known of a written model; models: None where time matters most."""
+        """Gather what is known of a written model; models: None where time matters most.
+
+        What few frames left out say is a sample, too: it counts beside a prior that the errors are
+        as the model has them, worth `_PRIOR_FREEDOM` frames.
+        Source: Smyth, Linear models and empirical Bayes methods for assessing differential
+        expression, Statistical Applications in Genetics and Molecular Biology 3 (2004).
+        """
         own, quick = null.included_columns, models is None
         inverse = pseudo_inverse(null.information[np.ix_(own, own)], 1e-13)
         least = inverse / np.outer(null.scale[own], null.scale[own])
-        known, errors = np.sqrt(np.diag(least)), standard_errors(null, jackknife=not quick)
+        known = np.maximum(np.sqrt(np.diag(least)), 1e-300)
+        errors = np.nan_to_num(standard_errors(null, jackknife=not quick))
+        clusters = float(cluster_frames(null.linear).max())  # less one
+        freedom = clusters + _PRIOR_FREEDOM
+        squares = np.maximum(errors / known, 1.0) ** 2
+        ratios = np.sqrt((clusters * squares + _PRIOR_FREEDOM) / freedom)
         if not quick:
-            errors = np.hypot(errors, field_uncertainty(null))
-        larger = np.nan_to_num(errors) / np.maximum(known, 1e-300)
-        ratios = np.where(known > 0, np.maximum(larger, 1.0), 0.0)
+            ratios = np.hypot(ratios, np.nan_to_num(field_uncertainty(null)) / known)
+        ratios = np.where(np.diag(least) > 0, ratios, 0.0)
         rng = np.random.default_rng(_SEED)
         others = averaged.draw_shifts(rng, SAMPLES)
         covariance = np.zeros((len(others), len(others)))
         covariance[np.ix_(averaged.place, averaged.place)] = least * np.outer(ratios, ratios)
-        alone = cls(averaged.linear, covariance, others, ratios, averaged.place)
+        alone = cls(averaged.linear, covariance, others, ratios, averaged.place, freedom)
         return alone if models is None else alone.with_other_models(null, models, rng)
 
     def with_other_models(

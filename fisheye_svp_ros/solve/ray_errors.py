@@ -6,6 +6,7 @@ A change of the camera frame that is common to all ranges is a convention, and t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -48,7 +49,8 @@ class RayModel(NamedTuple):
     points (R, G, 3), m: of G image points at the ranges (R,); columns (R, G, 3, K): what each
     parameter moves them by over the range, rad, without what a motion of the camera frame does;
     covariance (K, K) of the parameters; ranges (R,), m; others (K, SAMPLES): by what they may be
-    off beside that, drawn, where this is not normal.
+    off beside that, drawn, where this is not normal; freedom: degrees of freedom of what the
+    covariance was estimated from (Student's t).
     """
 
     points: Array
@@ -56,6 +58,7 @@ class RayModel(NamedTuple):
     covariance: Array
     ranges: tuple[float, ...] = RANGES
     others: Array | None = None
+    freedom: float = inf
 
     @property
     def sd(self) -> Array:
@@ -127,7 +130,10 @@ class RayModel(NamedTuple):
         errors = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
         # Of correlations: rounding of what is large is none of what is small.
         root = errors[:, None] * symmetric_root(self.covariance / np.outer(errors, errors))
-        draws = root @ np.random.default_rng(seed).standard_normal((len(root), SAMPLES))
+        rng = np.random.default_rng(seed)
+        draws = root @ rng.standard_normal((len(root), SAMPLES))
+        if self.freedom < inf:  # the size of all errors is uncertain, and common to them
+            draws *= np.sqrt(self.freedom / rng.chisquare(self.freedom, SAMPLES))
         if self.others is not None:
             draws[: len(self.others)] += self.others
         return np.asarray(draws)
@@ -145,11 +151,12 @@ def ray_model(
     uv: Array,
     ranges: tuple[float, ...] = RANGES,
     others: Array | None = None,
+    freedom: float = inf,
 ) -> tuple[RayModel, Mask]:
     """Return how parameters move the rays of image points, and which points (G,) have rays.
 
     lens_of: makes a lens of changes (K,) of its parameters; covariance (K, K) of these; uv (G, 2),
-    px; ranges: m; others: as in `RayModel`.
+    px; ranges: m; others, freedom: as in `RayModel`.
     """
     count = len(covariance)
     base = points_on_rays(lens_of(np.zeros(count)), uv, ranges)
@@ -173,7 +180,7 @@ def ray_model(
         if sides
         else (np.zeros((*points.shape, 0)))
     )
-    model = RayModel(points, without_motion(points, moves), covariance, ranges, others)
+    model = RayModel(points, without_motion(points, moves), covariance, ranges, others, freedom)
     return model, np.asarray(there)
 
 

@@ -89,6 +89,21 @@ def test_what_another_model_says_is_far_off_in_its_share_of_the_draws() -> None:
     )
 
 
+def test_an_interval_holds_where_the_size_of_errors_is_of_few_degrees_of_freedom() -> None:
+    """With few photographs stated errors were too sure of themselves, both ways."""
+    rng, freedom = np.random.default_rng(2), 5.0
+    model, _ = ray_model(focal, np.eye(1), UV)
+    inside = []
+    for known in (np.inf, freedom):
+        found = []
+        for estimated in rng.chisquare(freedom, 400) / freedom:
+            one = model._replace(covariance=np.full((1, 1), estimated), freedom=known).errors()[1]
+            size = np.sqrt(((model.columns[1] @ rng.normal(size=1)) ** 2).sum(axis=-1).mean())
+            found.append(one.low <= size <= one.high)
+        inside.append(np.mean(found))
+    assert inside[0] < 0.92 < inside[1] < 0.98
+
+
 def test_a_viewpoint_shift_costs_more_the_nearer_the_landmark_is() -> None:
     def shifted(step: np.ndarray) -> Lens:
         return replace(LENS, viewpoint_shift=Gennery(0.0, float(step[0]), 0.0, 0.0))
