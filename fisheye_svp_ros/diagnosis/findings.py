@@ -9,11 +9,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from math import e, exp, log
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
+
+from fisheye_svp_ros.effects.terms import ModelTerm
 
 CONFIRMED_PROBABILITY = 0.95
 LIKELY_PROBABILITY = 0.5
 _MAX_SQUARE = 200.0  # of z: beyond it, the probability is 0
+_MAX_SHIFT = 0.025  # m: no lens of a machine is known to move its viewpoint by more
 
 
 class Status(Enum):
@@ -136,3 +139,62 @@ class Finding:
     def is_removal(self) -> bool:
         """Whether it was given up in the selection after it had been taken in."""
         return self.reason.is_removal
+
+
+class Evidence(Protocol):
+    """What is known of an effect in the model when it is to be confirmed; the methods take time.
+
+    cause: the effect with its values; frames: how many can be predicted from the others; z: by
+    how many of its errors over them the held-out sum of squares falls with the effect.
+    """
+
+    @property
+    def cause(self) -> ModelTerm: ...
+
+    @property
+    def frames(self) -> int: ...
+
+    @property
+    def z(self) -> float: ...
+
+    def z_of_file(self) -> float | None:
+        """Return z over the frames of a file that was held out; None without one."""
+
+    def adds_density(self) -> bool:
+        """Say whether frames left out are likelier with it, by more than the error of that."""
+
+    def find_rival(self) -> tuple[Reason | None, Rival | None]:
+        """Return which effect in the place of another cause makes it needless, and how."""
+
+
+class Doubt(NamedTuple):
+    """Why an effect in the model is no confirmed cause; z: of the frames that decide it."""
+
+    cause: ModelTerm
+    reason: Reason
+    z: float
+    rival: Rival | None = None
+
+
+def find_doubt(evidence: Evidence) -> Doubt | None:
+    """Return why an effect is no confirmed cause; None: it is one."""
+    cause, z = evidence.cause, evidence.z
+    if evidence.frames < 2:
+        return Doubt(cause, Reason.NO_OTHER_FRAME, z)
+    if z < -1:
+        return Doubt(cause, Reason.REFUTED_BY_FRAMES, z)
+    if z <= 1 and not (z > 0 and evidence.adds_density()):
+        return Doubt(cause, Reason.NO_GAIN, z)
+    z_of_file = evidence.z_of_file()
+    if z_of_file is not None and z_of_file < 0:
+        reason = Reason.REFUTED_BY_FILE if z_of_file < -1 else Reason.NO_GAIN
+        return Doubt(cause, reason, z_of_file)
+    needless, rival = evidence.find_rival()
+    if needless is not None:
+        return Doubt(cause, needless, z, rival)
+    return Doubt(cause, Reason.IMPLAUSIBLE, z) if is_implausible(cause) else None
+
+
+def is_implausible(cause: ModelTerm) -> bool:
+    """Say whether an effect is larger than in any real lens."""
+    return cause.name == 'viewpoint_shift' and bool(abs(cause.values[0]) > _MAX_SHIFT)

@@ -7,7 +7,7 @@ Before the last, causes that held-out frames refute, or another effect explains,
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,7 +36,15 @@ from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, cross_validate
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
-from fisheye_svp_ros.diagnosis.findings import Finding, Reason, Rival, Status
+from fisheye_svp_ros.diagnosis.findings import (
+    Evidence,
+    Finding,
+    Reason,
+    Rival,
+    Status,
+    find_doubt,
+    is_implausible,
+)
 from fisheye_svp_ros.diagnosis.model_errors import with_uncertainty
 from fisheye_svp_ros.diagnosis.problem import (
     DiagnosisOptions,
@@ -55,7 +63,6 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
     remaining_structure,
     significant_components,
 )
-from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.lens import Lens
@@ -63,8 +70,6 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.table_checks import ROUNDING, check_distinct, dither
 from fisheye_svp_ros.solve.measured_poses import rig_lenses
-
-_FAR_SHIFT = 0.025  # m: no lens of a machine is known to move its viewpoint by more
 
 
 def diagnose(
@@ -319,21 +324,12 @@ def _remaining(
     return [structure for structure in remaining if structure.variable not in hidden]
 
 
-class _Doubt(NamedTuple):
-    """A cause that is not confirmed; z: of what it gains on held-out frames."""
-
-    z: float
-    cause: ModelTerm
-    reason: Reason
-    rival: Rival | None
-
-
 def _weakest_cause(evaluation: Evaluation) -> tuple[ModelTerm, Finding] | None:
     """Return the cause that is confirmed least and why it is not, if there is one."""
-    doubts = list(_doubts(evaluation))
+    doubts = [doubt for part in _evidence(evaluation) if (doubt := find_doubt(part))]
     if not doubts:
         return None
-    z, cause, reason, rival = min(doubts, key=lambda doubt: doubt.z)
+    cause, reason, z, rival = min(doubts, key=lambda doubt: doubt.z)
     effect = cause.effect
     tests = EffectTests(evaluation.null)
     p_value = tests.test_removal(evaluation.null.included_columns, cause.columns, effect).p_value
@@ -348,48 +344,52 @@ def _weakest_cause(evaluation: Evaluation) -> tuple[ModelTerm, Finding] | None:
     )
 
 
-def _doubts(evaluation: Evaluation) -> Iterator[_Doubt]:
-    """Yield the causes that are not confirmed."""
+def _evidence(evaluation: Evaluation) -> Iterator[Evidence]:
+    """Yield what is known of each cause that is to be confirmed."""
     selection, null = evaluation.selection, evaluation.null
     tests, full = EffectTests(null), cross_validate(null)
     kept = full.is_predictable
-    twins = [
+    confounded = [
         (term.name, term.columns, confounded_effects(tests, term.name, term.columns))
         for term in null.terms
         if not term.effect.per_frame
     ]
-    other = None if evaluation.held_out is None else evaluation.predict()
+    predicted = None if evaluation.held_out is None else evaluation.predict()
     for cause in selection.causes:
-        effect, columns = cause.effect, cause.columns
-        if effect.name in selection.problem.options.included or effect.per_frame:
-            continue
-        z = _gain_in_sigmas(cross_validate(null, [effect.name]).take(kept), full.take(kept))
-        reason, rival = None, None
-        if len(kept) < 2:
-            reason = Reason.NO_OTHER_FRAME
-        elif z < -1:
-            reason = Reason.REFUTED_BY_FRAMES
-        elif z <= 1 and not (z > 0 and _adds_density(tests, effect, columns)):
-            reason = Reason.NO_GAIN
-        elif other is not None:
-            z_file = _gain_in_sigmas(evaluation.predict([effect.name]), other)
-            if z_file < 0:
-                reason, z = (Reason.REFUTED_BY_FILE if z_file < -1 else Reason.NO_GAIN), z_file
-        if reason is None:
-            reason, rival = find_confounder(tests, effect, columns, twins)
-        if reason is None and _is_implausible(cause):
-            reason = Reason.IMPLAUSIBLE
-        if reason is not None:
-            yield _Doubt(z, cause, reason, rival)
+        name = cause.name
+        if name not in selection.problem.options.included and not cause.effect.per_frame:
+            z = _gain_in_sigmas(cross_validate(null, [name]).take(kept), full.take(kept))
+            yield _HeldOutEvidence(cause, len(kept), z, evaluation, predicted, tests, confounded)
 
 
-def _adds_density(tests: EffectTests, effect: Effect, columns: Index) -> bool:
-    """Say whether frames left out are likelier with an effect, by more than the error of that.
+@dataclass(frozen=True)
+class _HeldOutEvidence:
+    """The `Evidence` of an evaluation for a cause.
 
-    The sum of their squares may be one frame's doing: of few frames, or where one is near.
+    predicted: the file that was held out, if any, by all causes; confounded: as of `find_rival`.
     """
-    rest = np.setdiff1d(tests.null.included_columns, columns)
-    return tests.held_out_gain(rest, columns, effect).sufficient
+
+    cause: ModelTerm
+    frames: int
+    z: float
+    evaluation: Evaluation
+    predicted: HeldOut | None
+    tests: EffectTests
+    confounded: Sequence[tuple[str, Index, list[str]]]
+
+    def z_of_file(self) -> float | None:
+        if self.predicted is None:
+            return None
+        return _gain_in_sigmas(self.evaluation.predict([self.cause.name]), self.predicted)
+
+    def adds_density(self) -> bool:
+        """See `Evidence`: the sum of squares may be one frame's doing, of few, or a near one."""
+        cause = self.cause
+        rest = np.setdiff1d(self.tests.null.included_columns, cause.columns)
+        return self.tests.held_out_gain(rest, cause.columns, cause.effect).sufficient
+
+    def find_rival(self) -> tuple[Reason | None, Rival | None]:
+        return find_rival(self.tests, self.cause, self.confounded)
 
 
 def _gain_in_sigmas(before: HeldOut, after: HeldOut) -> float:
@@ -399,25 +399,26 @@ def _gain_in_sigmas(before: HeldOut, after: HeldOut) -> float:
     return float(change.sum()) / max(error, 1e-300)
 
 
-def find_confounder(
-    tests: EffectTests,
-    effect: Effect,
-    columns: Index,
-    twins: Sequence[tuple[str, Index, list[str]]],
+def find_rival(
+    tests: EffectTests, cause: ModelTerm, confounded: Sequence[tuple[str, Index, list[str]]]
 ) -> tuple[Reason | None, Rival | None]:
-    """Return which effect in the place of another cause makes this one needless, and how."""
-    null = tests.null
-    for other, theirs, names in twins:
-        if other == effect.name or not names:
+    """Return which effect in the place of another cause makes this one needless, and how.
+
+    confounded: name, columns and confounded effects of each term of the model.
+    """
+    null, columns = tests.null, cause.columns
+    for other, theirs, names in confounded:
+        if other == cause.name or not names:
             continue
         rest = np.setdiff1d(null.included_columns, np.concatenate([columns, theirs]))
         # One with as many parameters as both causes explains nothing more simply than they do.
-        for twin in tests.likeliest_forms(rest, names, len(theirs) + len(columns) - 1):
-            beside = np.concatenate([rest, null.form_columns(twin.form)])
-            rival = Rival(twin.effect.name, other)
-            if tests.correct(effect, tests.score_beside(beside, columns).p_value) > SIGNIFICANCE:
+        for form in tests.likeliest_forms(rest, names, len(theirs) + len(columns) - 1):
+            beside = np.concatenate([rest, null.form_columns(form.form)])
+            rival = Rival(form.effect.name, other)
+            p_value = tests.score_beside(beside, columns).p_value
+            if tests.correct(cause.effect, p_value) > SIGNIFICANCE:
                 return Reason.NEEDLESS_BESIDE_RIVAL, rival
-            if not tests.held_out_gain(beside, columns, effect).sufficient:
+            if not tests.held_out_gain(beside, columns, cause.effect).sufficient:
                 return Reason.NO_GAIN_BESIDE_RIVAL, rival
     return None, None
 
@@ -425,11 +426,6 @@ def find_confounder(
 def _holds_back(candidates: Sequence[Finding]) -> bool:
     """Say whether an effect is held back for its size: frames scatter by what it leaves."""
     return any(candidate.reason is Reason.IMPLAUSIBLE for candidate in candidates)
-
-
-def _is_implausible(cause: ModelTerm) -> bool:
-    """Say whether an effect is larger than in any real lens."""
-    return cause.name == 'viewpoint_shift' and bool(abs(cause.values[0]) > _FAR_SHIFT)
 
 
 def _confirm(selection: Selection, medium: Medium | None) -> tuple[Evaluation, list[Finding]]:
@@ -443,7 +439,7 @@ def _confirm(selection: Selection, medium: Medium | None) -> tuple[Evaluation, l
         cause, finding = weakest
         candidates[cause.name] = finding
         selection = without_cause(selection, cause.name)
-        if finding.status is Status.REFUTED or _is_implausible(cause):
+        if finding.status is Status.REFUTED or is_implausible(cause):
             selection = replace(selection, refuted=(*selection.refuted, cause.name))
 
 

@@ -1,6 +1,7 @@
 """A cause stays confirmed only beside what the other causes may be mistaken for."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from helpers.water import AIR
 from fisheye_svp_ros.diagnosis import EffectTests, NullModel, Reason, Rival, diagnose
 from fisheye_svp_ros.diagnosis.causes import selected_causes
 from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain
-from fisheye_svp_ros.diagnosis.stages import find_confounder
+from fisheye_svp_ros.diagnosis.findings import Doubt, find_doubt
+from fisheye_svp_ros.diagnosis.stages import find_rival
 from fisheye_svp_ros.diagnosis.stepwise import eliminate_effects
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
@@ -110,8 +112,8 @@ def false_tilt():
 
 def confounder(tests):
     drift, tilt = tests.null.terms
-    twins = [('focal_drift', drift.columns, ['session_step'])]
-    return find_confounder(tests, tilt.effect, tilt.columns, twins)
+    confounded = [('focal_drift', drift.columns, ['session_step'])]
+    return find_rival(tests, tilt, confounded)
 
 
 def test_an_effect_with_more_parameters_takes_the_place_of_another_cause(false_tilt):
@@ -129,6 +131,41 @@ def test_a_cause_must_predict_better_beside_what_takes_the_place_of_another(
     assert confounder(false_tilt) == (None, None)
     gain = HeldOutGain(1.0, 2.0)
     assert confounder(false_tilt) == (Reason.NO_GAIN_BESIDE_RIVAL, RIVAL)
+
+
+TILT = ModelTerm(CATALOGUE['sensor_tilt'](), np.zeros(2))
+FAR = ModelTerm(ViewpointShiftEffect(), np.array([0.03]))
+
+
+@pytest.mark.parametrize(
+    ('facts', 'reason', 'z'),
+    [
+        ({'frames': 1}, Reason.NO_OTHER_FRAME, 3.0),
+        ({'z': -1.5, 'gains': True}, Reason.REFUTED_BY_FRAMES, -1.5),
+        ({'z': -0.5, 'gains': True}, Reason.NO_GAIN, -0.5),
+        ({'z': 0.5}, Reason.NO_GAIN, 0.5),
+        ({'z': 0.5, 'gains': True}, None, None),
+        ({'file': 0.5}, None, None),
+        ({'file': -0.5}, Reason.NO_GAIN, -0.5),
+        ({'file': -1.5}, Reason.REFUTED_BY_FILE, -1.5),
+        ({'rival': (Reason.NEEDLESS_BESIDE_RIVAL, RIVAL)}, Reason.NEEDLESS_BESIDE_RIVAL, 3.0),
+        ({'cause': FAR}, Reason.IMPLAUSIBLE, 3.0),
+        ({'cause': FAR, 'z': -1.5}, Reason.REFUTED_BY_FRAMES, -1.5),
+    ],
+)
+def test_a_cause_is_confirmed_unless_there_is_a_reason(facts, reason, z):
+    given = {'cause': TILT, 'frames': 9, 'z': 3.0, 'gains': False, 'file': None, **facts}
+    rival = given.get('rival', (None, None))
+    evidence = SimpleNamespace(
+        cause=given['cause'],
+        frames=given['frames'],
+        z=given['z'],
+        z_of_file=lambda: given['file'],
+        adds_density=lambda: given['gains'],
+        find_rival=lambda: rival,
+    )
+    doubt = None if reason is None else Doubt(given['cause'], reason, z, rival[1])
+    assert find_doubt(evidence) == doubt
 
 
 def test_one_frame_confirms_nothing_and_is_not_adequate():

@@ -123,7 +123,7 @@ def test_ray_errors_are_stated_at_the_range_that_is_asked_for() -> None:
 
 
 def test_a_shift_that_no_lens_can_have_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('fisheye_svp_ros.diagnosis.stages._FAR_SHIFT', 1e-3)
+    monkeypatch.setattr('fisheye_svp_ros.diagnosis.findings._MAX_SHIFT', 1e-3)
     found = diagnosed(0.006, 0.02, options=DiagnosisOptions(quick=True))
     reasons = {one.effect: one.reason for one in found.candidates}
     assert reasons['viewpoint_shift'] is Reason.IMPLAUSIBLE
