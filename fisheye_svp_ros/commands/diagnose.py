@@ -160,13 +160,13 @@ def run(args: argparse.Namespace) -> None:
     free = True if args.free == 'intrinsics' else None
     observations, lens = _read(args.observations, args, given)
     held_out = _read(args.held_out, args, given)[0] if args.held_out else None
-    names = free_parameters(rig_lenses(observations, lens), free)
     poses = None
     if args.poses:
         poses = poses_by_frame(observations, read_poses(args.poses).by_frame(), args.poses)
     other = _read(args.against, args, given)[0] if args.against else None
     if args.number and isinstance(lens, Lens):
-        check_number(args.number, observations, lens, names)
+        fitted = free_parameters(rig_lenses(observations, lens), free)
+        check_number(args.number, observations, lens, fitted)
     told: list[tuple[str, ...]] = []
     with stages('diagnosing') as progress:
 
@@ -192,16 +192,16 @@ def run(args: argparse.Namespace) -> None:
             else:
                 diagnosis = diagnose_against(observations, other, lens, **settings)
             progress('errors where the truth is known', 0.88)
-            known = known_errors(
-                diagnosis.evaluation.simulation, diagnosis.evaluation.fixed_model, names
-            )
+            evaluation = diagnosis.evaluation
+            fitted = evaluation.problem.free
+            known = known_errors(evaluation.simulation, evaluation.fixed_model, fitted)
         except (GeometryError, np.linalg.LinAlgError) as cause:
             raise _fit_error(args, cause) from cause
         wanted, impossible = _plan_next_views(args, diagnosis) if args.count else (None, None)
         if args.output:
             progress('report', 0.9)
             with write_together():
-                _write(args, diagnosis, known, bool(names), wanted)
+                _write(args, diagnosis, known, bool(fitted), wanted)
     _print(diagnosis, known, args, wanted)
     for names in told:
         print(*what_changed(names, diagnosis), sep='\n', end='', file=sys.stderr)
@@ -267,8 +267,7 @@ def _read(
     path: str, args: argparse.Namespace, given: Lenses
 ) -> tuple[Observations, Lens | dict[str, Lens]]:
     """Return the views that can be posed, and the lens of all cameras or that of each."""
-    from fisheye_svp_ros.scene.table_checks import remove_copies
-    from fisheye_svp_ros.solve.measured_poses import posable_observations
+    from fisheye_svp_ros.solve.measured_poses import usable_observations
 
     table, sizes = read_input(path, args)
     note_huge(table)
@@ -281,11 +280,10 @@ def _read(
         note_side_by_side(table, {name: (one.width, one.height) for name, one in lenses.items()})
     one = set(given) == {''} and not (given.in_file and len(table.cameras) > 1)
     lens = next(iter(lenses.values())) if one else lenses
-    observations, left_out = posable_observations(table, lens)
-    note_left_out(table, left_out)
-    observations, again = remove_copies(observations)
-    note_copies(table, again)
-    return observations, lens
+    usable = usable_observations(table, lens)
+    note_left_out(table, usable.not_posable)
+    note_copies(table, usable.copies)
+    return usable.observations, lens
 
 
 def _print(

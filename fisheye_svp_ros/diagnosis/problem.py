@@ -39,7 +39,6 @@ from fisheye_svp_ros.scene.table_checks import (
     order_cameras,
     put_right_camera_first,
     quantization_step,
-    remove_copies,
     thin_out,
 )
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
@@ -146,8 +145,10 @@ class Inputs:
         poses: dict[int, Pose] | None = None,
         held_out: Observations | None = None,
     ) -> Inputs:
-        """Return checked inputs, as `diagnose` takes them; raise ObservationError otherwise."""
-        observations, _ = remove_copies(observations)
+        """Return checked inputs, as `diagnose` takes them; raise ObservationError otherwise.
+
+        observations, held_out: as `usable_observations` returns them.
+        """
         observations.landmarks()  # each is in one place
         if poses is not None:
             observations = put_right_camera_first(observations)

@@ -85,7 +85,8 @@ def diagnose(
 ) -> Diagnosis:
     """Find what a lens's simulation gets wrong about observations.
 
-    lens: of every camera, or the lenses of a rig by camera.
+    observations: as `usable_observations` returns them; lens: of every camera, or the lenses of a
+    rig by camera.
     free_intrinsics: whether they were (or are to be) fitted; None asks the lens's `calibration`.
     poses: by frame, of the camera (of a rig: its right one), or of the flange of a robot that
     carries it, which the data tell apart; held_out: other frames of the same camera

@@ -350,11 +350,12 @@ def diagnose(
     """
     from fisheye_svp_ros.diagnosis import diagnose as find_causes
     from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
-    from fisheye_svp_ros.solve.measured_poses import posable_observations, poses_by_frame
+    from fisheye_svp_ros.solve.measured_poses import poses_by_frame, usable_observations
 
     table, known = table_and_lens(observations, lens)
-    table, _ = posable_observations(table, known)
-    test = None if held_out is None else posable_observations(*table_and_lens(held_out, known))[0]
+    table, test = usable_observations(table, known).observations, None
+    if held_out is not None:
+        test = usable_observations(*table_and_lens(held_out, known)).observations
     given = None if poses is None else poses_by_frame(table, _by_frame(poses), 'poses')
     found = find_causes(
         table,

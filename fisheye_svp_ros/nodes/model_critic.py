@@ -39,7 +39,7 @@ from fisheye_svp_ros.reporting.wording.decisions import decision_reason
 from fisheye_svp_ros.reporting.wording.diagnosis import refusal_reason
 from fisheye_svp_ros.reporting.wording.first_screen import first_screen, terminal_lines
 from fisheye_svp_ros.scene.observations import STEREO, Observations
-from fisheye_svp_ros.solve.measured_poses import posable_observations
+from fisheye_svp_ros.solve.measured_poses import usable_observations
 from fisheye_svp_ros.study.settings import RigSettings
 
 T = TypeVar('T')
@@ -300,8 +300,8 @@ class ModelCritic(SolverNode):
 
 def judge(table: Observations, lens: Lens, free_intrinsics: bool) -> Diagnosis:
     """Diagnose the frames that can be posed; raise FisheyeSvpError where none can."""
-    usable, _ = posable_observations(table, lens)
-    return diagnose(usable, lens, free_intrinsics=free_intrinsics)
+    usable = usable_observations(table, lens)
+    return diagnose(usable.observations, lens, free_intrinsics=free_intrinsics)
 
 
 def _lines(found: Diagnosis) -> list[str]:

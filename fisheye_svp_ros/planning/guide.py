@@ -28,7 +28,7 @@ from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.simulate.simulation import blank_views
 from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.measured_poses import posable_observations
+from fisheye_svp_ros.solve.measured_poses import usable_observations
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 MAX_PHOTOGRAPHS = 40  # photographs; with so many what is still open stays open
@@ -110,7 +110,7 @@ def _evaluate(session: Session) -> SessionState:
     session = replace(session, latest=(lens, float(shift[0])))
     if len(session.taken) >= _MIN_DIAGNOSED:
         with suppress(FisheyeSvpError):  # the next photograph may mend it
-            return _diagnose_session(session, posable_observations(table, lens)[0], lens)
+            return _diagnose_session(session, usable_observations(table, lens).observations, lens)
     wanted = next_photographs(linear, (), _noise(linear), _VIEWS_AHEAD, number, room)
     return _session_state(
         session, _model(linear), wanted, _value(linear, number), wanted.answers[0]

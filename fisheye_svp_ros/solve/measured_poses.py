@@ -13,6 +13,7 @@ from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
+from fisheye_svp_ros.scene.table_checks import remove_copies
 from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization, localize
 from fisheye_svp_ros.solve.outliers import WrongLandmark
 from fisheye_svp_ros.solve.reliability import examine
@@ -125,6 +126,23 @@ def rig_lenses(observations: Observations, lens: Lens | Mapping[str, Lens]) -> d
     if missing:
         raise ObservationError(f'{observations.source}: camera {missing[0]!r} has no lens')
     return {name: lens[name] for name in observations.cameras}
+
+
+class UsableObservations(NamedTuple):
+    """The rows that a diagnosis is asked about; the frames that have others, for either reason."""
+
+    observations: Observations
+    not_posable: tuple[int, ...]
+    copies: tuple[int, ...]
+
+
+def usable_observations(
+    observations: Observations, lens: Lens | Mapping[str, Lens]
+) -> UsableObservations:
+    """Return the views that fix a pose and repeat no earlier frame; raise what either does."""
+    posable, left_out = posable_observations(observations, lens)
+    distinct, copies = remove_copies(posable)
+    return UsableObservations(distinct, left_out, copies)
 
 
 def posable_observations(

@@ -15,6 +15,7 @@ from fisheye_svp_ros.library import functions as library
 from fisheye_svp_ros.scene.table_checks import too_exact
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.measured_poses import usable_observations
 from fisheye_svp_ros.solve.rig_state import group_by_frame
 
 SIZE = (LENS.width, LENS.height)
@@ -53,6 +54,18 @@ def test_a_sigma_that_no_detector_has_is_refused(sigma, tmp_path):
 def test_copies_of_one_frame_are_told():
     with pytest.raises(ObservationError, match='4 frames repeat the image points of frame 0'):
         library.calibrate(copied(5), 'equidistant', SIZE)
+
+
+def test_what_cannot_be_posed_and_what_is_there_twice_is_left_out_by_one_step():
+    rows = table()
+    few = (rows.frame == 4) & (rows.landmark > 2)
+    rows = rows.take(~few)
+    rows = replace(rows, frame=np.where(rows.frame == 5, 7, rows.frame))
+    both = rows.take(np.concatenate([np.arange(len(rows)), np.flatnonzero(rows.frame == 2)]))
+    frame = np.where(np.arange(len(both)) < len(rows), both.frame, 9)
+    usable = usable_observations(replace(both, frame=frame), LENS)
+    assert usable.not_posable == (4,) and usable.copies == (9,)
+    assert usable.observations.frames.tolist() == [0, 1, 2, 3, 7]
 
 
 def test_a_state_without_an_image_of_some_points_is_refused():
