@@ -43,7 +43,7 @@ from fisheye_svp_ros.planning.guide import (
 from fisheye_svp_ros.planning.optimal_design import FlatBoard
 from fisheye_svp_ros.planning.plan import nominal_lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector, vector_from_rotation
-from fisheye_svp_ros.reporting.shot_list import draw_guide
+from fisheye_svp_ros.reporting.shot_plots import draw_guide
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.solve.localization import localize

@@ -43,15 +43,18 @@ from fisheye_svp_ros.io.rig_files import check_camera_names, save_rig
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import quaternion_from_rotation
-from fisheye_svp_ros.reporting.calibration_text import (
+from fisheye_svp_ros.reporting.calibrated_camera import (
     ROBOT_HEADER,
-    STANDARD_ERRORS,
     CalibratedCamera,
     hand_eye_rows,
-    hand_eye_sentence,
 )
 from fisheye_svp_ros.reporting.terminal import print_table, progress, stages
-from fisheye_svp_ros.reporting.wording.calibration import estimate_sentence
+from fisheye_svp_ros.reporting.wording.calibration import (
+    STANDARD_ERRORS,
+    calibration_warnings,
+    estimate_sentence,
+    hand_eye_sentence,
+)
 from fisheye_svp_ros.scene.observations import Observations, list_frames, rig_cameras
 from fisheye_svp_ros.scene.table_checks import check_frames_differ, remove_copies
 from fisheye_svp_ros.solve.lens_calibration import (
@@ -177,7 +180,7 @@ def run(args: argparse.Namespace) -> None:
                 write_rig(rig, args.output)
     for one in found.values():
         _print(one)
-        for warning in one.warnings:
+        for warning in calibration_warnings(one):
             say(warning)
     if args.output:
         print(f'{", ".join(map(str, paths.values()))}; report: {report}')
@@ -339,7 +342,7 @@ def _document(found: CalibratedCamera) -> dict[str, Any]:
             zip(adjusted.names, parameter_values(adjusted.lens, adjusted.names), strict=True)
         ),
         'admissible': {name: asdict(range_) for name, range_ in found.trust.admissible.items()},
-        'warnings': list(found.warnings),
+        'warnings': list(calibration_warnings(found)),
     }
 
 

@@ -309,13 +309,13 @@ def _print(
         ]
     )
     if wanted:
-        from fisheye_svp_ros.reporting import shot_list
+        from fisheye_svp_ros.reporting.wording import shots
 
         print_table(
-            f'photographs to take next, {shot_list.purpose(wanted)}',
-            shot_list.HEADER,
-            shot_list.rows(wanted),
-            words=shot_list.TEXT_COLUMNS,
+            f'photographs to take next, {shots.purpose(wanted)}',
+            shots.HEADER,
+            shots.rows(wanted),
+            words=shots.TEXT_COLUMNS,
         )
     if args.output:
         files = ['report.html', 'diagnosis.json']

@@ -88,8 +88,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Choose, print, draw."""
     from fisheye_svp_ros.planning.plan import plan
-    from fisheye_svp_ros.reporting import shot_list
+    from fisheye_svp_ros.reporting.shot_plots import draw_shots
     from fisheye_svp_ros.reporting.terminal import UNITS, print_table
+    from fisheye_svp_ros.reporting.wording import shots
 
     if not args.noise > 0:
         raise ParameterError('--noise must be above 0')
@@ -100,7 +101,7 @@ def run(args: argparse.Namespace) -> None:
     wanted = planned.wanted
     if args.output:
         with write_together():
-            shot_list.draw_shots(args.output / 'plan.pdf', ForwardModel(lens), wanted)
+            draw_shots(args.output / 'plan.pdf', ForwardModel(lens), wanted)
             write_poses(
                 args.output / 'poses.csv',
                 np.arange(len(wanted.shots.distance)),
@@ -111,10 +112,10 @@ def run(args: argparse.Namespace) -> None:
                 {'photographs': wanted.to_list(), 'stderr': planned.stderr},
             )
     print_table(
-        f'{lens.name}, {pattern.spec}: photographs to take, {shot_list.purpose(wanted)}',
-        shot_list.HEADER,
-        shot_list.rows(wanted),
-        words=shot_list.TEXT_COLUMNS,
+        f'{lens.name}, {pattern.spec}: photographs to take, {shots.purpose(wanted)}',
+        shots.HEADER,
+        shots.rows(wanted),
+        words=shots.TEXT_COLUMNS,
     )
     print(
         '  expected standard errors: '

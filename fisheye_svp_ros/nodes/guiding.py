@@ -39,7 +39,8 @@ from fisheye_svp_ros.planning.guide import (
     start_session,
 )
 from fisheye_svp_ros.planning.plan import nominal_lens
-from fisheye_svp_ros.reporting.shot_list import draw_guide, guide_words
+from fisheye_svp_ros.reporting.shot_plots import draw_guide
+from fisheye_svp_ros.reporting.wording.shots import guide_words
 
 _PLANNING_TIMEOUT = 60.0  # s, to choose the next photograph
 _PICTURES = QoSProfile(depth=2)

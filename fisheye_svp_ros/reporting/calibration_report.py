@@ -13,9 +13,13 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.reporting.blocks import page, png_uri
-from fisheye_svp_ros.reporting.calibration_text import STANDARD_ERRORS, CalibratedCamera
+from fisheye_svp_ros.reporting.calibrated_camera import CalibratedCamera
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, drawing, round_number
-from fisheye_svp_ros.reporting.wording.calibration import estimate_sentence
+from fisheye_svp_ros.reporting.wording.calibration import (
+    STANDARD_ERRORS,
+    calibration_warnings,
+    estimate_sentence,
+)
 from fisheye_svp_ros.scene.observations import frame_name
 from fisheye_svp_ros.solve.ray_errors import RANGES, RayModel, ray_model, typical_points
 
@@ -55,7 +59,7 @@ def _camera(name: str, camera: CalibratedCamera) -> dict[str, Any]:
         'rms': figures['rms_px'],
         'estimate': estimate_sentence(figures),
         'noise': camera.result.sigma,
-        'warnings': camera.warnings,
+        'warnings': calibration_warnings(camera),
         'rows': camera.parameter_rows(),
         'ranged': any(row[3] for row in camera.parameter_rows()),
         'reached': float(np.degrees(camera.result.reached)),

@@ -13,10 +13,11 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.planning.plan import NextViews
-from fisheye_svp_ros.reporting import shot_list
 from fisheye_svp_ros.reporting.blocks import data_uri, page
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, PointResiduals, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
+from fisheye_svp_ros.reporting.shot_plots import draw_shots
+from fisheye_svp_ros.reporting.wording import shots
 from fisheye_svp_ros.reporting.wording.advice import separation
 from fisheye_svp_ros.reporting.wording.causes import (
     bare_probability,
@@ -30,6 +31,7 @@ from fisheye_svp_ros.reporting.wording.causes import (
     uncertainty_rows,
 )
 from fisheye_svp_ros.reporting.wording.diagnosis import (
+    CAPTIONS,
     STAGE_WORDS,
     VARIABLES,
     advice_text,
@@ -54,21 +56,6 @@ from fisheye_svp_ros.reporting.wording.next_steps import (
     follow_up_files,
 )
 
-_CAPTIONS = {
-    'field': 'Residual vectors over the image; the scale is above each panel; dotted: equal '
-    'incidence angle. Above: single points. Below: means over cells of the image, which '
-    'show errors common to all frames.',
-    'theta': 'Residuals against the incidence angle, along the radius from the principal point '
-    '(above) and across it (below).',
-    'range': 'Residuals against the distance of the landmark. If the viewpoint of the lens moves, '
-    'the radial residuals change with the distance.',
-    'landmark': 'Residuals of each landmark. One that stands out is displaced.',
-    'frame': 'Residuals of each frame. A step or a drift indicates a change of the camera.',
-    'phase': 'Residuals against the fractional part of the image point. Waves come from the '
-    'detector.',
-    'histogram': 'Residuals divided by the noise; the end bins include all beyond 6. Wide tails '
-    'are outliers, or noise that varies.',
-}
 _PICTURE_OF = {
     'image': 'field',
     'theta': 'theta',
@@ -104,7 +91,7 @@ def write_report(
     if wanted is not None:
         pictures.append(inputs.folder / 'next.png')
         state = diagnosis.evaluation.fixed_model.state
-        shot_list.draw_shots(pictures[-1], ForwardModel(state.lens, state.terms), wanted)
+        draw_shots(pictures[-1], ForwardModel(state.lens, state.terms), wanted)
     report = inputs.folder / 'report.html'
     write_text(
         report,
@@ -125,7 +112,7 @@ def write_report(
                 'next': None,
                 **{p.stem: data_uri(p) for p in pictures},
             },
-            shown=_CAPTIONS.items(),
+            shown=CAPTIONS.items(),
             **_causes(diagnosis),
             **_budget(diagnosis),
             **_evidence(diagnosis),
@@ -133,9 +120,9 @@ def write_report(
             next={}
             if wanted is None
             else {
-                'purpose': shot_list.purpose(wanted),
-                'header': shot_list.HEADER,
-                'rows': shot_list.rows(wanted),
+                'purpose': shots.purpose(wanted),
+                'header': shots.HEADER,
+                'rows': shots.rows(wanted),
             },
             uncertainty=list(uncertainty_rows(diagnosis)),
             known=list(known_rows(diagnosis, known)),

@@ -29,7 +29,7 @@ from fisheye_svp_ros.planning.optimal_design import (
 )
 from fisheye_svp_ros.planning.plan import next_photographs, plan
 from fisheye_svp_ros.pose import rotation_from_vector
-from fisheye_svp_ros.reporting.shot_list import instruction, purpose, rows
+from fisheye_svp_ros.reporting.wording.shots import instruction, purpose, rows
 from fisheye_svp_ros.scene.observations import Landmarks, make_observations
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.bundle_adjustment import adjust

@@ -5,7 +5,8 @@ import pytest
 from helpers.guide import POINTS, session
 
 from fisheye_svp_ros.planning.guide import DetectedBoard, Guide, evaluate_session
-from fisheye_svp_ros.reporting.shot_list import draw_guide, guide_words
+from fisheye_svp_ros.reporting.shot_plots import draw_guide
+from fisheye_svp_ros.reporting.wording.shots import guide_words
 
 GREEN, ORANGE = np.array([80, 200, 80]), np.array([40, 123, 224])
 

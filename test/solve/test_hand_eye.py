@@ -11,11 +11,8 @@ from helpers.robot import LENS, TRUTH, robot
 
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
-from fisheye_svp_ros.reporting.calibration_text import (
-    hand_eye_rows,
-    hand_eye_sentence,
-    hand_eye_warnings,
-)
+from fisheye_svp_ros.reporting.calibrated_camera import hand_eye_rows
+from fisheye_svp_ros.reporting.wording.calibration import hand_eye_sentence, hand_eye_warnings
 from fisheye_svp_ros.solve.hand_eye import (
     MAX_ODDS,
     HandEye,

@@ -1,11 +1,29 @@
-"""What a calibration says of its estimate: why its residual is not the least there is."""
+"""A calibration in sentences: its estimate, its lens, the robot that carried the camera."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from fisheye_svp_ros.scene.observations import list_frames
+from fisheye_svp_ros.solve.hand_eye import MAX_ODDS, HandEye
+from fisheye_svp_ros.solve.lens_checks import image_coverage, is_no_fit
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.reporting.calibrated_camera import CalibratedCamera
+
+STANDARD_ERRORS = (
+    'standard errors include local errors of target, frames and image, and the '
+    'shape and scale of the target'
+)
 _WORTH_SAYING = 1.001  # residuals over those of least squares
+_MODEL_ERROR_RATIO = 2.0  # times the noise, from which residuals show a model error
+_LARGE_SHARE = 0.5  # of the squares of all frames: such a pose is wrong
+_MIN_FRAMES = 6
+_MAX_SCALE = 2.0  # of lengths, either way: more is another unit, or the size of another board
+_MIN_MM = 100.0  # such a factor, too large for a mistaken board, is that of mm
 
 
 def estimate_sentence(figures: Mapping[str, Any]) -> str:
@@ -20,3 +38,108 @@ def estimate_sentence(figures: Mapping[str, Any]) -> str:
         f'rms {figures["rms_px"]:.4f} px on the board as stated, {least:.4f} px by least squares, '
         'which bends the lens to errors of the board (--plain writes that lens)'
     )
+
+
+def calibration_warnings(camera: CalibratedCamera) -> tuple[str, ...]:
+    """Return what there is to say against a lens, a sentence each."""
+    shifts = [
+        f'{name} is undetermined: {1e3 * limits.low:.2f} to {1e3 * limits.high:.2f} mm, since '
+        'the shape of the target is confounded with it; run `fisheye-svp diagnose`'
+        for name, limits in camera.trust.doubtful_shift.items()
+    ]
+    return (
+        *shifts,
+        *_fit_warnings(camera),
+        *_image_warnings(camera),
+        *(hand_eye_warnings(camera.hand_eye) if camera.hand_eye else ()),
+    )
+
+
+def _fit_warnings(camera: CalibratedCamera) -> list[str]:
+    texts, result = [], camera.result
+    if result.left_out:
+        texts.append(
+            'left out, their points do not determine a pose (all near one line, or '
+            f'of another lens?): {list_frames(camera.table, result.left_out)}'
+        )
+    if not result.adjusted.converged:
+        texts.append(
+            'the adjustment has not converged, so the lens is inaccurate; take more '
+            'photographs, or check these'
+        )
+    rms, sigma = (camera.lens.calibration or {})['rms_px'], float(np.median(camera.table.sigma))
+    if is_no_fit(rms, sigma):
+        texts.append(
+            f'{camera.model} leaves {rms:.1f} px: the model does not fit this lens, or '
+            'image points and landmarks do not match (check order, units, axes, '
+            'image size)'
+        )
+    elif np.isfinite(sigma) and rms > _MODEL_ERROR_RATIO * 2**0.5 * sigma:
+        texts.append(
+            f'{rms:.2g} px are {rms / sigma / 2**0.5:.1f} times the noise of image '
+            'points: lens or target has a model error; run `fisheye-svp diagnose`'
+        )
+    if result.beyond:
+        texts.append(
+            f'{result.beyond} observations lie beyond max_incidence_deg, where the '
+            'fitted curve stops growing; try another --model'
+        )
+    return texts
+
+
+def _image_warnings(camera: CalibratedCamera) -> list[str]:
+    """Say where the image of the lens lies askew, or was not covered."""
+    views, texts = camera.result.views, []
+    image = image_coverage(camera.lens, views.uv[views.used])
+    if image.is_off_center:
+        texts.append(
+            f'the principal point lies {image.offset[0]:.0f}, {image.offset[1]:.0f} px off '
+            'the center of the image; check the image size, and that images are not cropped'
+        )
+    if image.is_extrapolated:
+        texts.append(
+            f'the curve is extrapolated beyond {np.degrees(camera.result.reached):.0f} deg: '
+            f'image points reach {image.radius:.0f} px from the center, the nearest edge is '
+            f'at {image.edge:.0f} px; photograph the target near the edges too'
+        )
+    return texts
+
+
+def hand_eye_sentence(found: HandEye) -> str:
+    """Return how many poses there are, what the flange carries, the robot's noise, the scale."""
+    scale, error = found.scale, found.stderr[-1]
+    carried = 'target, the camera is fixed' if found.fixed_camera else 'camera'
+    sure = '' if found.odds < MAX_ODDS else 'more than '
+    return (
+        f'{len(found.frame)} poses of the flange, which carries the {carried} (odds '
+        f'{sure}{found.odds:.3g} to 1); noise of the robot '
+        f'{1e3 * found.noise_m:.3f} mm and {np.degrees(found.noise_rad):.4f} deg an axis; '
+        f'lengths of the target are {scale:.5f} ± {error:.5f} times those of the robot'
+    )
+
+
+def hand_eye_warnings(found: HandEye) -> list[str]:
+    """Return what there is to say against the poses."""
+    warnings, factor = [], max(found.scale, 1 / found.scale)
+    if found.fixed_camera:
+        warnings.append(
+            'the poses are those of a flange that carries the target before a fixed camera; if it '
+            'carries the camera, they are inverted: give the flange in the base'
+        )
+    if factor > _MAX_SCALE:
+        longer = 'the poses' if found.scale < 1 else 'the target'
+        likely = f': {longer} may be in mm' if factor > _MIN_MM else ''
+        warnings.append(
+            f'lengths of robot and target differ by a factor of {factor:.4g}{likely}; '
+            'both are needed in m'
+        )
+    noise = np.repeat((found.noise_m, found.noise_rad), 3)
+    squares = ((found.residual / noise) ** 2).sum(axis=1)
+    worst = int(np.argmax(squares))
+    if len(squares) >= _MIN_FRAMES and squares[worst] >= _LARGE_SHARE * squares.sum():
+        off, turn = np.linalg.norm(found.residual[worst].reshape(2, 3), axis=1)
+        warnings.append(
+            f'the pose of frame {found.frame[worst]} is {1e3 * off:.1f} mm and '
+            f'{np.degrees(turn):.2f} deg off the others: correct it, or remove it from the poses'
+        )
+    return warnings

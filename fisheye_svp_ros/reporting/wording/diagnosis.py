@@ -29,6 +29,21 @@ from fisheye_svp_ros.reporting.wording.findings import pixels, with_odds
 from fisheye_svp_ros.scene.observations import frame_name
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
 
+CAPTIONS = {
+    'field': 'Residual vectors over the image; the scale is above each panel; dotted: equal '
+    'incidence angle. Above: single points. Below: means over cells of the image, which '
+    'show errors common to all frames.',
+    'theta': 'Residuals against the incidence angle, along the radius from the principal point '
+    '(above) and across it (below).',
+    'range': 'Residuals against the distance of the landmark. If the viewpoint of the lens moves, '
+    'the radial residuals change with the distance.',
+    'landmark': 'Residuals of each landmark. One that stands out is displaced.',
+    'frame': 'Residuals of each frame. A step or a drift indicates a change of the camera.',
+    'phase': 'Residuals against the fractional part of the image point. Waves come from the '
+    'detector.',
+    'histogram': 'Residuals divided by the noise; the end bins include all beyond 6. Wide tails '
+    'are outliers, or noise that varies.',
+}
 LENS_FILE = 'extended_lens.yaml'
 LENS = {
     'keep': 'Keep the lens',
