@@ -52,12 +52,12 @@ def __getattr__(name: str) -> _Any:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     if not _HOMES[name]:  # a room that can be called
         return _import_module(f'{__name__}.{name}')
-    found = getattr(_import_module(f'{__name__}.{_HOMES[name]}'), name)
-    if not isinstance(found, type):
+    value = getattr(_import_module(f'{__name__}.{_HOMES[name]}'), name)
+    if not isinstance(value, type):
         from fisheye_svp_ros.errors import only_own_errors
 
-        found = only_own_errors(found)
-    return globals().setdefault(name, found)
+        value = only_own_errors(value)
+    return globals().setdefault(name, value)
 
 
 def __dir__() -> list[str]:

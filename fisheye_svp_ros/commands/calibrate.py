@@ -305,16 +305,16 @@ def _calibrate_camera(
     )
 
 
-def _print(found: CalibratedCamera) -> None:
-    lens, figures = found.lens, found.lens.calibration or {}
-    open_ones = any(row[3] for row in found.parameter_rows())
+def _print(camera: CalibratedCamera) -> None:
+    lens, figures = camera.lens, camera.lens.calibration or {}
+    open_ones = any(row[3] for row in camera.parameter_rows())
     print_table(
         f'{lens.name}: {figures["observations"]} points in {figures["frames"]} frames, '
         f'rms {figures["rms_px"]:.4f} px',
         ('parameter', 'value', 'std. error', *(['with any target'] if open_ones else []), 'unit'),
         [
             (name, value, error, *([range_] if open_ones else []), unit)
-            for name, value, error, range_, unit in found.parameter_rows()
+            for name, value, error, range_, unit in camera.parameter_rows()
         ],
     )
     if sentence := estimate_sentence(figures):
@@ -323,26 +323,28 @@ def _print(found: CalibratedCamera) -> None:
         print('  with any target: 95 %, with shape, scale and boards of the target estimated too')
     print(
         f'  max_incidence_deg {np.degrees(lens.max_incidence):.2f}, image points up to '
-        f'{np.degrees(found.result.reached):.2f}; {STANDARD_ERRORS}'
+        f'{np.degrees(camera.result.reached):.2f}; {STANDARD_ERRORS}'
     )
-    if found.hand_eye:
-        print_table(hand_eye_sentence(found.hand_eye), ROBOT_HEADER, hand_eye_rows(found.hand_eye))
+    if camera.hand_eye:
+        print_table(
+            hand_eye_sentence(camera.hand_eye), ROBOT_HEADER, hand_eye_rows(camera.hand_eye)
+        )
 
 
-def _document(found: CalibratedCamera) -> dict[str, Any]:
+def _document(camera: CalibratedCamera) -> dict[str, Any]:
     """Return what scripts may want beside the lens itself; its errors are those of the lens."""
-    adjusted = found.result.adjusted
+    adjusted = camera.result.adjusted
     return {
-        **(found.lens.calibration or {}),
-        'left_out': found.result.left_out,
-        'beyond': found.result.beyond,
-        'sigma_px': found.result.sigma,
-        'wrong_landmarks': [landmark.to_dict() for landmark in found.wrong_landmarks],
+        **(camera.lens.calibration or {}),
+        'left_out': camera.result.left_out,
+        'beyond': camera.result.beyond,
+        'sigma_px': camera.result.sigma,
+        'wrong_landmarks': [landmark.to_dict() for landmark in camera.wrong_landmarks],
         'parameters': dict(
             zip(adjusted.names, parameter_values(adjusted.lens, adjusted.names), strict=True)
         ),
-        'admissible': {name: asdict(range_) for name, range_ in found.trust.admissible.items()},
-        'warnings': list(calibration_warnings(found)),
+        'admissible': {name: asdict(range_) for name, range_ in camera.trust.admissible.items()},
+        'warnings': list(calibration_warnings(camera)),
     }
 
 
@@ -390,13 +392,13 @@ def fit_rig(table: Observations, lenses: Mapping[str, Lens]) -> RigCalibration |
                 )
         if len(largest) < 2:
             return None
-        found = calibrate_rig(table, lenses, rig_cameras(largest) or largest)
+        calibration = calibrate_rig(table, lenses, rig_cameras(largest) or largest)
     except FisheyeSvpError as cause:
         say(f'rig: {cause}')
         return None
-    for warning in _warnings(found, table, lenses):
+    for warning in _warnings(calibration, table, lenses):
         say(f'rig: {warning}')
-    return found
+    return calibration
 
 
 def _warnings(
@@ -432,77 +434,82 @@ def _warnings(
                 return
 
 
-def write_rig(found: RigCalibration, folder: Path) -> None:
+def write_rig(calibration: RigCalibration, folder: Path) -> None:
     """Write a rig as tools read it, its lenses apart."""
-    save_rig(found.steps(), folder / 'rig.yaml', found.cameras)
-    turns = quaternion_from_rotation(found.rig.rotation)
+    save_rig(calibration.steps(), folder / 'rig.yaml', calibration.cameras)
+    turns = quaternion_from_rotation(calibration.rig.rotation)
     write_json(
         folder / 'rig.json',
         {  # cameras in the first one, with covariances
-            'frame': found.cameras[0],
-            'frames': len(found.frame),
-            'sigma_px': found.sigma_px,
-            'left_out': list(found.left_out),
+            'frame': calibration.cameras[0],
+            'frames': len(calibration.frame),
+            'sigma_px': calibration.sigma_px,
+            'left_out': list(calibration.left_out),
             'cameras': {
                 name: {
-                    'position': found.rig.position[i].tolist(),
+                    'position': calibration.rig.position[i].tolist(),
                     'quaternion': turns[i].tolist(),
-                    'covariance': found.covariance[i - 1].tolist() if i else None,
-                    'rms_px': float(found.rms_px[i]),
-                    'frames': int(found.shared[i]),
-                    'board': found.boards[i] if found.boards else 0,
+                    'covariance': calibration.covariance[i - 1].tolist() if i else None,
+                    'rms_px': float(calibration.rms_px[i]),
+                    'frames': int(calibration.shared[i]),
+                    'board': calibration.boards[i] if calibration.boards else 0,
                 }
-                for i, name in enumerate(found.cameras)
+                for i, name in enumerate(calibration.cameras)
             },
         },
     )
-    write_text(folder / 'rig.urdf', transforms.urdf_text(found.cameras, found.rig))
+    write_text(folder / 'rig.urdf', transforms.urdf_text(calibration.cameras, calibration.rig))
     write_text(
-        folder / 'tf_static.yaml', transforms.static_transforms_text(found.cameras, found.rig)
+        folder / 'tf_static.yaml',
+        transforms.static_transforms_text(calibration.cameras, calibration.rig),
     )
     try:
-        write_text(folder / 'camchain.yaml', kalibr.write_chain(found.lenses, found.steps()))
-        for lens in found.lenses:
+        write_text(
+            folder / 'camchain.yaml', kalibr.write_chain(calibration.lenses, calibration.steps())
+        )
+        for lens in calibration.lenses:
             note_reader_limit(lens, 'kalibr')
     except FisheyeSvpError as cause:
         say(f'camchain.yaml of Kalibr is not written: {cause}')
 
 
-def print_rig(found: RigCalibration) -> None:
+def print_rig(calibration: RigCalibration) -> None:
     """Print a rig."""
-    if len(found.cameras) == 2:
-        x, y, z = 1000 * found.steps()[0].position
+    if len(calibration.cameras) == 2:
+        x, y, z = 1000 * calibration.steps()[0].position
         print(
-            f'rig: camera {found.cameras[0]} in {found.cameras[1]} at {x:.3f}, '
-            f'{y:.3f}, {z:.3f} mm, from {len(found.frame)} frames, '
-            f'rms {found.total_rms_px:.4f} px'
+            f'rig: camera {calibration.cameras[0]} in {calibration.cameras[1]} at {x:.3f}, '
+            f'{y:.3f}, {z:.3f} mm, from {len(calibration.frame)} frames, '
+            f'rms {calibration.total_rms_px:.4f} px'
         )
-    if found.boards:
+    if calibration.boards:
         each = [
             ' and '.join(
                 name
-                for name, board in zip(found.cameras, found.boards, strict=True)
+                for name, board in zip(calibration.cameras, calibration.boards, strict=True)
                 if board == one
             )
-            for one in sorted(set(found.boards))
+            for one in sorted(set(calibration.boards))
         ]
         print(
             'rig: boards apart, related by the motion of the rig: one seen by '
             f'{", another by ".join(each)}'
         )
-    sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    sigma = np.sqrt(np.diagonal(calibration.covariance, axis1=1, axis2=2))
     rows = []
-    for i, name in enumerate(found.cameras):
-        place = [f'{1e3 * value:.3f}' for value in found.rig.position[i]]
+    for i, name in enumerate(calibration.cameras):
+        place = [f'{1e3 * value:.3f}' for value in calibration.rig.position[i]]
         error = (
             (f'{1e3 * sigma[i - 1, :3].max():.3f}', f'{np.degrees(sigma[i - 1, 3:].max()):.4f}')
             if i
             else ('', '')
         )
-        rows.append((name, *place, *error, str(found.shared[i]), f'{found.rms_px[i]:.4f}'))
+        rows.append(
+            (name, *place, *error, str(calibration.shared[i]), f'{calibration.rms_px[i]:.4f}')
+        )
     print_table(
-        f'rig: cameras in {found.cameras[0]}, from {len(found.frame)} frames that several '
-        'cameras see',
+        f'rig: cameras in {calibration.cameras[0]}, from {len(calibration.frame)} frames that '
+        'several cameras see',
         ('camera', 'x, mm', 'y, mm', 'z, mm', '±, mm', '±, deg', 'frames', 'rms, px'),
         rows,
     )

@@ -315,16 +315,16 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
             f'{len(unknown)} photographs have centers of unknown sigma, since no lens fits each '
             f'by itself: {", ".join(unknown[:_MAX_LISTED])}{more}'
         )
-    found = sum(one.points is not None for one in detection.searched)
+    detected = sum(one.points is not None for one in detection.searched)
     larger = sum(LARGER_BOARD in one.notes for one in detection.searched)
-    if larger and larger >= _MIN_LARGER_SHARE * found:
+    if larger and larger >= _MIN_LARGER_SHARE * detected:
         say(
-            f'{larger} of {found} boards look larger than {args.board}; count its inner corners '
-            'again, otherwise photographs may number different corners alike'
+            f'{larger} of {detected} boards look larger than {args.board}; count its inner '
+            'corners again, otherwise photographs may number different corners alike'
         )
     _note_tags(detection, pattern)
     note_side_by_side(detection.observations, detection.image_sizes)
-    if 2 * found < len(detection.searched):
+    if 2 * detected < len(detection.searched):
         counted = ' (inner corners)' if pattern.kind == 'chessboard' else ''
         say(f'no {args.board} in most photographs; check kind and size{counted} of the board')
     return detection

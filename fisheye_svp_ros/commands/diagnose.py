@@ -305,7 +305,7 @@ def _print(
             *terminal_lines(
                 first_screen(diagnosis, args.observations, known), command if args.output else ''
             ),
-            *(f'{one.title}: {one.sentence}' for one in sections(diagnosis)),
+            *(f'{section.title}: {section.sentence}' for section in sections(diagnosis)),
         ]
     )
     if wanted:

@@ -127,17 +127,17 @@ def _localize_rig(
     """Localize every frame of a rig, print the poses of its first camera, write the results."""
     cameras, places = load_cameras(args.rig)
     with progress('localizing'):
-        found = localize_rig(table, lenses, cameras, places)
+        solution = localize_rig(table, lenses, cameras, places)
     for camera, (name, lens) in enumerate(lenses.items()):
         note_extrapolated(name, lens, table.uv[table.camera == camera])
-    note_left_out(table, found.left_out)
-    note_gross_errors(found.table, found.outliers)
-    if found.contradicted:
+    note_left_out(table, solution.left_out)
+    note_gross_errors(solution.table, solution.outliers)
+    if solution.contradicted:
         say(f'{args.rig}: the relative poses of the cameras differ; calibrate the rig again')
     if args.output:
         with write_together():
-            _write_rig(args.output, cameras, found)
-    _print_rig(table, cameras, found)
+            _write_rig(args.output, cameras, solution)
+    _print_rig(table, cameras, solution)
 
 
 def _print(
@@ -161,22 +161,24 @@ def _print(
     )
 
 
-def _print_rig(table: Observations, cameras: tuple[str, ...], found: RigLocalization) -> None:
-    data, labels, rms = found.data, [], []
-    for i, frame in enumerate(found.frame[:_MAX_ROWS].tolist()):
+def _print_rig(
+    table: Observations, cameras: tuple[str, ...], localization: RigLocalization
+) -> None:
+    data, labels, rms = localization.data, [], []
+    for i, frame in enumerate(localization.frame[:_MAX_ROWS].tolist()):
         mine = data.frame_of == i
-        names = [found.table.cameras[camera] for camera in data.camera_of[mine]]
+        names = [localization.table.cameras[camera] for camera in data.camera_of[mine]]
         labels.append((str(frame), ' '.join(names), str(int(data.views.used[mine].sum()))))
-        rms.append(rms_px(found.residual[mine]))
+        rms.append(rms_px(localization.residual[mine]))
     _print_poses(
         f'{table.source}: {cameras[0]} in the world, from {int(data.views.used.sum())} points of '
-        f'{len(found.table.cameras)} cameras in {len(found.frame)} frames, rms '
-        f'{rms_px(found.residual):.4f} px',
+        f'{len(localization.table.cameras)} cameras in {len(localization.frame)} frames, rms '
+        f'{rms_px(localization.residual):.4f} px',
         labels,
         rms,
-        found.pose,
-        found.covariance,
-        noise_text(found.sigma),
+        localization.pose,
+        localization.covariance,
+        noise_text(localization.sigma),
     )
 
 
@@ -307,9 +309,9 @@ def _write(
     )
 
 
-def _write_rig(folder: Path, cameras: tuple[str, ...], found: RigLocalization) -> None:
-    data, views, residual = found.data, found.data.views, found.residual
-    _write_poses(folder, found.frame, found.pose, found.covariance)
+def _write_rig(folder: Path, cameras: tuple[str, ...], localization: RigLocalization) -> None:
+    data, views, residual = localization.data, localization.data.views, localization.residual
+    _write_poses(folder, localization.frame, localization.pose, localization.covariance)
     used = views.used
     frame, camera = (
         np.broadcast_to(part[:, None], used.shape)[used] for part in (views.frame, data.camera_of)
@@ -318,7 +320,7 @@ def _write_rig(folder: Path, cameras: tuple[str, ...], found: RigLocalization) -
         folder / 'residuals.csv',
         {
             'frame': frame,
-            'camera': np.array(found.table.cameras)[camera],
+            'camera': np.array(localization.table.cameras)[camera],
             'landmark': views.landmark[used],
             'u': views.uv[used][:, 0],
             'v': views.uv[used][:, 1],
@@ -330,30 +332,32 @@ def _write_rig(folder: Path, cameras: tuple[str, ...], found: RigLocalization) -
         folder / 'localize.json',
         {
             'rms_px': rms_px(residual),
-            'frames': len(found.frame),
+            'frames': len(localization.frame),
             'observations': int(used.sum()),
-            'left_out': found.left_out,
-            'sigma_px': found.sigma,
+            'left_out': localization.left_out,
+            'sigma_px': localization.sigma,
             'frame_id': cameras[0],
-            'rig_contradicted': found.contradicted,
+            'rig_contradicted': localization.contradicted,
             'cameras': {
                 name: {
                     'rms_px': rms_px(residual[data.camera_of == i]),
                     'frames': int((data.camera_of == i).sum()),
                 }
-                for i, name in enumerate(found.table.cameras)
+                for i, name in enumerate(localization.table.cameras)
             },
             'gross': [
                 {
-                    'frame': int(found.table.frame[row]),
-                    **photograph_entry(found.table, int(found.table.frame[row])),
-                    'camera': found.table.cameras[found.table.camera[row]],
-                    'landmark': int(found.table.landmark[row]),
+                    'frame': int(localization.table.frame[row]),
+                    **photograph_entry(localization.table, int(localization.table.frame[row])),
+                    'camera': localization.table.cameras[localization.table.camera[row]],
+                    'landmark': int(localization.table.landmark[row]),
                     'px': float(px),
                     'why': why,
                 }
-                for row, px, why in zip(*found.outliers[:3], strict=True)
+                for row, px, why in zip(*localization.outliers[:3], strict=True)
             ],
-            'wrong_landmarks': [landmark.to_dict() for landmark in found.outliers.landmarks],
+            'wrong_landmarks': [
+                landmark.to_dict() for landmark in localization.outliers.landmarks
+            ],
         },
     )

@@ -78,28 +78,28 @@ def _of_bag(args: argparse.Namespace) -> list[Path]:
     bag = Bag(args.source)
     with progress('reading', 2 * bag.size) as passed:
         table = tabulate(bag.records(is_tabulated, passed))
-        found = residual_sets(bag.records(has_residuals, passed))
+        sets = residual_sets(bag.records(has_residuals, passed))
     if bag.damage:
         say(f'{args.source}: {bag.damage}')
     with progress('drawing'):
         # Rows of the namespace with most of them: others have other metrics.
         most = table[NAMESPACE].mode()[:1]
         files = draw_table(table[table[NAMESPACE].isin(most)], args.output)
-        if found:
+        if sets:
             files.append(args.output / 'residuals.png')
             draw_residuals(
-                [one.points for one in found],
-                [one.tags.get('lens', '') for one in found],
+                [one.points for one in sets],
+                [one.tags.get('lens', '') for one in sets],
                 files[-1],
             )
-            files += _fields(found, args.output / 'residual_fields.png')
+            files += _fields(sets, args.output / 'residual_fields.png')
     return files
 
 
-def _fields(found: list[ResidualSet], path: Path) -> list[Path]:
+def _fields(sets: list[ResidualSet], path: Path) -> list[Path]:
     """Draw the residuals over the image, once a lens and range, where a scenario names these."""
     named: dict[Any, ResidualSet] = {}
-    for one in found:
+    for one in sets:
         key = one.tags.get('lens'), one.tags.get('radius')
         same_lens = sum(lens == key[0] for lens, _ in named)
         if None not in key and len(one.points) and same_lens < _FIELDS:

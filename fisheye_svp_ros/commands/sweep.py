@@ -181,14 +181,14 @@ def _metrics(plan: Plan) -> list[str]:
 
 def _report(path: Path, folder: Path, plan: Plan, mine: str, metrics: DataFrame) -> None:
     """Print and write what came out, metric by metric."""
-    found = {name: summarise(metrics[name].to_numpy()) for name in metrics}
+    summaries = {name: summarise(metrics[name].to_numpy()) for name in metrics}
     count = len(plan.sweep)
     print_table(
         f'{path}: {counted(count, "scenario")}',
         ('metric', 'sets', 'not solved', 'median', 'mean', 'largest'),
         [
             (name, str(s.solved), str(s.missing), *(f'{v:.6g}' for v in s[2:]))
-            for name, s in found.items()
+            for name, s in summaries.items()
         ],
     )
     write_json(
@@ -198,7 +198,7 @@ def _report(path: Path, folder: Path, plan: Plan, mine: str, metrics: DataFrame)
             'file': str(path),
             'scenarios': count,
             'swept': {name: list(values) for name, values in plan.sweep.lists.items()},
-            'metrics': {name: s._asdict() for name, s in found.items()},
+            'metrics': {name: s._asdict() for name, s in summaries.items()},
         },
     )
 

@@ -172,8 +172,8 @@ def _rectifications(
     lenses = load_lenses(args.lens or args.inputs[:1])
     for line in doubtful_folders(paths):
         say(line)
-    found = find_photographs(paths, split=args.split or 1)
-    photographed = tuple(dict.fromkeys(one.camera for one in found))
+    photographs = find_photographs(paths, split=args.split or 1)
+    photographed = tuple(dict.fromkeys(one.camera for one in photographs))
     by_camera = _by_camera(photographed, lenses)
     rig = _rig(args, by_camera)
     field = None if args.fov is None else float(np.radians(args.fov))

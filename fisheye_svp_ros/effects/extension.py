@@ -105,41 +105,46 @@ class Target:
         return slot, known, known & (off < _POSITION_TOLERANCE)
 
 
-def landmark_rows(seen: Observations) -> list[list[float]]:
+def landmark_rows(observations: Observations) -> list[list[float]]:
     """Return what a target is known by: [landmark, board, x, y, z] of each of its landmarks, m."""
-    ids, first = np.unique(seen.landmark, return_index=True)
-    boards, places = seen.board[first].tolist(), seen.xyz[first].tolist()
+    ids, first = np.unique(observations.landmark, return_index=True)
+    boards, places = observations.board[first].tolist(), observations.xyz[first].tolist()
     return [[*pair, *xyz] for *pair, xyz in zip(ids.tolist(), boards, places, strict=True)]
 
 
-def on_boards(seen: Observations, rows: Sequence[Sequence[float]] | None) -> Observations:
+def on_boards(observations: Observations, rows: Sequence[Sequence[float]] | None) -> Observations:
     """Return observations of a target on the boards that its `landmark_rows` say.
 
     A recording of topics tells of no boards, another table may call them otherwise.
     """
     if rows is None:
-        return seen
-    target, views = Target.from_entries({LANDMARKS: rows}, seen.source), group_views(seen)
+        return observations
+    target, views = (
+        Target.from_entries({LANDMARKS: rows}, observations.source),
+        group_views(observations),
+    )
     assert target is not None
     mine = views.used & target.landmark_mask(views).any(axis=1, keepdims=True)
-    board = seen.board.copy()
+    board = observations.board.copy()
     board[views.row[mine]] = target.assign_boards(views).board[mine]
-    return replace(seen, board=board)
+    return replace(observations, board=board)
 
 
-def extend_lens(lens: Lens, terms: Iterable[ModelTerm], seen: Observations | None = None) -> Lens:
+def extend_lens(
+    lens: Lens, terms: Iterable[ModelTerm], observations: Observations | None = None
+) -> Lens:
     """Return a lens with effects added.
 
     Viewpoint shifts, focal lengths, principal point and, where that is exact, radial coefficients
     are added to the lens's own; others of the lens go to `corrections`, those of the target to
-    `target`.  seen: observations of the target on which the effects were found; another target's
+    `target`.  observations: of the target on which the effects were found; another target's
     corrections are given up where there are new ones.  The field ends where the curves do.
     Raises LensError where the lens holds another form of one of the effects.
     """
     terms = (*load_effects(lens.corrections, lens.name), *terms)
     lens = replace(lens, corrections={})
-    if seen is not None and any(term.effect.place == 'target' for term in terms):
-        rows = landmark_rows(seen)
+    if observations is not None and any(term.effect.place == 'target' for term in terms):
+        rows = landmark_rows(observations)
         if lens.target.get(LANDMARKS) != rows:
             lens = replace(lens, target={LANDMARKS: rows})
     # All effects were found at the same focal length, so that their order does not matter.

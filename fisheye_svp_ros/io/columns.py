@@ -285,10 +285,12 @@ def _arrow_table(pyarrow: Any, table: DataFrame, schema: Any) -> Any:
     """Return a table of numbers and text: text also where no cell of a column has any."""
     if schema is None:
         fields = pyarrow.Schema.from_pandas(table, preserve_index=False)
-        kinds = (pyarrow.string() if _is_text(pyarrow, one.type) else one.type for one in fields)
+        kinds = (
+            pyarrow.string() if _is_text(pyarrow, field.type) else field.type for field in fields
+        )
         schema = pyarrow.schema(zip(fields.names, kinds, strict=True))
-    found = pyarrow.Table.from_pandas(table, schema, preserve_index=False)
-    return found.replace_schema_metadata(None)
+    converted = pyarrow.Table.from_pandas(table, schema, preserve_index=False)
+    return converted.replace_schema_metadata(None)
 
 
 def _is_text(pyarrow: Any, kind: Any) -> bool:

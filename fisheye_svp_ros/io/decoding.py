@@ -319,10 +319,10 @@ def statuses(message: Any) -> list[Status]:
 
 def read_key_values(message: Any, topic: str = 'scenario') -> dict[str, str]:
     """Return the key/values of a DiagnosticArray's only status."""
-    found = statuses(message)
-    if len(found) != 1:
-        raise ObservationError(f'{topic}: {len(found)} statuses in it; one is needed')
-    return found[0].values
+    states = statuses(message)
+    if len(states) != 1:
+        raise ObservationError(f'{topic}: {len(states)} statuses in it; one is needed')
+    return states[0].values
 
 
 def _pose(position: Any, orientation: Any, topic: str) -> Pose:

@@ -194,12 +194,12 @@ def _read(path: str | Path) -> tuple[str, str]:
 
 def _in_folder(folder: Path) -> dict[str, Path]:
     """Return the lens files of a rig by camera; raise LensError where there is none."""
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     # Names of cameras may have slashes, and then their files are further down.
     for depth in range(_DEPTH):
         above = '*/' * depth
-        found = (
-            found
+        paths = (
+            paths
             or {
                 str(file.relative_to(folder).with_suffix('')): file
                 for file in sorted(folder.glob(f'{above}*.yaml'))
@@ -210,12 +210,12 @@ def _in_folder(folder: Path) -> dict[str, Path]:
                 for file in sorted(folder.glob(f'{above}*/extended_lens.yaml'))
             }
         )
-    if not found:
+    if not paths:
         raise LensError(
             f'{folder}: a folder without lenses; those of a rig are CAMERA.yaml or '
             'CAMERA/extended_lens.yaml'
         )
-    return found
+    return paths
 
 
 def _projection(section: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -263,9 +263,11 @@ def _curve(
     values |= {f'{listed}{i}': value for i, value in enumerate(numbered, start=first)}
     _refuse_unknown(values, set(known), where)
     missing = [
-        one.name
-        for one in signature(kind).parameters.values()
-        if one.name in known and one.default is one.empty and one.name not in values
+        parameter.name
+        for parameter in signature(kind).parameters.values()
+        if parameter.name in known
+        and parameter.default is parameter.empty
+        and parameter.name not in values
     ]
     if missing:
         raise LensError(f'{where}: incomplete; add {", ".join(missing)}')

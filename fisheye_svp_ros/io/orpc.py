@@ -62,11 +62,11 @@ def read(path: str | Path) -> Observations:
 
 def _description(folder: Path) -> Path:
     for place in (folder, *list(folder.resolve().parents)[:2]):
-        found = sorted(place.glob('*.dsc'))
-        if len(found) > 1:
+        descriptions = sorted(place.glob('*.dsc'))
+        if len(descriptions) > 1:
             raise ObservationError(f'{place}: several .dsc files; keep the one of this target')
-        if found:
-            return found[0]
+        if descriptions:
+            return descriptions[0]
     raise ObservationError(f'{folder}: no .dsc file of the target, here or two folders above')
 
 
@@ -161,9 +161,9 @@ def _image_times(files: list[Path], dataset: Path) -> Array:
 
 
 def _time(file: Path) -> datetime | None:
-    found = _TIME.search(file.stem)
+    stamp = _TIME.search(file.stem)
     try:
-        return datetime.strptime(found.group(), '%Y-%m-%d-%H-%M-%S') if found else None
+        return datetime.strptime(stamp.group(), '%Y-%m-%d-%H-%M-%S') if stamp else None
     except ValueError:
         return None
 

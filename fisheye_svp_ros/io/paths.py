@@ -17,7 +17,7 @@ def path_of(given: str | Path) -> Path:
 
 def final_path(path: str | Path) -> Path:
     """Return where a path leads, through all symbolic links; raise OutputError for a circle."""
-    found = Path(os.path.realpath(path_of(path)))
-    if found.is_symlink():
+    resolved = Path(os.path.realpath(path_of(path)))
+    if resolved.is_symlink():
         raise OutputError(f'{path}: its symbolic links lead in a circle; choose another name')
-    return found
+    return resolved

@@ -53,7 +53,7 @@ def photographs_beside(path: Path, cameras: Sequence[str]) -> tuple[tuple[int, s
             f'{beside}: photographs is not a list of name, camera and frame '
             f'({cause}); run `fisheye-svp detect` again'
         ) from cause
-    return tuple(one for one in entries if one[0] >= 0 and one[1] in cameras)
+    return tuple(entry for entry in entries if entry[0] >= 0 and entry[1] in cameras)
 
 
 def sizes_beside(path: Path) -> Sizes:

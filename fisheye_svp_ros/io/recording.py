@@ -195,9 +195,9 @@ def _topics_present(bag: Bag, worlds: set[str]) -> str:
     images = {topic for topic, kind in bag.topics() if kind in _IMAGES}
     if images and not worlds:
         return f'it has images, on {min(images)}: add --board, for example chessboard:9x6:24mm'
-    found = ', '.join(world or '/' for world in sorted(worlds)) or 'none'
+    listed = ', '.join(world or '/' for world in sorted(worlds)) or 'none'
     wanted = f'{max(worlds)}/.*' if len(worlds) > 1 else '.*/(landmarks|image_points)'
-    return f"landmarks are in: {found}; record with --topics '{wanted}'"
+    return f"landmarks are in: {listed}; record with --topics '{wanted}'"
 
 
 def _table(

@@ -25,7 +25,7 @@ def ros1_types() -> Any:
 def bag_topics(path: Path) -> set[tuple[str, str]]:
     """Return the topics and types of a bag; raise BagError where it cannot be read."""
     with _opened(path) as reader:
-        return {(one.topic, one.msgtype) for one in reader.connections}
+        return {(connection.topic, connection.msgtype) for connection in reader.connections}
 
 
 def bag_messages(

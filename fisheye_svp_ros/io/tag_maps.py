@@ -75,11 +75,11 @@ def read_tag_map(path: str | Path) -> TagMap:
             'apriltag_ros, is needed'
         )
     tags = [_read_tag(entry, f'{path}: tag {number}') for number, entry in enumerate(entries)]
-    ids = np.array([one[0] for one in tags], dtype=np.int64)
+    ids = np.array([tag[0] for tag in tags], dtype=np.int64)
     if len(np.unique(ids)) < len(ids):
         twice = next(one for one in ids.tolist() if (ids == one).sum() > 1)
         raise ObservationError(f'{path}: tag id {twice} is listed twice; remove one')
-    return TagMap(ids, np.array([one[1] for one in tags]), Pose.stack([one[2] for one in tags]))
+    return TagMap(ids, np.array([tag[1] for tag in tags]), Pose.stack([tag[2] for tag in tags]))
 
 
 def write_tag_map(

@@ -224,22 +224,24 @@ def calibrate_stereo(
     """
     table, models = _stereo_inputs(observations, left, right)
     views = stereo_views(table)
-    found = stereo_calibration.calibrate_stereo(*models, *views)
-    residual = np.concatenate([found.left_residual, found.right_residual])
+    calibration = stereo_calibration.calibrate_stereo(*models, *views)
+    residual = np.concatenate([calibration.left_residual, calibration.right_residual])
     sigma = (
         1.0
         if sigma_known(table)
         else noise_sigma(
-            float(found.cost[0]), int(np.isfinite(residual).sum()), 6 * (len(views[0].frame) + 1)
+            float(calibration.cost[0]),
+            int(np.isfinite(residual).sum()),
+            6 * (len(views[0].frame) + 1),
         )
     )
     return CalibratedRig(
-        found.rig.take(0),
-        sigma**2 * found.rig_covariance[0],
+        calibration.rig.take(0),
+        sigma**2 * calibration.rig_covariance[0],
         views[0].frame,
-        found.pose.take(0),
+        calibration.pose.take(0),
         rms_px(residual),
-        bool(found.converged[0]),
+        bool(calibration.converged[0]),
     )
 
 

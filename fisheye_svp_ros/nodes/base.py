@@ -291,7 +291,7 @@ class BaseNode(Node):  # type: ignore[misc]
     def introduce(self) -> None:
         """Say what the node listens to; warn of what was given and means nothing to it."""
         if self._inputs:
-            topics = sorted(one.resolved for one in self._inputs.values())
+            topics = sorted(subscription.resolved for subscription in self._inputs.values())
             self.get_logger().info(f'listening to {", ".join(topics)}')
         names = [row.name for row in rows(self.SETTINGS)]
         for text in unknown_parameters(self, self.given, names):
@@ -399,8 +399,8 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):  # type: ignore[misc]
     def on_activate(self, state: Any) -> Any:
         """Listen."""
         self._active = True
-        for one in self._inputs.values():
-            one.subscribe()
+        for subscription in self._inputs.values():
+            subscription.subscribe()
         self.introduce()
         return super().on_activate(state)
 
@@ -416,5 +416,5 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):  # type: ignore[misc]
 
     def _fall_silent(self) -> None:
         self._active = False
-        for one in self._inputs.values():
-            one.unsubscribe()
+        for subscription in self._inputs.values():
+            subscription.unsubscribe()

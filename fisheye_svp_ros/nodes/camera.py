@@ -77,7 +77,7 @@ class CameraTopics:
         return str(self._images.topic_name)
 
     def publish(
-        self, stamp: int, seen: Observations | Pixels, pose: Pose | None, lens: Lens | None
+        self, stamp: int, observations: Observations | Pixels, pose: Pose | None, lens: Lens | None
     ) -> None:
         """Publish one set: image points or an image, and what is known of pose and lens."""
         if lens is not None:
@@ -85,12 +85,14 @@ class CameraTopics:
         if pose is not None:
             self._pose.publish(messages.pose_message(pose, stamp, self._world))
             self._transforms.publish(pose, stamp, self._world, f'{self.frame}_true')
-        if self._points is not None and isinstance(seen, Observations):
+        if self._points is not None and isinstance(observations, Observations):
             self._points.publish(
-                messages.image_points_message(seen.landmark, seen.uv, stamp, self.frame)
+                messages.image_points_message(
+                    observations.landmark, observations.uv, stamp, self.frame
+                )
             )
-        if self._images is not None and isinstance(seen, np.ndarray):
-            self._images.publish(messages.image_message(seen, stamp, self.frame))
+        if self._images is not None and isinstance(observations, np.ndarray):
+            self._images.publish(messages.image_message(observations, stamp, self.frame))
 
 
 class CameraNode(BaseNode):

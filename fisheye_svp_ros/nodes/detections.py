@@ -45,12 +45,12 @@ def read_apriltags(message: Any, topic: str = 'detections') -> ImagePoints:
 def read_detections(message: Any, topic: str = 'detections') -> ImagePoints:
     """Return the middles of tags; those whose id has no number are left out."""
     ids, uv = [], []
-    for one in message.detections:
-        names = [one.id, *(result.hypothesis.class_id for result in one.results)]
+    for detection in message.detections:
+        names = [detection.id, *(result.hypothesis.class_id for result in detection.results)]
         number = next((match[1] for name in names if (match := _LAST_NUMBER.search(name))), None)
         if number is not None:
             ids.append(CENTER_OFFSET + int(number))
-            center = getattr(one.bbox.center, 'position', one.bbox.center)
+            center = getattr(detection.bbox.center, 'position', detection.bbox.center)
             uv.append((center.x, center.y))
     return _image_points(ids, uv, message, topic)
 

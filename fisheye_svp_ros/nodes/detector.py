@@ -269,22 +269,24 @@ class Detector(BaseNode):
         task = pixels, self._pattern, self._detector, self._near
         self._searches.start(task, self.settings.longest_search)
 
-    def _finish(self, found: Any, stamp: int, frame: str, pixels: Pixels) -> None:
-        if isinstance(found, Points):
-            self._near, self._size = found.uv, pixels.shape
-            self._points.publish(messages.image_points_message(found.ids, found.uv, stamp, frame))
+    def _finish(self, result: Any, stamp: int, frame: str, pixels: Pixels) -> None:
+        if isinstance(result, Points):
+            self._near, self._size = result.uv, pixels.shape
+            self._points.publish(
+                messages.image_points_message(result.ids, result.uv, stamp, frame)
+            )
         else:
             self._near = None
             self._counts['images without board'] += 1
             self._failures_at_first += self._size is None
             if self._failures_at_first == _MIN_FAILURES and self._size is None:
                 self.get_logger().warning(self._missing_board())
-            self._counts['searches ended'] += isinstance(found, TimedOut)
-            if isinstance(found, Exception):
-                self.unforeseen(found)
+            self._counts['searches ended'] += isinstance(result, TimedOut)
+            if isinstance(result, Exception):
+                self.unforeseen(result)
         if self._guiding is not None:
             try:
-                self._guiding.look(stamp, frame, pixels, found)
+                self._guiding.look(stamp, frame, pixels, result)
             except FisheyeSvpError as error:
                 self.drop('image', error)
 
@@ -306,8 +308,8 @@ class Detector(BaseNode):
             raise ObservationError(f'{topic}: a corner is not a finite number')
         return str(message.header.frame_id), ids, uv
 
-    def _publish_tags(self, stamp: int, found: tuple[str, Index, Array]) -> None:
-        frame, ids, uv = found
+    def _publish_tags(self, stamp: int, tags: tuple[str, Index, Array]) -> None:
+        frame, ids, uv = tags
         self._points.publish(messages.image_points_message(ids, uv, stamp, frame))
 
     def _check_size(self, pixels: Pixels) -> None:

@@ -46,9 +46,9 @@ class FrameListener:
         return self.tree.find(frame.lstrip('/'), child.lstrip('/'), stamp)
 
     def _hear(self, fixed: bool, data: bytes) -> None:
-        for one in deserialize_message(data, self._kind).transforms:
-            stamp = None if fixed else stamp_of(one)
-            frames = one.header.frame_id.lstrip('/'), one.child_frame_id.lstrip('/')
-            self.tree.add(*frames, read_transform(one, '/tf'), stamp)
+        for transform in deserialize_message(data, self._kind).transforms:
+            stamp = None if fixed else stamp_of(transform)
+            frames = transform.header.frame_id.lstrip('/'), transform.child_frame_id.lstrip('/')
+            self.tree.add(*frames, read_transform(transform, '/tf'), stamp)
         if not fixed and self._moved is not None:
             self._moved()

@@ -70,10 +70,10 @@ class FrameTree:
         return None if mine is None or other is None else mine.inverse().compose(other)
 
     def _ancestors(self, frame: str) -> list[str]:
-        found = [frame]
-        while found[-1] in self._frames and self._frames[found[-1]].parent not in found:
-            found.append(self._frames[found[-1]].parent)
-        return found
+        chain = [frame]
+        while chain[-1] in self._frames and self._frames[chain[-1]].parent not in chain:
+            chain.append(self._frames[chain[-1]].parent)
+        return chain
 
     def _in_ancestor(self, frame: str, ancestor: str, stamp: int) -> Pose | None:
         pose = identity()

@@ -106,7 +106,7 @@ class Guiding:
             'guide: failures': self._failures,
         }, self._trouble
 
-    def look(self, stamp: int, frame: str, pixels: Pixels, found: Any) -> None:
+    def look(self, stamp: int, frame: str, pixels: Pixels, result: Any) -> None:
         """Take note of an image and of what was found in it; publish the picture.
 
         Raises FisheyeSvpError for an image or a lens that cannot be used.
@@ -115,8 +115,8 @@ class Guiding:
             self._begin(stamp, pixels)
         assert self._guide is not None
         guide, seen = self._guide, None
-        if isinstance(found, Points):
-            seen = DetectedBoard(stamp / _NS, found.ids, found.uv, found.sigma)
+        if isinstance(result, Points):
+            seen = DetectedBoard(stamp / _NS, result.ids, result.uv, result.sigma)
         self._frame = frame
         if guide.look(stamp / _NS, seen):
             self._save(pixels)

@@ -214,14 +214,14 @@ class StampJoin:
     def _find(self, topic: str, stamp: int) -> Any:
         return self._tracks[topic].find(stamp, self.reaches.get(topic, 0), self._taken)
 
-    def _settle(self, topic: str, one: Pending, item: Any) -> None:
+    def _settle(self, topic: str, pending: Pending, item: Any) -> None:
         """Give a set what there is of an optional topic; wait for that topic as it matches."""
-        track, stamp = self._tracks[topic], one.stamps[self._shares[topic]]
+        track, stamp = self._tracks[topic], pending.stamps[self._shares[topic]]
         track.expected = item is not None
         if item is None:
             track.missed.append(stamp)
             return
-        one.items[topic] = item
+        pending.items[topic] = item
         if track.take(stamp) is not None:
             track.matched = True
 

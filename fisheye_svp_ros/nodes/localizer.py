@@ -95,17 +95,17 @@ class Localizer(SolverNode):
 
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Localize the camera of one set; raise GeometryError where its points fix no pose."""
-        seen: KnownPoints = items['image_points']
-        views, model = self.views(stamp, seen), self.model(stamp, items)
+        points: KnownPoints = items['image_points']
+        views, model = self.views(stamp, points), self.model(stamp, items)
         errors = self._lens_errors(stamp, items) if self.settings.model_error else None
         if errors is not None:
             sigma = errors.inflate_sigma(self.settings.sigma_px)
             views = views._replace(weight=np.full_like(views.weight, 1 / sigma))
         true: Pose | None = items.get('true_pose')
-        found = self._localize(stamp, model, views, true).require(self.settings.gate)
-        solution = found.solution
+        solved = self._localize(stamp, model, views, true).require(self.settings.gate)
+        solution = solved.solution
         pose, world = solution.pose.take(0), landmarks.frame
-        camera = self.settings.camera_frame or seen.frame
+        camera = self.settings.camera_frame or points.frame
         covariance = solution.covariance
         if errors is not None:
             covariance = errors.of_solved_poses(views, solution, None).total
@@ -121,7 +121,7 @@ class Localizer(SolverNode):
             error = pose.difference(true)
             self._position_error.publish(messages.vector_message(error[:3], stamp, world))
             self._rotation_error.publish(messages.vector_message(error[3:], stamp, world))
-        self.publish_result(stamp, found.metrics, found.reasons[0])
+        self.publish_result(stamp, solved.metrics, solved.reasons[0])
         if self._markers.get_subscription_count():
             shape = camera_shape(pose, 'estimated', alpha=0.6)
             self._markers.publish(messages.markers_message([shape], stamp, world))
@@ -143,20 +143,20 @@ class Localizer(SolverNode):
         start = _pose_at(stamp, self._latest)
         measured = bool(self.settings.lens)
         searched = measured and self._misfits % OUTLIER_SEARCH_INTERVAL == 0
-        found = localize_sets(model, views, true, start, examined=True, searched=searched)
+        solved = localize_sets(model, views, true, start, examined=True, searched=searched)
         if start is not None and not (
-            _rms_px(found) < MAX_RMS_RATIO * self._rms_before
-            and _is_near(start, found.solution.pose, views)
+            _rms_px(solved) < MAX_RMS_RATIO * self._rms_before
+            and _is_near(start, solved.solution.pose, views)
         ):
             self._latest.clear()
-            found = localize_sets(model, views, true, examined=True, searched=measured)
-        rms, pose = _rms_px(found), found.solution.pose
+            solved = localize_sets(model, views, true, examined=True, searched=measured)
+        rms, pose = _rms_px(solved), solved.solution.pose
         if np.isfinite(rms):
             self._latest.append((stamp, pose))
             self._rms_before = max(rms, PERFECT_FIT_PX)
-        whole = found.metrics['points'][0] == views.used.sum()
-        self._misfits = self._misfits + 1 if found.reasons[0] and whole else 0
-        return found
+        whole = solved.metrics['points'][0] == views.used.sum()
+        self._misfits = self._misfits + 1 if solved.reasons[0] and whole else 0
+        return solved
 
 
 def _errors_of(lens: Lens) -> LensErrors:

@@ -222,38 +222,40 @@ class ModelCritic(SolverNode):
 
     def _finish(self, done: _Running) -> None:
         try:
-            found = done.future.result()
+            diagnosis = done.future.result()
         except FisheyeSvpError as error:
             self._complain(error, 'not diagnosed: ')
             self.publish_result(done.stamp, {}, str(error))
             return
-        self._verdict = found
-        numbers = figures(found)
+        self._verdict = diagnosis
+        numbers = figures(diagnosis)
         for name, value in numbers.items():
             if name not in self._metrics:
                 self._metrics[name] = self.announce(Float64, f'~/metrics/{name}', LATCHED)
             self._metrics[name].publish(messages.number_message(value))
-        said = tuple(one.say for one in found.decision.values())
+        said = tuple(one.say for one in diagnosis.decision.values())
         if said != self._announced:
             self._announced = said
-            self.get_logger().info(' '.join(_lines(found)))
-        self._result.publish(self._verdict_message(found, done.stamp, numbers))
+            self.get_logger().info(' '.join(_lines(diagnosis)))
+        self._result.publish(self._verdict_message(diagnosis, done.stamp, numbers))
         self._publish_diagnostics()
 
-    def _verdict_message(self, found: Diagnosis, stamp: int, numbers: Mapping[str, float]) -> Any:
+    def _verdict_message(
+        self, diagnosis: Diagnosis, stamp: int, numbers: Mapping[str, float]
+    ) -> Any:
         words = {
-            'verdict': found.verdict,
-            'causes': ' '.join(c.effect for c in found.causes),
-            'candidates': ' '.join(c.effect for c in found.candidates),
-            **decisions(found),
+            'verdict': diagnosis.verdict,
+            'causes': ' '.join(c.effect for c in diagnosis.causes),
+            'candidates': ' '.join(c.effect for c in diagnosis.candidates),
+            **decisions(diagnosis),
         }
         return messages.key_values_message(
             f'{self.get_fully_qualified_name()}: verdict',
             {**words, **numbers},
             stamp,
-            ' '.join(_lines(found)),
+            ' '.join(_lines(diagnosis)),
             DiagnosticStatus.WARN
-            if _ALARMING & {one.say for one in found.decision.values()}
+            if _ALARMING & {one.say for one in diagnosis.decision.values()}
             else DiagnosticStatus.OK,
         )
 
@@ -304,17 +306,18 @@ def judge(table: Observations, lens: Lens, free_intrinsics: bool) -> Diagnosis:
     return diagnose(usable.observations, lens, free_intrinsics=free_intrinsics)
 
 
-def _lines(found: Diagnosis) -> list[str]:
+def _lines(diagnosis: Diagnosis) -> list[str]:
     """Return the first screen of a report as sentences."""
     return [
-        line.rstrip('.') + '.' for line in terminal_lines(first_screen(found, 'image_points'), '')
+        line.rstrip('.') + '.'
+        for line in terminal_lines(first_screen(diagnosis, 'image_points'), '')
     ]
 
 
-def decisions(found: Diagnosis) -> dict[str, object]:
+def decisions(diagnosis: Diagnosis) -> dict[str, object]:
     """Return what to do about lens, target and photographs, each with its figure, and bounds."""
     words: dict[str, object] = {}
-    for name, one in found.decision.items():
+    for name, one in diagnosis.decision.items():
         unit = _suffix(one.figure.unit)
         words |= {
             f'decision_{name}': one.say,
@@ -327,13 +330,17 @@ def decisions(found: Diagnosis) -> dict[str, object]:
     return words
 
 
-def figures(found: Diagnosis) -> dict[str, float]:
+def figures(diagnosis: Diagnosis) -> dict[str, float]:
     """Return METRICS, and the parameters of the causes with their standard errors."""
-    base, extended, gain = found.figures.base, found.figures.extended, found.figures.gain
+    base, extended, gain = (
+        diagnosis.figures.base,
+        diagnosis.figures.extended,
+        diagnosis.figures.gain,
+    )
     numbers = {
-        'frames': found.frames,
-        'points': found.observations,
-        'noise_px': found.noise_px,
+        'frames': diagnosis.frames,
+        'points': diagnosis.observations,
+        'noise_px': diagnosis.noise_px,
         'base_rms_px': base.rms_px,
         'base_heldout_rms_px': base.heldout_rms_px,
         'extended_rms_px': extended.rms_px,
@@ -342,7 +349,7 @@ def figures(found: Diagnosis) -> dict[str, float]:
         'gain_low': gain.low,
         'gain_high': gain.high,
     }
-    for cause in found.causes:
+    for cause in diagnosis.causes:
         if len(cause.parameters) > _MAX_PARAMETER_TOPICS:
             continue
         for name, entry in cause.parameters.items():

@@ -74,11 +74,11 @@ class Recorder(Node):  # type: ignore[misc]
         for typename in types:
             offered = [
                 OfferedQos(
-                    one.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT,
-                    one.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+                    publisher.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT,
+                    publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
                 )
-                for one in publishers
-                if one.topic_type == typename
+                for publisher in publishers
+                if publisher.topic_type == typename
             ]
             if not offered:
                 continue

@@ -70,17 +70,17 @@ class RigLocalizer(SolverNode):
             name: self.lens(stamp, items, camera)
             for name, camera in zip(names, cameras, strict=True)
         }
-        found = localize_rig(table, lenses, names, places)
+        solution = localize_rig(table, lenses, names, places)
         true: Pose | None = items.get(f'{cameras[0]}true_pose')
-        residual = found.residual.reshape(1, -1, 2)
+        residual = solution.residual.reshape(1, -1, 2)
         check_gate(residual / self.settings.sigma_px, self.settings.gate)
         metrics = localization_metrics(
-            found.pose, residual, None if true is None else true.take(None)
+            solution.pose, residual, None if true is None else true.take(None)
         )
-        pose, world = found.pose.take(0), landmarks.frame
-        frame, covariance = items[f'{cameras[0]}image_points'].frame, found.covariance[0]
+        pose, world = solution.pose.take(0), landmarks.frame
+        frame, covariance = items[f'{cameras[0]}image_points'].frame, solution.covariance[0]
         self._pose.publish(messages.pose_with_covariance_message(pose, covariance, stamp, world))
         self._base.publish(pose, covariance, stamp, world, frame)
         self._transforms.publish(pose, stamp, world, frame)
-        problem = rig_reason(len(found.outliers.rows), found.contradicted)
+        problem = rig_reason(len(solution.outliers.rows), solution.contradicted)
         self.publish_result(stamp, metrics, problem)

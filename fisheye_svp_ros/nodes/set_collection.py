@@ -38,7 +38,7 @@ def make_set(stamp: int, items: Items, cameras: Sequence[str]) -> CollectedSet:
     )
 
 
-def is_repeated(seen: CollectedSet, earlier: Sequence[CollectedSet]) -> bool:
+def is_repeated(collected: CollectedSet, earlier: Sequence[CollectedSet]) -> bool:
     """Say whether a set is no new view.
 
     It is the last one again, the camera having stood still, or an earlier one to the last digit.
@@ -46,19 +46,19 @@ def is_repeated(seen: CollectedSet, earlier: Sequence[CollectedSet]) -> bool:
     if not earlier:
         return False
     copies = any(
-        np.array_equal(seen.landmark, one.landmark) and np.array_equal(seen.uv, one.uv)
+        np.array_equal(collected.landmark, one.landmark) and np.array_equal(collected.uv, one.uv)
         for one in earlier
     )
-    return copies or _median_move(seen, earlier[-1]) < _MAX_MOTION_PX
+    return copies or _median_move(collected, earlier[-1]) < _MAX_MOTION_PX
 
 
-def _median_move(one: CollectedSet, other: CollectedSet) -> float:
+def _median_move(collected: CollectedSet, other: CollectedSet) -> float:
     """Return how far, px, the image points that two sets share moved; infinite for none."""
-    mine, theirs = (2**32 * seen.camera + seen.landmark for seen in (one, other))
+    mine, theirs = (2**32 * seen.camera + seen.landmark for seen in (collected, other))
     _, mine, theirs = np.intersect1d(mine, theirs, return_indices=True)
     if not len(mine):
         return float('inf')
-    return float(np.median(np.linalg.norm(one.uv[mine] - other.uv[theirs], axis=1)))
+    return float(np.median(np.linalg.norm(collected.uv[mine] - other.uv[theirs], axis=1)))
 
 
 def table_of(window: Sequence[CollectedSet], cameras: Sequence[str]) -> Observations:

@@ -375,7 +375,10 @@ class SolverNode(ManagedNode):
         A solver that is behind would else find out late which sets are too old to be solved.
         """
         end = time.monotonic() + _LONGEST_INTAKE
-        while sum(one.take() for one in self._inputs.values()) and time.monotonic() < end:
+        while (
+            sum(subscription.take() for subscription in self._inputs.values())
+            and time.monotonic() < end
+        ):
             pass
 
     def _skip_unpublished(self) -> None:
@@ -389,11 +392,11 @@ class SolverNode(ManagedNode):
             if silent or not self.count_publishers(one.resolved):
                 self._join.expect_no_more(topic)
 
-    def _compare_stamps(self, one: Pending) -> None:
+    def _compare_stamps(self, pending: Pending) -> None:
         """Say how far off the true poses are that come and are of no use to a set."""
         for topic, points in self._poses.items():
-            off = self._join.distance(topic, one.stamps[points])
-            if topic not in one.items and off is not None:
+            off = self._join.distance(topic, pending.stamps[points])
+            if topic not in pending.items and off is not None:
                 self.warn(
                     f'{topic}: the nearest stamp is {1e-6 * off:.1f} ms from that of the '
                     'image points; true poses are interpolated only over gaps up to '
@@ -416,27 +419,29 @@ class SolverNode(ManagedNode):
             if topic in self._image_points:
                 self._fail(stamp, str(error))
 
-    def _attempt(self, one: Pending) -> None:
+    def _attempt(self, pending: Pending) -> None:
         try:
-            items, landmarks = self._validate(one)
-            self.solve(one.stamp, landmarks, items)
+            items, landmarks = self._validate(pending)
+            self.solve(pending.stamp, landmarks, items)
             self._pace.counts['solved'] += 1
         except FisheyeSvpError as error:
             self._complain(error, 'not solved: ')
-            self._fail(one.stamp, str(error))
+            self._fail(pending.stamp, str(error))
         except Exception as error:
             self.unforeseen(error)
-            self._fail(one.stamp, f'internal error: {error!r:.200}')
+            self._fail(pending.stamp, f'internal error: {error!r:.200}')
         finally:
             self._left_out = []
 
-    def _validate(self, one: Pending) -> tuple[Items, LandmarkSet]:
+    def _validate(self, pending: Pending) -> tuple[Items, LandmarkSet]:
         """Return what is to be solved; raise FisheyeSvpError where that is nothing."""
-        read = self._validation.read(one.items)
+        read = self._validation.read(pending.items)
         landmarks = self._latched_landmarks.find_for_set(
-            read.get('landmarks'), self._join.distance('landmarks', one.stamp)
+            read.get('landmarks'), self._join.distance('landmarks', pending.stamp)
         )
-        items, self._left_out = self._validation.check(read, landmarks, self.settings, one.stamp)
+        items, self._left_out = self._validation.check(
+            read, landmarks, self.settings, pending.stamp
+        )
         for text in self._left_out:
             self.warn(text)
         return items, landmarks
@@ -451,10 +456,10 @@ class SolverNode(ManagedNode):
         self._pace.counts['not solved'] += 1
         self.publish_result(stamp, {}, problem)
 
-    def _drop_set(self, one: Pending) -> None:
+    def _drop_set(self, pending: Pending) -> None:
         self._pace.counts['incomplete'] += 1
-        missing = [topic for topic in self._image_points if topic not in one.items]
-        for topic, stamp in one.stamps.items():
+        missing = [topic for topic in self._image_points if topic not in pending.items]
+        for topic, stamp in pending.stamps.items():
             reason = self._reason(missing[0], stamp) if missing else 'too many sets wait'
             self._complain(ObservationError(f'{topic}: {reason}'), 'incomplete: ')
 

@@ -78,13 +78,13 @@ class StereoCalibrator(SolverNode):
         one = make_set(stamp, items, self.CAMERAS)
         window = [*known, one][-self.settings.views :]
         left, right = stereo_views(table_of(window, self.CAMERAS), self.settings.sigma_px)
-        found = solve_rigs(self.models(stamp, items), left, right, true=true_rig(items)).require(
+        solved = solve_rigs(self.models(stamp, items), left, right, true=true_rig(items)).require(
             self.settings.gate
         )
         # Only now: a set that cannot be used must not spoil those to come.
-        self._window, self._scenario, self._found = window, scenario, found
-        self._publish(stamp, items, found)
-        fit = {name: float(found.metrics[name][0]) for name in ('points', 'rms_px')}
+        self._window, self._scenario, self._found = window, scenario, solved
+        self._publish(stamp, items, solved)
+        fit = {name: float(solved.metrics[name][0]) for name in ('points', 'rms_px')}
         self._progress.tell(stamp, len(window), self.settings.views - len(window), fit)
 
     def _save(self, _: Any, response: Any) -> Any:
@@ -111,8 +111,8 @@ class StereoCalibrator(SolverNode):
         self._progress.tell(0, 0, self.settings.views, {})
         return response
 
-    def _publish(self, stamp: int, items: Items, found: SetSolutions[StereoCalibration]) -> None:
-        rig, true = found.solution.rig.take(0), true_rig(items)
+    def _publish(self, stamp: int, items: Items, solved: SetSolutions[StereoCalibration]) -> None:
+        rig, true = solved.solution.rig.take(0), true_rig(items)
         left, right = (items[f'{camera}image_points'].frame for camera in self.CAMERAS)
         self._rig.publish(messages.transform_message(rig, stamp, right, left))
         self._transforms.publish(rig, stamp, right, left)
@@ -120,5 +120,5 @@ class StereoCalibrator(SolverNode):
             error = rig.difference(true)
             self._position_error.publish(messages.vector_message(error[:3], stamp, right))
             self._rotation_error.publish(messages.vector_message(error[3:], stamp, right))
-        problems = filter(None, (found.reasons[0], exchange_reason(rig)))
-        self.publish_result(stamp, found.metrics, '; '.join(problems))
+        problems = filter(None, (solved.reasons[0], exchange_reason(rig)))
+        self.publish_result(stamp, solved.metrics, '; '.join(problems))

@@ -80,7 +80,7 @@ class StereoDepth(SolverNode):
         uv = left.uv[in_left], right.uv[in_right]
         true: Pose | None = items.get('right/true_pose')
         known = right.points[in_right]
-        found = measure_points(
+        solved = measure_points(
             models,
             rig.take(None),
             uv[0][None],
@@ -88,13 +88,13 @@ class StereoDepth(SolverNode):
             None if true is None else true.into_body(known)[None],
             self.settings.optimal,
         ).require()
-        points = found.solution.points[0]
+        points = solved.solution.points[0]
         seen = np.isfinite(points[:, 0])
         cloud = structured_array(LANDMARKS, ids[seen], *points[seen].T)
         self._points.publish(messages.cloud_message(cloud, stamp, right.frame))
         doubt = doubt_of_pairs(models, rig.take(None), uv, ids, self.settings.sigma_px)
         problems = filter(None, (doubt, exchange_reason(rig)))
-        self.publish_result(stamp, found.metrics, '; '.join(problems))
+        self.publish_result(stamp, solved.metrics, '; '.join(problems))
         if self._markers.get_subscription_count():
             pose: Pose | None = items.get('left/true_pose')
             frame = left.frame if pose is None else landmarks.frame
@@ -134,10 +134,10 @@ def _shapes(
 ) -> list[messages.Segments]:
     # As markers, because RViz draws no cloud of doubles.
     place = left.compose(rig.inverse()).transform(points)
-    found = landmarks_shape(place)._replace(name='measured points', colour=(0.8, 0.2, 0.2, 1.0))
+    shape = landmarks_shape(place)._replace(name='measured points', colour=(0.8, 0.2, 0.2, 1.0))
     curves = epipolar_curves(*models, rig, uv_right)
     return [
         camera_shape(left, 'left', alpha=0.6),
         *epipolar_shapes(models[0].lens, left, curves, uv_left),
-        found,
+        shape,
     ]

@@ -151,7 +151,7 @@ class Input:
     @property
     def profiles(self) -> list[Any]:
         """What is asked for; empty while the node does not listen."""
-        return [one.of_rclpy.qos_profile for one in self._subscriptions.values()]
+        return [subscription.of_rclpy.qos_profile for subscription in self._subscriptions.values()]
 
     @property
     def has_messages(self) -> bool:
@@ -190,20 +190,20 @@ class Input:
 
     def unsubscribe(self) -> None:
         """Listen no more."""
-        for one in self._subscriptions.values():
-            self._node.destroy_subscription(one.of_rclpy)
+        for subscription in self._subscriptions.values():
+            self._node.destroy_subscription(subscription.of_rclpy)
         self._subscriptions.clear()
 
     def take(self) -> bool:
         """Take in a message that the executor has not brought yet; say whether there was one."""
         taken = False
-        for one in self._subscriptions.values():
-            handle = one.of_rclpy.handle
+        for subscription in self._subscriptions.values():
+            handle = subscription.of_rclpy.handle
             with handle:
                 message = handle.take_message(self._kind, True)
             if message is not None:
                 taken = True
-                one.hear(*message)
+                subscription.hear(*message)
         return taken
 
     def adapt(self) -> None:
@@ -361,45 +361,51 @@ def explain_silence(node: Any, inputs: Sequence[Input]) -> tuple[str, str]:
     return (f'no message on {one.resolved}{since}', _reason(node, inputs, one, publishers[one]))
 
 
-def _reason(node: Any, inputs: Sequence[Input], one: Input, publishers: Sequence[Any]) -> str:
+def _reason(
+    node: Any, inputs: Sequence[Input], subscription: Input, publishers: Sequence[Any]
+) -> str:
     if not publishers:
-        if one.has_messages:
+        if subscription.has_messages:
             return 'its publisher is gone; start it again'
         return 'it has no publisher; ' + _proposal(node, inputs)
-    right = [info for info in publishers if info.topic_type == one.typename]
+    right = [info for info in publishers if info.topic_type == subscription.typename]
     if not right:
         kinds = ', '.join(sorted({info.topic_type for info in publishers}))
-        return f'its type is {kinds}, but {one.typename} is needed; ' + _proposal(node, inputs)
+        return f'its type is {kinds}, but {subscription.typename} is needed; ' + _proposal(
+            node, inputs
+        )
     names = ', '.join(sorted({info.node_name for info in right}))
-    if one.has_messages:
+    if subscription.has_messages:
         return (
             f'{names} is still connected; check its own input, and run ros2 topic hz '
-            f'{one.resolved}'
+            f'{subscription.resolved}'
         )
     offers = [info.qos_profile for info in right]
     if all(
         qos_check_compatible(offered, asked)[0] == QoSCompatibility.ERROR
         for offered in offers
-        for asked in one.profiles
+        for asked in subscription.profiles
     ):
         return (
             f'{names} offers {qos_words(offers[0])}, but this node requests '
-            f'{qos_words(one.profiles[0])}; remove {PREFIX}{one.resolved}.subscription.*'
+            f'{qos_words(subscription.profiles[0])}; remove '
+            f'{PREFIX}{subscription.resolved}.subscription.*'
         )
-    return f'{names} is connected, but no message has arrived{_remedy(one, offers)}'
+    return f'{names} is connected, but no message has arrived{_remedy(subscription, offers)}'
 
 
-def _remedy(one: Input, offers: Sequence[Any]) -> str:
+def _remedy(subscription: Input, offers: Sequence[Any]) -> str:
     """Return what may help where a publisher that is heard has sent nothing, or nothing came."""
-    if one.typename not in _LARGE:
+    if subscription.typename not in _LARGE:
         volatile = all(offer.durability == DurabilityPolicy.VOLATILE for offer in offers)
-        if one.latched and volatile:
+        if subscription.latched and volatile:
             return ' (volatile: what was sent before this node started is lost; publish it again)'
-        return f'; check its own input, and run ros2 topic hz {one.resolved}'
+        return f'; check its own input, and run ros2 topic hz {subscription.resolved}'
     if all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers):
-        override = f'set {PREFIX}{one.resolved}.subscription.reliability:=reliable'
-        return f'; if ros2 topic hz {one.resolved} shows messages, {override}'
-    return f' (best effort loses large messages: {_loss_remedy(one.typename, one.resolved)})'
+        override = f'set {PREFIX}{subscription.resolved}.subscription.reliability:=reliable'
+        return f'; if ros2 topic hz {subscription.resolved} shows messages, {override}'
+    remedy = _loss_remedy(subscription.typename, subscription.resolved)
+    return f' (best effort loses large messages: {remedy})'
 
 
 def _loss_remedy(typename: str, topic: str) -> str:

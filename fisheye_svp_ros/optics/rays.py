@@ -121,9 +121,9 @@ def _shifted_rays(
     limit = search_limit(shift, lens.max_incidence)
     apart = ~settled | (theta <= 0) | (distance < caustic_range(shift, limit))
     if np.count_nonzero(apart):
-        found = _scan(shift, limit, r[apart], z[apart])
-        theta[apart], sin[apart], cos[apart] = found, np.sin(found), np.cos(found)
-        value, rise = shift_at(shift, found, sin[apart], cos[apart])
+        roots = _scan(shift, limit, r[apart], z[apart])
+        theta[apart], sin[apart], cos[apart] = roots, np.sin(roots), np.cos(roots)
+        value, rise = shift_at(shift, roots, sin[apart], cos[apart])
         clearance[apart] = newton_step(r[apart], z[apart], sin[apart], cos[apart], value, rise)[1]
     return theta, (sin, cos, clearance)
 

@@ -33,9 +33,9 @@ class Claim(NamedTuple):
     numbers: dict[str, float]
 
 
-def claims(found: Mapping[str, LensEvaluation]) -> list[Claim]:
+def claims(evaluations: Mapping[str, LensEvaluation]) -> list[Claim]:
     """Check every statement on the evaluations of both lenses with the SVP solver."""
-    pair = [found[name] for name in LENSES]
+    pair = [evaluations[name] for name in LENSES]
     return [
         *(claim for one in pair for claim in _localization_bounds(one)),
         *_localization(*pair),
@@ -52,8 +52,8 @@ def _claim(
     return Claim(section, statement, verdict, {name: float(v) for name, v in numbers.items()})
 
 
-def _localization_bounds(one: LensEvaluation) -> Iterator[Claim]:
-    lens, table = one.lens.name, one.localization
+def _localization_bounds(evaluation: LensEvaluation) -> Iterator[Claim]:
+    lens, table = evaluation.lens.name, evaluation.localization
     name = NAMES[lens]
     worst = np.abs(table[..., :2]).max()
     yield _claim(
@@ -83,11 +83,11 @@ def _localization_bounds(one: LensEvaluation) -> Iterator[Claim]:
     )
 
 
-def _localization(one: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]:
-    z = [found.localization[..., _Z] for found in (one, other)]
+def _localization(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]:
+    z = [found.localization[..., _Z] for found in (evaluation, other)]
     size = [np.abs(values).mean() for values in z]
     angles = np.radians(np.linspace(0, 88, 89))
-    spans = [1e3 * np.ptp(found.lens.shift_at(angles)) for found in (one, other)]
+    spans = [1e3 * np.ptp(found.lens.shift_at(angles)) for found in (evaluation, other)]
     yield _claim(
         3,
         'The z errors of Fish214 are fairly large, those of Fish180 much smaller, because the '
@@ -96,7 +96,7 @@ def _localization(one: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]
         _by_lens('mean |z|, {}, mm', size) | _by_lens('shift range to 88 degree, {}, mm', spans),
     )
     change = [(np.ptp(v, axis=0) / np.abs(v).mean(axis=0)).max() for v in z]
-    axis = [found.localization[..., _AXIS] for found in (one, other)]
+    axis = [found.localization[..., _AXIS] for found in (evaluation, other)]
     growth = min((a[-1] / a[0]).min() for a in axis)
     yield _claim(
         3,
@@ -116,7 +116,7 @@ def _localization(one: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]
     # Whole beside Inner and Outer, in what noise does to z and in what SVP does.
     numbers: dict[str, float] = {}
     best: list[bool] = []
-    for found, values in zip((one, other), far, strict=True):
+    for found, values in zip((evaluation, other), far, strict=True):
         noise = [1e3 * np.sqrt(s.solved.covariance[0, 2, 2]) for s in found.localized]
         for spread, deviation, error in zip(SPREADS, noise, np.abs(values), strict=True):
             where = f'{NAMES[found.lens.name]} {spread.title()} 2.0 m, mm'
@@ -133,9 +133,9 @@ def _localization(one: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]
     )
 
 
-def _calibration(one: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]:
-    position = [np.linalg.norm(f.calibration[..., :3], axis=-1) for f in (one, other)]
-    axis = [found.calibration[..., _AXIS] for found in (one, other)]
+def _calibration(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]:
+    position = [np.linalg.norm(f.calibration[..., :3], axis=-1) for f in (evaluation, other)]
+    axis = [found.calibration[..., _AXIS] for found in (evaluation, other)]
     worst, worst_axis = position[0].max(), axis[0].max()
     yield _claim(
         4,
@@ -155,10 +155,10 @@ def _calibration(one: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]:
     )
 
 
-def _stereo(one: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]:
+def _stereo(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]:
     # Lens, radius, style.
     error2, largest, error3 = (
-        np.stack([found.panels(name).reshape(3, 3) for found in (one, other)])
+        np.stack([found.panels(name).reshape(3, 3) for found in (evaluation, other)])
         for name in ('error2_px', 'error2_max_px', 'error3_m')
     )
     growth = error2[:, 1:] / error2[:, :-1]

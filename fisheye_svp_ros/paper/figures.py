@@ -101,18 +101,18 @@ def draw_height(path: Path, lenses: dict[str, Lens]) -> None:
         axis.legend(loc='center left')
 
 
-def draw_localization(path: Path, found: dict[str, LensEvaluation]) -> None:
+def draw_localization(path: Path, evaluations: dict[str, LensEvaluation]) -> None:
     """Figure 6: two views of every environment, and the residuals of both lenses, x 100."""
     rows = [(radius, spread) for radius in range(len(RADII)) for spread in range(len(SPREADS))]
     with picture(path, 10.5, 2.5 * len(rows)) as figure:
         axes = _fixed_grid(figure, len(rows), 4)
         for line, (radius, spread) in zip(axes, rows, strict=True):
-            points = found[LENSES[0]].localized[spread].views.points[radius]
+            points = evaluations[LENSES[0]].localized[spread].views.points[radius]
             for axis, view in zip(line[:2], _VIEWS, strict=True):
                 _draw_world(axis, view, points)
             line[0].set_ylabel(f'{SPREADS[spread].title()}, {RADII[radius]} m\ny / m')
             for axis, name in zip(line[2:], LENSES, strict=True):
-                one = found[name]
+                one = evaluations[name]
                 _draw_image_frame(axis, one.lens)
                 mean = one.localization[radius, spread, -1]
                 _draw_residuals(axis, one.localized[spread], radius, _COLOURS[name])
@@ -171,18 +171,18 @@ def draw_calibration_poses(path: Path) -> None:
         legend_below(figure, axis)
 
 
-def draw_stereo(path: Path, found: LensEvaluation, panels: list[Panel]) -> None:
+def draw_stereo(path: Path, evaluation: LensEvaluation, panels: list[Panel]) -> None:
     """Nine rows: left image with epipolar curves and vertical errors; two views of 3-D points."""
     with picture(path, 9.6, 3.2 * len(panels)) as figure:
         axes = _fixed_grid(figure, len(panels), 3)
-        for line, measured, panel in zip(axes, found.measured, panels, strict=True):
-            _draw_left_image(line[0], found, measured, panel.style)
+        for line, measured, panel in zip(axes, evaluation.measured, panels, strict=True):
+            _draw_left_image(line[0], evaluation, measured, panel.style)
             line[0].set_ylabel(f'{panel.style}, {panel.radius} m')
             for axis, ((across, up), *names) in zip(line[1:], _VIEWS, strict=True):
                 _draw_points(axis, measured, across, up)
                 _frame_world(axis, panel.radius, *names)
             line[1].set_title(_caption(panel), fontsize=8.5, loc='left')
-        name = found.lens.name
+        name = evaluation.lens.name
         figure.suptitle(
             f'{NAMES[name]}: vertical errors x {_VERTICAL_MAGNIFIED[name]}; orange: true, blue: '
             'measured\nError2: mean distance from the epipolar curve; Error3: mean distance of '
@@ -192,21 +192,21 @@ def draw_stereo(path: Path, found: LensEvaluation, panels: list[Panel]) -> None:
         )
 
 
-def draw_solvers(path: Path, found: Mapping[str, Mapping[str, LensEvaluation]]) -> None:
+def draw_solvers(path: Path, evaluations: Mapping[str, Mapping[str, LensEvaluation]]) -> None:
     """Draw mean errors of all solvers, a line a solver, a mark a lens."""
-    place = np.arange(len(found))[::-1]
+    place = np.arange(len(evaluations))[::-1]
     with picture(path, 11.0, 4.2) as figure:
         axes = figure.subplots(1, len(_SUMMARIES), sharey=True)
         for axis, (title, summary) in zip(axes, _SUMMARIES.items(), strict=True):
             for k, name in enumerate(LENSES):
-                values = np.array([summary(by_lens[name]) for by_lens in found.values()])
+                values = np.array([summary(by_lens[name]) for by_lens in evaluations.values()])
                 drawn = np.where(values > _ZERO, values, np.nan)
                 axis.plot(drawn, place, 'os'[k], color=_COLOURS[name], label=NAMES[name])
             axis.set_title(title, fontsize=9)
             axis.set_xscale('log')
             axis.xaxis.set_major_locator(LogLocator(numticks=6))
             low = axis.get_xlim()[0]
-            exact = list(found).index('ShiftVP')
+            exact = list(evaluations).index('ShiftVP')
             axis.annotate(
                 'none',
                 (low, place[exact]),
@@ -216,7 +216,7 @@ def draw_solvers(path: Path, found: Mapping[str, Mapping[str, LensEvaluation]]) 
                 textcoords='offset points',
                 fontsize=8,
             )
-        axes[0].set_yticks(place, list(found))
+        axes[0].set_yticks(place, list(evaluations))
         legend_below(figure, axes[0])
 
 
@@ -327,8 +327,10 @@ def _caption(panel: Panel) -> str:
     return f'{text}\npublished: {panel.published_error2:.3f} px, {panel.published_error3:.2f} mm'
 
 
-def _draw_left_image(axis: Any, found: LensEvaluation, measured: Measurement, style: str) -> None:
-    lens = found.lens
+def _draw_left_image(
+    axis: Any, evaluation: LensEvaluation, measured: Measurement, style: str
+) -> None:
+    lens = evaluation.lens
     _draw_image_frame(axis, lens)
     both = np.isfinite(measured.distance)
     known = ForwardModel(lens.svp())

@@ -102,8 +102,8 @@ def localize_environments(
     true = paper_pose(len(points))
     views = views_of(points, ForwardModel(lens).predict(true, views_of(points)).uv)
     model = ForwardModel(lens.svp() if solver is None else solver)
-    found = localize_sets(model, views, true, true if start is None else start)
-    return LocalizedSpread(_rows(found.metrics), found.solution, views)
+    solved = localize_sets(model, views, true, true if start is None else start)
+    return LocalizedSpread(_rows(solved.metrics), solved.solution, views)
 
 
 def localize_spreads(lens: Lens, solver: Lens | None = None) -> tuple[LocalizedSpread, ...]:
@@ -140,16 +140,16 @@ def calibrate_rigs(
             seen.append(views_of(points, model.predict(pose, blank).uv))
     left_views, right_views = map(Views.concatenate, views)
     known = ForwardModel(lens.svp() if solver is None else solver)
-    found = solve_rigs(
+    solved = solve_rigs(
         (known, known),
         left_views,
         right_views,
         len(systems),
         Pose.stack([true for _, true in systems]),
     )
-    table = _rows(found.metrics)
+    table = _rows(solved.metrics)
     table[:, :3] = table[:, :3] @ PAPER_FROM_OPTICAL
-    return table.reshape(len(RADII), len(STYLE_NAMES), -1), found.solution
+    return table.reshape(len(RADII), len(STYLE_NAMES), -1), solved.solution
 
 
 def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -> Measurement:
@@ -167,15 +167,15 @@ def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -
     solved = measure_points(
         (known, known), left_in_right.take(None), uv_left, uv_right, right.into_body(points)
     )
-    found = solved.solution
+    calibration = solved.solution
     return Measurement(
         uv_left[0],
         uv_right[0],
-        found.foot[0],
-        found.distance[0],
-        found.vertical[0],
+        calibration.foot[0],
+        calibration.distance[0],
+        calibration.vertical[0],
         points,
-        found.points[0] @ right.rotation[0].T + right.position[0],
+        calibration.points[0] @ right.rotation[0].T + right.position[0],
         {name: float(value[0]) for name, value in solved.metrics.items()},
     )
 

@@ -137,7 +137,7 @@ def _recovery(results: Results) -> Iterator[Block]:
     for k, name in enumerate(LENSES):
         curves = _MM * shift_curves(fits, name, theta)
         own = results.lenses[name].shift_at(theta)
-        f = np.array([one.lens_numbers[k, 0] for one in fits])
+        f = np.array([fit.lens_numbers[k, 0] for fit in fits])
         rows.append([NAMES[name], 'f, px', f'{results.lenses[name].fx:.1f}', _span(f, 1)])
         rows += [
             [NAMES[name], f'shift at {angle} degree, mm', f'{_MM * value:.2f}', _span(fitted, 2)]

@@ -72,10 +72,12 @@ class Results(NamedTuple):
 
     def cells(self, variant: str = SVP) -> list[Cell]:
         """Return the 180 cells of tables 1 to 4 for a variant of the solver."""
-        found = [self.found[variant][name] for name in LENSES]
+        evaluations = [self.found[variant][name] for name in LENSES]
         return [
-            *cells(LOCALIZATION, np.stack([one.localization for one in found]), 1, SPREADS),
-            *cells(CALIBRATION, np.stack([one.calibration for one in found]), 3, STYLE_NAMES),
+            *cells(LOCALIZATION, np.stack([one.localization for one in evaluations]), 1, SPREADS),
+            *cells(
+                CALIBRATION, np.stack([one.calibration for one in evaluations]), 3, STYLE_NAMES
+            ),
         ]
 
     def panels(self) -> list[Panel]:
@@ -166,13 +168,13 @@ def tasks() -> int:
     return len(LENSES) * (len(VARIANTS) + 1)
 
 
-def _panels(found: LensEvaluation) -> list[Panel]:
-    error2, error3 = found.panels('error2_px'), 1e3 * found.panels('error3_m')
-    vertical, points = found.panels('error2_vertical_px'), found.panels('points')
-    captions = captions_of(found.lens.name, error2, error3)
+def _panels(evaluation: LensEvaluation) -> list[Panel]:
+    error2, error3 = evaluation.panels('error2_px'), 1e3 * evaluation.panels('error3_m')
+    vertical, points = evaluation.panels('error2_vertical_px'), evaluation.panels('points')
+    captions = captions_of(evaluation.lens.name, error2, error3)
     return [
         Panel(
-            found.lens.name,
+            evaluation.lens.name,
             *panel,
             int(points[i]),
             float(error2[i]),

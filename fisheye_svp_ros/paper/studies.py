@@ -52,7 +52,7 @@ class Family(NamedTuple):
     @property
     def matching(self) -> list[Member]:
         """The members that reproduce tables 1 and 2."""
-        return [one for one in self.members if one.within_10 >= CELLS_NEEDED]
+        return [member for member in self.members if member.within_10 >= CELLS_NEEDED]
 
 
 class Stopping(NamedTuple):
@@ -126,7 +126,7 @@ def load_stopping(path: str | Path | None = None) -> Stopping:
 def shift_curves(members: Sequence[Member], lens: str, theta: Array) -> Array:
     """Return the viewpoint shifts (M, T), m, of the members at incidence angles (T,), rad."""
     which = LENSES.index(lens)
-    curves = [Gennery(*one.lens_numbers[which, 1:]) for one in members]
+    curves = [Gennery(*member.lens_numbers[which, 1:]) for member in members]
     return np.stack([curve.value_and_slope(theta, np.tan(theta / 2))[0] for curve in curves])
 
 

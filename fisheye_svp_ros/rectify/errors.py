@@ -46,8 +46,8 @@ def image_error(side: Rectification, ranges: Array) -> ImageError:
     px = np.full((len(ranges), len(pixels)), np.nan)
     for row, range_m in enumerate(ranges):
         uv, seen = side.image_points(directions, range_m)
-        found = side.rectified_points(np.where(seen[:, None], uv, np.nan))
-        px[row] = _distances(side.camera, found, pixels)
+        points = side.rectified_points(np.where(seen[:, None], uv, np.nan))
+        px[row] = _distances(side.camera, points, pixels)
     return ImageError(ranges, pixels, px)
 
 
@@ -110,12 +110,12 @@ def quantiles(errors: Array) -> Array:
     )
 
 
-def _distances(camera: RectifiedCamera, found: Array, pixels: Array) -> Array:
-    """Return the distances (N,), px, between pixels (N, 2); NaN where `found` is."""
-    straight: Array = np.linalg.norm(found - pixels, axis=-1)
+def _distances(camera: RectifiedCamera, places: Array, pixels: Array) -> Array:
+    """Return the distances (N,), px, between pixels (N, 2); NaN where `places` is."""
+    straight: Array = np.linalg.norm(places - pixels, axis=-1)
     if camera.projection != 'equirectangular':
         return straight
-    chord = np.linalg.norm(camera.directions(*found.T) - camera.directions(*pixels.T), axis=-1)
+    chord = np.linalg.norm(camera.directions(*places.T) - camera.directions(*pixels.T), axis=-1)
     along = camera.f * 2 * np.arcsin(np.minimum(chord / 2, 1.0))
     return np.asarray(np.where(np.isfinite(straight), along, np.nan))
 

@@ -149,8 +149,8 @@ class Rectification:
                 f'{self.lens.width}x{self.lens.height} px; give the lens of this camera at this '
                 'size'
             )
-        found = cv2.remap(pixels, self.maps.u, self.maps.v, interpolation)
-        return np.asarray(found)
+        rectified = cv2.remap(pixels, self.maps.u, self.maps.v, interpolation)
+        return np.asarray(rectified)
 
     def image_points(self, directions: Array, range_m: float) -> Image:
         """Project points at a range in rectified directions (..., 3) through the lens."""
@@ -304,22 +304,22 @@ def nearest_svp_lens(lens: Lens, range_m: float) -> tuple[Lens, float]:
 
 def _fit_parameters(start: Lens, names: tuple[str, ...], points: Array, uv: Array) -> Lens:
     """Return the lens with some parameters fitted to image points (N, 2) of points (N, 3)."""
-    found = start
+    lens = start
     for _ in range(_MOST_STEPS):
         image = camera.LinearImage(
-            found,
+            lens,
             points,
             False,
-            *camera.project(found, points, False),
+            *camera.project(lens, points, False),
             np.empty((len(points), 2, 3)),
         )
-        columns = camera.lens_columns(found, image, names).reshape(-1, len(names))
+        columns = camera.lens_columns(lens, image, names).reshape(-1, len(names))
         size = np.linalg.norm(columns, axis=0)
         residual = (uv - image.uv).ravel()
         change = np.linalg.lstsq(columns / size, residual, rcond=None)[0]
         moved = columns @ (change / size)
-        values = [found.fx if name == 'f' else found.parameters[name] for name in names]
-        found = found.with_parameters(names, values + change / size)
+        values = [lens.fx if name == 'f' else lens.parameters[name] for name in names]
+        lens = lens.with_parameters(names, values + change / size)
         if np.abs(moved).max() < _TOLERANCE:
             break
-    return found
+    return lens

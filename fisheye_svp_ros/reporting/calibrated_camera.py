@@ -94,11 +94,11 @@ class CalibratedCamera:
         ]
 
 
-def hand_eye_rows(found: HandEye) -> list[tuple[str, ...]]:
+def hand_eye_rows(hand_eye: HandEye) -> list[tuple[str, ...]]:
     """Return both transforms as ROBOT_HEADER has them, each with its standard errors below it."""
     return [
-        *_rows(found.places[0], found.camera, found.stderr[:6]),
-        *_rows(found.places[1], found.target, found.stderr[6:12]),
+        *_rows(hand_eye.places[0], hand_eye.camera, hand_eye.stderr[:6]),
+        *_rows(hand_eye.places[1], hand_eye.target, hand_eye.stderr[6:12]),
     ]
 
 

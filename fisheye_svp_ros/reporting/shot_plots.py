@@ -80,7 +80,7 @@ def _frame(axis: Any, lens: Lens) -> None:
         side.set_visible(True)
 
 
-def draw_guide(pixels: Pixels, guide: Guide, seen: DetectedBoard | None) -> NDArray[np.uint8]:
+def draw_guide(pixels: Pixels, guide: Guide, board: DetectedBoard | None) -> NDArray[np.uint8]:
     """Return the picture (H, W, 3), blue, green, red, of an image with the guide over it."""
     zoom = min(1.0, _MAX_WIDTH / max(pixels.shape))
     picture, outline = to_color(pixels, zoom), guide.outline
@@ -101,10 +101,10 @@ def draw_guide(pixels: Pixels, guide: Guide, seen: DetectedBoard | None) -> NDAr
             cv2.LINE_AA,
             _FRACTION_BITS,
         )
-    if seen is not None:
-        found = _to_fixed_point(seen.uv, zoom)
+    if board is not None:
+        found = _to_fixed_point(board.uv, zoom)
         _dots(picture, found, _SEEN, 3)
-        first = found[int(np.argmin(seen.ids))].tolist()
+        first = found[int(np.argmin(board.ids))].tolist()
         cv2.circle(picture, first, 9 << _FRACTION_BITS, _SEEN, 2, cv2.LINE_AA, _FRACTION_BITS)
     _draw_texts(picture, guide)
     return picture

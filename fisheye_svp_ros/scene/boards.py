@@ -112,12 +112,12 @@ class BoardTurn(NamedTuple):
 
 def board_turns(landmarks: Landmarks, board_of: Index) -> list[BoardTurn]:
     """Return every turn of every flat board; board_of (L,): of each landmark."""
-    found = []
+    boards = []
     for board in find_boards(landmarks.points, board_of):
         mine = board_of == board.id
         if board.flat:
-            found += _turns(board, landmarks.ids[mine], landmarks.points[mine])
-    return found
+            boards += _turns(board, landmarks.ids[mine], landmarks.points[mine])
+    return boards
 
 
 def _turns(board: Board, ids: Index, points: Array) -> list[BoardTurn]:

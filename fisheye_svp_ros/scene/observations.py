@@ -324,8 +324,8 @@ def frame_names(table: Observations, frame: int, camera: str | None = None) -> l
     names = photograph_names(table)
     here = (table.cameras[i] for i in np.unique(table.camera))
     cameras = here if camera is None else (camera,)
-    found = [names[frame, one] for one in cameras if (frame, one) in names]
-    return found or [f'frame {frame}' + (f' of {camera}' if camera else '')]
+    listed = [names[frame, one] for one in cameras if (frame, one) in names]
+    return listed or [f'frame {frame}' + (f' of {camera}' if camera else '')]
 
 
 def frame_name(table: Observations, frame: int, camera: str | None = None) -> str:

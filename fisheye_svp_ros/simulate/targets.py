@@ -137,10 +137,10 @@ def _draw_poses(
 ) -> Pose:
     """Return the first `count` poses drawn that are good; raise GeometryError for too few."""
     drawn = (draw() for _ in range(count * _TRIES))
-    found = [*islice(filter(good, drawn), count)]
-    if len(found) < count:
+    poses = [*islice(filter(good, drawn), count)]
+    if len(poses) < count:
         raise GeometryError(wrong)
-    return Pose.stack(found)
+    return Pose.stack(poses)
 
 
 def _placed_in_sight(

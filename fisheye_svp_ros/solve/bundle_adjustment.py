@@ -265,7 +265,7 @@ class Adjustment:
 
     def pack(self, states: Sequence[RigState]) -> Arrays:
         """Return the states as rotations and positions of poses and rig, and shared values."""
-        parts = [(*one.pose, *one.rig, one.shared_values(self._free)) for one in states]
+        parts = [(*state.pose, *state.rig, state.shared_values(self._free)) for state in states]
         return tuple(np.stack(arrays) for arrays in zip(*parts, strict=True))
 
     def unpack(self, packed: Arrays, system: int = 0) -> RigState:

@@ -77,19 +77,19 @@ def _find_group(
 
 def _seeds(rest: Index, orders: Sequence[Array]) -> Iterator[Index]:
     """Yield few views that may be of one camera: near in some order, in step, or by chance."""
-    found: list[tuple[int, ...]] = []
+    groups: list[tuple[int, ...]] = []
     for order in orders:
         sorted_views = rest[np.argsort(order, kind='stable')]
-        found += [tuple(sorted_views[:_SEED]), tuple(sorted_views[-_SEED:])]
-    found += [
+        groups += [tuple(sorted_views[:_SEED]), tuple(sorted_views[-_SEED:])]
+    groups += [
         tuple(rest[: stride * _SEED : stride])
         for stride in _STRIDES
         if len(rest) > stride * (_SEED - 1)
     ]
     rng = np.random.default_rng(0)
-    while len(found) < _MAX_SEEDS:
-        found.append(tuple(rng.choice(rest, min(_SEED, len(rest)), replace=False)))
-    for seed in dict.fromkeys(tuple(sorted(one)) for one in found):
+    while len(groups) < _MAX_SEEDS:
+        groups.append(tuple(rng.choice(rest, min(_SEED, len(rest)), replace=False)))
+    for seed in dict.fromkeys(tuple(sorted(one)) for one in groups):
         yield np.array(seed)
 
 

@@ -240,7 +240,7 @@ def _likelier_arrangement(
     And the odds of that arrangement against the other: both have as many parameters, so that they
     are those of the noise that each leaves.
     """
-    found: list[tuple[float, Transforms, _Robot, Array]] = []
+    starts: list[tuple[float, Transforms, _Robot, Array]] = []
     problem: GeometryError | None = None
     freedom = 3 * int(known.sum()) - PARAMETERS / 2  # of positions, and of turns
     for fixed in (False, True):
@@ -255,12 +255,12 @@ def _likelier_arrangement(
         noise = np.maximum(np.sqrt((off**2).mean(axis=(0, 2))), _MIN_NOISE)
         # Of the robot, in its own lengths: a scale near zero would explain any position.
         own = noise / [max(abs(start.scale), _MIN_NOISE), 1.0]
-        found.append((-freedom * float(np.log(own).sum()), start, robot, noise))
-    if not found:
+        starts.append((-freedom * float(np.log(own).sum()), start, robot, noise))
+    if not starts:
         assert problem is not None
         raise problem
-    likelihood, start, robot, noise = max(found, key=lambda one: one[0])
-    other = min(one[0] for one in found) if len(found) > 1 else -np.inf
+    likelihood, start, robot, noise = max(starts, key=lambda one: one[0])
+    other = min(one[0] for one in starts) if len(starts) > 1 else -np.inf
     odds = min(float(np.exp(min(likelihood - other, 100.0))), MAX_ODDS)
     return start, robot, noise, odds
 

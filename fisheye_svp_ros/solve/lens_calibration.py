@@ -122,18 +122,18 @@ def calibrate_port(
 
 
 def calibrate_hand_eye(
-    found: Calibration,
+    calibration: Calibration,
     observations: Observations,
     poses: dict[int, Pose],
     free: Sequence[str] | None = None,
 ) -> tuple[Calibration, HandEye]:
     """Fit a calibrated lens anew, together with the robot that carried the camera, or the target.
 
-    found: the calibration of the observations without poses; poses: of the flange, by frame; a
+    calibration: of the observations without poses; poses: of the flange, by frame; a
     frame may have none; free: parameters of the lens to fit, those of the calibration by default.
     Raises ObservationError where these do not determine the hand-eye transform, or fit none.
     """
-    adjusted, views = found.adjusted, found.views
+    adjusted, views = calibration.adjusted, calibration.views
     data = replace(RigViews.of_one_camera(views), table=observations)
     state = RigState(adjusted.pose, identity(1), adjusted.lens, (), corrected=True)
     names = adjusted.names if free is None else tuple(free)
@@ -147,7 +147,7 @@ def calibrate_hand_eye(
     linear = Linearization(data, state, names)
     # The covariances stay those of the images alone, which are no smaller.
     adjusted = adjusted._replace(lens=state.lens, pose=state.pose, residual=linear.residual_px)
-    return _with_figures(found, adjusted, hand_eye=hand_eye.to_dict()), hand_eye
+    return _with_figures(calibration, adjusted, hand_eye=hand_eye.to_dict()), hand_eye
 
 
 def with_values(found: Calibration, values: Sequence[float]) -> Calibration:

@@ -40,15 +40,15 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
     """
     model = model.seeing(views)
     still = model.without_motion()
-    found = _localize(still, views, start)
+    solution = _localize(still, views, start)
     for _ in range(_MOTIONS if still is not model else 0):
-        moving = views._replace(t=np.where(found.converged[:, None], views.t, np.nan))
-        moved, stood = (one.predict(found.pose, moving, False).uv for one in (model, still))
+        moving = views._replace(t=np.where(solution.converged[:, None], views.t, np.nan))
+        moved, stood = (one.predict(solution.pose, moving, False).uv for one in (model, still))
         moved = np.nan_to_num(moved - stood)
         if not moved.any():
             break
-        found = _localize(still, views._replace(uv=views.uv - moved), found.pose)
-    return found
+        solution = _localize(still, views._replace(uv=views.uv - moved), solution.pose)
+    return solution
 
 
 def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localization:
@@ -75,13 +75,13 @@ def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localiza
 
 
 def _improve(
-    model: ForwardModel, views: Views, found: Localization, rows: Index, start: Pose
+    model: ForwardModel, views: Views, localization: Localization, rows: Index, start: Pose
 ) -> None:
     """Write what fits better from further starts (R, C) of views (R,), and the second best."""
     repeated = np.repeat(rows, start.shape[1])
     other, _ = _solve_from(model, views.take(repeated), start.reshape(-1))
     cost = np.where(other.converged, other.cost, np.inf).reshape(start.shape)
-    before = found.take(rows)
+    before = localization.take(rows)
     known = Pose.stack([before.pose, before.other])
     minima = Pose(
         *(
@@ -93,14 +93,14 @@ def _improve(
     costs = np.concatenate([costs, cost], axis=1)
     best = np.argmin(cost, axis=1) + start.shape[1] * np.arange(len(rows))
     better = cost.min(axis=1) < before.cost
-    found.put(rows[better], other.take(best[better]))
-    now = found.take(rows)
+    localization.put(rows[better], other.take(best[better]))
+    now = localization.take(rows)
     away = minima.difference(now.pose.take((slice(None), None)))
     costs[~(squared_distances(away, now.covariance) > _MIN_SEPARATION)] = np.inf
     second = np.arange(len(rows)), np.argmin(costs, axis=1)
-    found.other.put(rows, minima.take(second))
+    localization.other.put(rows, minima.take(second))
     base = np.where(now.converged, now.cost, -np.inf)
-    found.gap[rows] = np.maximum(costs[second] - base, 0.0)
+    localization.gap[rows] = np.maximum(costs[second] - base, 0.0)
 
 
 def _solve_from(model: ForwardModel, views: Views, start: Pose) -> tuple[Localization, bool]:

@@ -58,7 +58,7 @@ class Examination(NamedTuple):
 def examine(
     model: ForwardModel,
     views: Views,
-    found: Localization,
+    localization: Localization,
     sigma_known: bool = True,
     searched: bool = True,
 ) -> Examination:
@@ -70,14 +70,14 @@ def examine(
     """
     model = model.seeing(views)
     if sigma_known:
-        checked = _examine(model, views, found, 1.0, 1.0, searched)
+        checked = _examine(model, views, localization, 1.0, 1.0, searched)
         inliers, result = _inliers(views, checked), checked.result
         return checked._replace(result=hold_weak_geometry(model, inliers, result, checked.excess))
     freedom = np.maximum(2 * (views.weight > 0).sum(axis=1) - 6, 1)
-    usual = float(np.sqrt(np.median(found.cost / freedom)))
+    usual = float(np.sqrt(np.median(localization.cost / freedom)))
     if len(freedom) < _OTHERS:
-        usual = min(usual, float(_noise_from_median(views, found).max()))
-    checked = _examine(model, views, found, max(usual, _EXACT), _TOLERANCE)
+        usual = min(usual, float(_noise_from_median(views, localization).max()))
+    checked = _examine(model, views, localization, max(usual, _EXACT), _TOLERANCE)
     result, passed = checked.result, np.array([not reason for reason in checked.reasons])
     passed &= result.converged
     some = passed if passed.any() else result.converged
@@ -102,7 +102,7 @@ def _inliers(views: Views, checked: Examination) -> Views:
 def _examine(
     model: ForwardModel,
     views: Views,
-    found: Localization,
+    localization: Localization,
     sigma: float,
     tolerance: float,
     searched: bool = True,
@@ -110,16 +110,18 @@ def _examine(
     """Examine with a sigma in units of 1 / weight; tolerance: of the misfit, as a factor."""
     freedom = 2 * (views.weight > 0).sum(axis=1) - 6
     allowed = (tolerance * sigma) ** 2
-    suspect = ~found.converged | _suspect(views, found, freedom, allowed)
-    result, reasons = found, _far_reasons(views, found)
+    suspect = ~localization.converged | _suspect(views, localization, freedom, allowed)
+    result, reasons = localization, _far_reasons(views, localization)
     gross = np.zeros(views.used.shape, dtype=bool)
     if not suspect.any():
         return Examination(result, gross, tuple(reasons), None, np.ones(len(freedom)))
-    result, excess = Localization.concatenate([found]), np.ones(len(freedom))  # a copy
+    result, excess = Localization.concatenate([localization]), np.ones(len(freedom))  # a copy
     for i in np.flatnonzero(suspect):
         view = views.take([i])
         other = (
-            _consensus_pose(model, view, found.take([i]), sigma, tolerance) if searched else None
+            _consensus_pose(model, view, localization.take([i]), sigma, tolerance)
+            if searched
+            else None
         )
         if other is not None:
             result.put([i], other)
@@ -193,14 +195,14 @@ def noise_sigma(cost: float, rows: int, unknowns: int) -> float:
 
 
 def _consensus_pose(
-    model: ForwardModel, view: Views, found: Localization, sigma: float, tolerance: float
+    model: ForwardModel, view: Views, localization: Localization, sigma: float, tolerance: float
 ) -> Localization | None:
     """Return the pose that most points of one view (1,) agree on, residuals NaN for the others."""
     used = view.weight > 0
     enough = max(MIN_POINTS + _SPARE_POINTS, _MIN_AGREEMENT * used.sum())
     if (used & model.back_project(view.uv).valid).sum() < enough:
         return None
-    start = consensus_pose(model, view, found, sigma)
+    start = consensus_pose(model, view, localization, sigma)
     for _ in range(_ROUNDS):
         inside = _lengths(model, start, view) < _GROSS * tolerance * sigma
         if inside.sum() < enough:
@@ -217,27 +219,31 @@ def _consensus_pose(
     return solved
 
 
-def _suspect(views: Views, found: Localization, freedom: Array, allowed: float) -> Mask:
+def _suspect(views: Views, localization: Localization, freedom: Array, allowed: float) -> Mask:
     """Return which views fail the test of their misfit, or hold a residual that stands out.
 
     allowed: variance of a row.
     """
     with np.errstate(divide='ignore', invalid='ignore'):  # where no view has a pose
         largest = np.fmax.reduce(
-            np.where(views.weight > 0, (found.residual**2).sum(axis=-1) * views.weight**2, 0.0),
+            np.where(
+                views.weight > 0, (localization.residual**2).sum(axis=-1) * views.weight**2, 0.0
+            ),
             axis=1,
         )
-        mean = found.cost / np.maximum(freedom, 1)
+        mean = localization.cost / np.maximum(freedom, 1)
         stands_out = largest > 2 * _MAX_RESIDUAL_RATIO**2 * mean
-        return np.asarray(misfit_fails(found.cost / allowed, freedom) | stands_out)
+        return np.asarray(misfit_fails(localization.cost / allowed, freedom) | stands_out)
 
 
-def consensus_pose(model: ForwardModel, view: Views, found: Localization, sigma: float) -> Pose:
+def consensus_pose(
+    model: ForwardModel, view: Views, localization: Localization, sigma: float
+) -> Pose:
     """Return the pose (1,) that the points agree on best, from minimal subsets of them."""
     rays = model.back_project(view.uv)
     usable = np.flatnonzero((view.weight[0] > 0) & rays.valid[0])
     if len(usable) < MIN_POINTS:
-        return found.pose
+        return localization.pose
     # Six points fix a pose without a search among turns, which four of few need.
     enough = len(usable) >= _SUBSET + _SPARE_POINTS
     many, size = (_SUBSETS, _SUBSET) if enough else (_FEW_SUBSETS, MIN_POINTS)
@@ -246,7 +252,7 @@ def consensus_pose(model: ForwardModel, view: Views, found: Localization, sigma:
     pose = initial_poses(
         view.points[0, subset], rays.direction[0, subset], np.ones(subset.shape), not enough
     )
-    pose = Pose.concatenate([pose, found.pose])
+    pose = Pose.concatenate([pose, localization.pose])
     views = view.take(np.zeros(len(pose.position), dtype=int))
     off = _median(_lengths(model, pose, views), views)
     best = np.argsort(off, kind='stable')[:_KEPT]
@@ -276,9 +282,9 @@ def _median(length: Array, views: Views) -> Array:
     return np.asarray(median[:, 0])
 
 
-def _noise_from_median(views: Views, found: Localization) -> Array:
+def _noise_from_median(views: Views, localization: Localization) -> Array:
     """Return the noise (S,) that the median residuals speak of; they hide some of it."""
-    length = np.where(views.weight > 0, np.linalg.norm(found.residual, axis=-1), np.inf)
+    length = np.where(views.weight > 0, np.linalg.norm(localization.residual, axis=-1), np.inf)
     count = (views.weight > 0).sum(axis=1)
     hidden = np.sqrt(count / np.maximum(count - 3, 1))
     with np.errstate(invalid='ignore'):  # no weight, no residual
@@ -303,8 +309,8 @@ def _landmark_names(landmark: Index, size: Array) -> str:
     return f'landmark{"s" if len(landmark) > 1 else ""} {names}{more}'
 
 
-def _far_reasons(views: Views, found: Localization) -> list[str]:
-    away = np.linalg.norm(views.points - found.pose.position[:, None], axis=-1)
+def _far_reasons(views: Views, localization: Localization) -> list[str]:
+    away = np.linalg.norm(views.points - localization.pose.position[:, None], axis=-1)
     farthest = np.where(views.weight > 0, away, 0.0).max(axis=1)
     why = f'landmarks lie up to {farthest.max():.0f} m away; check that they are in meters'
     return [why if far > _MAX_RANGE else '' for far in farthest]

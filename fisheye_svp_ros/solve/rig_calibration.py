@@ -121,12 +121,12 @@ def _board_poses(rows: Observations, lenses: Sequence[Lens], boards: tuple[int, 
         left.remove(board)
         shared = sorted(body.keys() & views[board].keys())
         _check_motion([body[frame] for frame in shared])
-        found = _solve_robustly(
+        solution = _solve_robustly(
             Pose.stack([views[board][frame] for frame in shared]),
             Pose.stack([body[frame] for frame in shared]),
         )
-        placed.put(board, found.target)
-        moved = found.flange(Pose.stack(list(views[board].values())))
+        placed.put(board, solution.target)
+        moved = solution.flange(Pose.stack(list(views[board].values())))
         for number, frame in enumerate(views[board]):
             body.setdefault(frame, moved.take(number))
     return placed
@@ -149,11 +149,11 @@ def _solve_robustly(camera: Pose, flange: Pose) -> Transforms:
     kept = np.ones(len(camera.position), dtype=bool)
     size = float(np.median(np.linalg.norm(camera.position, axis=1)))
     for _ in range(_ROUNDS):
-        found = solve_hand_eye(camera.take(kept), flange.take(kept), 1.0)
-        off = found.flange(camera).difference(flange) / np.repeat([size, 1.0], 3)
+        hand_eye = solve_hand_eye(camera.take(kept), flange.take(kept), 1.0)
+        off = hand_eye.flange(camera).difference(flange) / np.repeat([size, 1.0], 3)
         distance = np.linalg.norm(off, axis=1)
         kept = np.asarray(distance <= _MAX_DISTANCE_RATIO * np.median(distance))
-    return found
+    return hand_eye
 
 
 def _in_first_board(rows: Observations, boards: tuple[int, ...], placed: Pose) -> Observations:

@@ -120,18 +120,20 @@ def _grow_map(model: ForwardModel, scene: _Scene, first: int) -> tuple[Pose, Mas
     while True:
         posed = np.asarray((seen & mapped).any(axis=1))
         images = np.flatnonzero(posed)
-        found = localize(model, scene.views(tags, mapped, images))
+        solution = localize(model, scene.views(tags, mapped, images))
         # Of one tag alone a pose may be its mirror image: two tags, or none, tell.
-        sure = found.converged & (((seen[images] & mapped).sum(axis=1) > 1) | (found.gap > 20.0))
+        sure = solution.converged & (
+            ((seen[images] & mapped).sum(axis=1) > 1) | (solution.gap > 20.0)
+        )
         if mapped.sum() == 1:
-            sure = found.converged
+            sure = solution.converged
         posed[images] = sure
-        cameras.put(images, found.pose)
+        cameras.put(images, solution.pose)
         shared = np.where(mapped, 0, (seen & posed[:, None]).sum(axis=0))
         if not shared.any():
             return tags, mapped, cameras, posed
         new = int(np.argmax(shared))
-        alternatives = found if mapped.sum() == 1 else None
+        alternatives = solution if mapped.sum() == 1 else None
         start = _place_tag(model, scene, new, cameras, np.flatnonzero(posed & seen[:, new]))
         if alternatives is not None:
             other = Pose(cameras.rotation.copy(), cameras.position.copy())

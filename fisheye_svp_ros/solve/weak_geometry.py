@@ -37,47 +37,51 @@ _VIEWS_AT_ONCE = 64
 
 
 def hold_weak_geometry(
-    model: ForwardModel, views: Views, found: Localization, scale: Array | float = 1.0
+    model: ForwardModel, views: Views, localization: Localization, scale: Array | float = 1.0
 ) -> Localization:
     """Return poses with covariances that hold for weak geometry and for a neglected shift.
 
     scale (S,): standard deviation of a whitened residual, which the covariances are scaled by
     already.  `gap` is returned in units of it, too.
     """
-    deviation = np.broadcast_to(np.asarray(scale, dtype=float), found.cost.shape)
+    deviation = np.broadcast_to(np.asarray(scale, dtype=float), localization.cost.shape)
     if not (deviation == 1.0).all():
-        found = found._replace(gap=found.gap / deviation**2)
-    covariance, neglected = found.covariance, model.lens.neglected
-    weak, curvature = _weak_views(views, found)
+        localization = localization._replace(gap=localization.gap / deviation**2)
+    covariance, neglected = localization.covariance, model.lens.neglected
+    weak, curvature = _weak_views(views, localization)
     if not weak.size and neglected is None:
-        return found
+        return localization
     if weak.size:
         covariance = covariance.copy()
-        double = found.gap[weak] < _MAX_GAP
+        double = localization.gap[weak] < _MAX_GAP
         many = double | (curvature > _MANY_FROM)
         for two, nodes in ((True, _MANY_NODES), (False, _MANY_NODES), (False, _NODES)):
             group = weak[(double == two) & (many == (nodes == _MANY_NODES))]
             for start in range(0, len(group), _VIEWS_AT_ONCE):
                 rows = group[start : start + _VIEWS_AT_ONCE]
-                some, seen = found.take(rows), views.take(rows)
+                some, seen = localization.take(rows), views.take(rows)
                 minima = (some.pose, some.other)[: 1 + two]
                 covariance[rows] = _integrate(model, seen, minima, deviation[rows], nodes)
     if neglected is not None:
-        covariance = covariance + _squared_bias(model, ForwardModel(neglected), views, found)
-    return found._replace(covariance=covariance, added=found.added + covariance - found.covariance)
+        covariance = covariance + _squared_bias(
+            model, ForwardModel(neglected), views, localization
+        )
+    return localization._replace(
+        covariance=covariance, added=localization.added + covariance - localization.covariance
+    )
 
 
-def pose_odds(found: Localization) -> Array:
+def pose_odds(localization: Localization) -> Array:
     """Return the likelihood (S,) of the second minimum over that of the pose; 0: there is none."""
-    return np.asarray(np.exp(-0.5 * found.gap))
+    return np.asarray(np.exp(-0.5 * localization.gap))
 
 
-def is_ambiguous(found: Localization) -> Mask:
+def is_ambiguous(localization: Localization) -> Mask:
     """Say of which poses (S,) a second one, outside their ellipsoids, is not excluded (99.9 %)."""
-    likely = np.flatnonzero(pose_odds(found) > MIN_ODDS)
-    apart = np.zeros(found.cost.shape, dtype=bool)
+    likely = np.flatnonzero(pose_odds(localization) > MIN_ODDS)
+    apart = np.zeros(localization.cost.shape, dtype=bool)
     if likely.size:
-        some = found.take(likely)
+        some = localization.take(likely)
         away = squared_distances(
             some.other.difference(some.pose)[:, None], some.covariance - some.added
         )
@@ -85,14 +89,14 @@ def is_ambiguous(found: Localization) -> Mask:
     return apart
 
 
-def _weak_views(views: Views, found: Localization) -> tuple[Index, Array]:
+def _weak_views(views: Views, localization: Localization) -> tuple[Index, Array]:
     """Return the views (W,) whose linearized covariance does not hold, and their curvature."""
-    turn = np.trace(found.covariance[:, 3:, 3:], axis1=1, axis2=2)
-    likely = found.gap < _MAX_GAP
-    rows = np.flatnonzero(found.converged & ((turn > _MIN_TILT**2) | likely))
+    turn = np.trace(localization.covariance[:, 3:, 3:], axis1=1, axis2=2)
+    likely = localization.gap < _MAX_GAP
+    rows = np.flatnonzero(localization.converged & ((turn > _MIN_TILT**2) | likely))
     if not rows.size:
         return rows, np.zeros(0)
-    some = found.take(rows)
+    some = localization.take(rows)
     # A camera that turns about the target leaves the tangent of its path.
     distance = np.linalg.norm(some.pose.position - _centres(views.take(rows)), axis=-1)
     precision = np.linalg.eigvalsh(np.linalg.inv(some.covariance)[:, :3, :3])[:, -1]
@@ -192,16 +196,16 @@ def _scatter(weight: Array, change: Array, own: Array) -> Array:
 
 
 def _squared_bias(
-    model: ForwardModel, true: ForwardModel, views: Views, found: Localization
+    model: ForwardModel, true: ForwardModel, views: Views, localization: Localization
 ) -> Array:
     """Return what neglecting part of a lens moves poses by, as outer products (S, 6, 6)."""
-    image = true.predict(found.pose, views, limited=False).uv
+    image = true.predict(localization.pose, views, limited=False).uv
     known = np.asarray(np.isfinite(image).all(axis=-1))
     seen = views._replace(
         uv=np.where(known[:, :, None], image, views.uv),
         weight=np.where(known, views.weight, 0.0),
     )
-    _, (hessian, gradient) = pose_equations(model, found.pose, seen)
+    _, (hessian, gradient) = pose_equations(model, localization.pose, seen)
     relative, unit = with_unit_diagonal(hessian, 0.0)
     step = (never_singular(np.linalg.inv, relative) @ (gradient / unit)[..., None])[..., 0] / unit
     return np.asarray(step[:, :, None] * step[:, None, :])

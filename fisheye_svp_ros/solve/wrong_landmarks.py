@@ -144,38 +144,40 @@ class _Landmarks(NamedTuple):
                 scale = self.scale_of(self._distances(model, pose, posed))
         return _Agreement(model, kept, pose, posed, scale)
 
-    def wrong(self, found: _Agreement) -> tuple[WrongLandmark, ...]:
+    def wrong(self, agreement: _Agreement) -> tuple[WrongLandmark, ...]:
         """Return the landmarks that do not agree and do not move as their neighbors do."""
-        uv = found.model.linearise(found.pose, self.views).uv
-        off = np.where(found.posed[:, None, None], self.views.uv - uv, np.nan)
+        uv = agreement.model.linearise(agreement.pose, self.views).uv
+        off = np.where(agreement.posed[:, None, None], self.views.uv - uv, np.nan)
         by_landmark = np.full((len(off), len(self.ids) + 1, 2), np.nan)
         np.put_along_axis(by_landmark, self.slot[..., None], off, axis=1)
         wrong = []
-        for i in np.flatnonzero(~found.kept):
+        for i in np.flatnonzero(~agreement.kept):
             near = np.argsort(np.linalg.norm(self.xyz - self.xyz[i], axis=1), kind='stable')
             around = _median(by_landmark[:, near[1 : 1 + _NEIGHBORS]], axis=1)
             mine = by_landmark[:, i]
             own = np.linalg.norm(mine - np.nan_to_num(around), axis=-1)
             if _median(own) > _OWN_SHARE * _median(np.linalg.norm(mine, axis=-1)):
-                landmark = self._describe(int(i), found)
-                far = found.scale[i] > _MISMATCH_RATIO * OUTLIER_SIGMAS * found.typical
+                landmark = self._describe(int(i), agreement)
+                far = agreement.scale[i] > _MISMATCH_RATIO * OUTLIER_SIGMAS * agreement.typical
                 wrong += [landmark] if landmark.displaced or far else []
         share = len(wrong) / len(self.ids)
         return tuple(wrong) if share <= _MAX_WRONG_SHARE else ()
 
-    def _describe(self, i: int, found: _Agreement) -> WrongLandmark:
-        mine = (self.slot == i) & found.posed[:, None]
+    def _describe(self, i: int, agreement: _Agreement) -> WrongLandmark:
+        mine = (self.slot == i) & agreement.posed[:, None]
         offset = np.full(3, np.nan)
-        meeting = _meeting_point(found.model, found.pose, self.views, mine)
+        meeting = _meeting_point(agreement.model, agreement.pose, self.views, mine)
         if meeting is not None:
             moved = self.views._replace(
                 points=np.where(mine[..., None], meeting, self.views.points)
             )
-            left = prediction_distances(found.model, found.pose, moved)[mine]
-            if _median(left) / MEDIAN_NORM < _MAX_REMAINDER * found.scale[i]:
+            left = prediction_distances(agreement.model, agreement.pose, moved)[mine]
+            if _median(left) / MEDIAN_NORM < _MAX_REMAINDER * agreement.scale[i]:
                 offset = meeting - self.xyz[i]
         points = int((self.table.landmark == self.ids[i]).sum())
-        return WrongLandmark(int(self.ids[i]), points, MEDIAN_NORM * float(found.scale[i]), offset)
+        return WrongLandmark(
+            int(self.ids[i]), points, MEDIAN_NORM * float(agreement.scale[i]), offset
+        )
 
     def scale_of(self, distance: Array) -> Array:
         """Return robust standard deviations (L,) of a coordinate, px, of distances (S, N).
@@ -205,10 +207,10 @@ class _Landmarks(NamedTuple):
                 step = max(1, len(used) // _CONSENSUS_POINTS)
                 single = self.views.take([view]).take_points(used[::step])
                 try:
-                    found = localize(one, single)
+                    solution = localize(one, single)
                 except GeometryError:
                     continue
-                pose.put([view], consensus_pose(one.seeing(single), single, found, 1.0))
+                pose.put([view], consensus_pose(one.seeing(single), single, solution, 1.0))
                 posed[view] = True
         return self._distances(model, pose, posed)
 
@@ -222,10 +224,10 @@ class _Landmarks(NamedTuple):
             inside = (views.weight > 0) & one.seeing(views).back_project(views.uv).valid
             which = np.flatnonzero(inside.sum(axis=1) >= MIN_POINTS)
             if len(which):
-                found = localize(one, views.take(which))
+                solution = localize(one, views.take(which))
                 at = np.arange(len(used))[rows][which]
-                pose.put(at, found.pose)
-                posed[at] = found.converged
+                pose.put(at, solution.pose)
+                posed[at] = solution.converged
         return pose, posed
 
     def _distances(self, model: ForwardModel, pose: Pose, posed: Mask) -> Array:

@@ -162,7 +162,7 @@ def at_point(
     """
     _check(np.degrees(spread), np.degrees(budget.spreads), 'spread', 'degrees')
     _check(working_range, budget.ranges, 'range', 'm')
-    found = []
+    rows = []
     for quantity in QUANTITIES:
         limit = limits.get(quantity)
         if limit is not None and not (np.isfinite(limit) and limit > 0):
@@ -185,7 +185,7 @@ def at_point(
             _value(budget, table, spread, working_range) for table in (error, noise, allowed, *own)
         )
         logs = np.log(budget.ranges)
-        found.append(
+        rows.append(
             Point(
                 quantity,
                 caused,
@@ -201,7 +201,7 @@ def at_point(
                 misfit,
             )
         )
-    return found
+    return rows
 
 
 def _localization_errors(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
@@ -257,18 +257,18 @@ def _own_errors(setup: Setup, points: Array) -> dict[str, dict[str, Array]]:
         errors.of_poses(views_of(caps), identity(len(caps)))
         for caps in np.array_split(points, -(-len(points) // _CAPS_PER_BLOCK))
     ]
-    found = {}
+    limits = {}
     for part in _LENS_PARTS:
         variance = np.concatenate(
-            [np.diagonal(getattr(one, part), axis1=-2, axis2=-1) for one in poses]
+            [np.diagonal(getattr(pose, part), axis1=-2, axis2=-1) for pose in poses]
         )
         far = np.sqrt(np.trace(getattr(depth, part), axis1=-2, axis2=-1))
-        found[part] = {
+        limits[part] = {
             'position': np.sqrt(variance[:, :3].sum(axis=-1)),
             'axis': np.sqrt(variance[:, 3:5].sum(axis=-1)),
             'depth': known_mean(scatter(both, far)),
         }
-    return found
+    return limits
 
 
 def _caps(angles: Array) -> Array:

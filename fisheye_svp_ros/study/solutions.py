@@ -112,21 +112,21 @@ def localize_sets(
     `examine` does: not of sets whose errors by the SVP model are to be measured.
     Raises GeometryError as `localize` does.
     """
-    found = localize(model, views, start)
-    residual, reasons = found.residual, ('',) * len(found.cost)
+    localization = localize(model, views, start)
+    residual, reasons = localization.residual, ('',) * len(localization.cost)
     if examined:
-        checked = examine(model, views, found, searched=searched)
-        found, reasons = checked.result, checked.reasons
-        residual = np.where(checked.gross[..., None], np.nan, found.residual)
+        checked = examine(model, views, localization, searched=searched)
+        localization, reasons = checked.result, checked.reasons
+        residual = np.where(checked.gross[..., None], np.nan, localization.residual)
     else:
-        found = hold_weak_geometry(model, views, found)
+        localization = hold_weak_geometry(model, views, localization)
     metrics = {
-        **localization_metrics(found.pose, residual, true),
-        'odds': pose_odds(found),
-        'ambiguous': is_ambiguous(found).astype(float),
+        **localization_metrics(localization.pose, residual, true),
+        'odds': pose_odds(localization),
+        'ambiguous': is_ambiguous(localization).astype(float),
     }
-    sigmas = _residual_sigmas(found.cost, 2 * metrics['points'] - 6)
-    return SetSolutions(found, metrics, found.converged, _NO_POSE, reasons, sigmas)
+    sigmas = _residual_sigmas(localization.cost, 2 * metrics['points'] - 6)
+    return SetSolutions(localization, metrics, localization.converged, _NO_POSE, reasons, sigmas)
 
 
 def residual_points(model: ForwardModel, views: Views, solution: Localization) -> Points:
@@ -140,20 +140,20 @@ def solve_rigs(
     models: Pair, left: Views, right: Views, systems: int = 1, true: Pose | None = None
 ) -> SetSolutions[StereoCalibration]:
     """Calibrate S rigs of S * V views; models: left, right; true (S,); raise GeometryError."""
-    found = calibrate_stereo(*models, left, right, systems)
+    calibration = calibrate_stereo(*models, left, right, systems)
     metrics = stereo_calibration_metrics(
-        found.rig, found.left_residual, found.right_residual, true
+        calibration.rig, calibration.left_residual, calibration.right_residual, true
     )
     points = [(view.weight > 0).reshape(systems, -1).sum(axis=1) for view in (left, right)]
-    freedom = 2 * sum(points) - 6 * (found.pose.shape[1] + 1)
+    freedom = 2 * sum(points) - 6 * (calibration.pose.shape[1] + 1)
     reasons = tuple(
         misfit_reason(float(cost) / max(int(free), 1), int(free)) if fails else ''
         for cost, free, fails in zip(
-            found.cost, freedom, misfit_fails(found.cost, freedom), strict=True
+            calibration.cost, freedom, misfit_fails(calibration.cost, freedom), strict=True
         )
     )
-    sigmas = _residual_sigmas(found.cost, freedom)
-    return SetSolutions(found, metrics, found.converged, _NO_RIG, reasons, sigmas)
+    sigmas = _residual_sigmas(calibration.cost, freedom)
+    return SetSolutions(calibration, metrics, calibration.converged, _NO_RIG, reasons, sigmas)
 
 
 def _residual_sigmas(cost: Array, freedom: Array) -> Array:
@@ -192,11 +192,11 @@ def measure_points(
     pairs = *models, rig.take(np.nonzero(both)[0]), uv_left[both], uv_right[both]
     offset = epipolar_offset(*pairs)
     points = (triangulate_optimally if optimal else triangulate)(*pairs).points
-    found = Measurement(
+    measured = Measurement(
         *(scatter(both, part) for part in (points, offset.distance, offset.vertical, offset.foot))
     )
-    metrics = stereo_depth_metrics(found.distance, found.vertical, found.points, true)
-    return SetSolutions(found, metrics, np.asarray(both.any(axis=1)), _NO_PAIR)
+    metrics = stereo_depth_metrics(measured.distance, measured.vertical, measured.points, true)
+    return SetSolutions(measured, metrics, np.asarray(both.any(axis=1)), _NO_PAIR)
 
 
 class Summary(NamedTuple):

@@ -77,7 +77,7 @@ class Outcome:
         gate: sigmas above which the residuals of a set count as no solution; 0: no limit.
         """
         try:
-            found = solve(index)
+            solution = solve(index)
         except GeometryError as error:
             if len(index) == 1:
                 from fisheye_svp_ros.io.recording import note_of_set  # with rosbags, seldom
@@ -87,10 +87,10 @@ class Outcome:
             for half in np.array_split(index, 2):
                 self.attempt(half, solve, gate)
             return
-        solved = found.solved & found.passes(gate)
-        self.note[index[~found.passes(gate)]] = gate_reason(gate)
-        self.note[index[~found.solved]] = found.unsolved
-        for name, values in found.metrics.items():
+        solved = solution.solved & solution.passes(gate)
+        self.note[index[~solution.passes(gate)]] = gate_reason(gate)
+        self.note[index[~solution.solved]] = solution.unsolved
+        for name, values in solution.metrics.items():
             self.metrics[name][index[solved]] = values[solved]
 
 

@@ -106,12 +106,12 @@ def calibrate_without_outliers(
         rows = rows[~np.isin(observations.frame[rows], result.left_out)]
         table = observations.take(rows)
         data = group_by_frame(table)
-        found = find_outliers(data, initial_state(data, result.adjusted.lens))[1]
+        outliers = find_outliers(data, initial_state(data, result.adjusted.lens))[1]
         rounds += 1
-        if not len(found.rows) or rounds == _MAX_ROUNDS:
+        if not len(outliers.rows) or rounds == _MAX_ROUNDS:
             return result, table, rejected
-        rejected = rejected.join(found._replace(rows=rows[found.rows]))
-        rows = np.delete(rows, found.rows)
+        rejected = rejected.join(outliers._replace(rows=rows[outliers.rows]))
+        rows = np.delete(rows, outliers.rows)
 
 
 def _fit_if_possible(
@@ -147,23 +147,23 @@ def assess_lens(observations: Observations, lens: Lens, names: Sequence[str]) ->
     return LensTrust(stderr, admissible, moved, covariance * np.outer(larger, larger))
 
 
-def generalize(found: Calibration, trusted: LensTrust) -> Calibration:
+def generalize(calibration: Calibration, trusted: LensTrust) -> Calibration:
     """Return a calibration at the values of generalized least squares.
 
     As it is where these are no lens, or one that is not near: the equations are linear.
     """
-    adjusted = found.adjusted
+    adjusted = calibration.adjusted
     if adjusted.lens.port is not None or not np.isfinite(trusted.moved).all():
-        return found
+        return calibration
     values = np.array(parameter_values(adjusted.lens, adjusted.names)) + trusted.moved
     try:
-        moved = with_values(found, values.tolist())
+        moved = with_values(calibration, values.tolist())
     except FisheyeSvpError:
-        return found
+        return calibration
     near = moved.adjusted.converged and rms_px(moved.adjusted.residual) < (
         _MAX_RMS_RATIO * rms_px(adjusted.residual)
     )
-    return moved if near else found
+    return moved if near else calibration
 
 
 def with_covariance(lens: Lens, trusted: LensTrust) -> Lens:
@@ -267,10 +267,10 @@ def localize_with_errors(
     Raises ObservationError and GeometryError as `localize_measured` does.
     """
     allowed = replace(observations, sigma=np.asarray(errors.inflate_sigma(observations.sigma)))
-    found = localize_measured(ForwardModel(errors.lens), allowed)
-    kept = found.views._replace(weight=np.where(found.gross, 0.0, found.views.weight))
-    parts = errors.of_solved_poses(kept, found.result, found.sigma)
-    return found._replace(result=found.result._replace(covariance=parts.total)), parts
+    measured = localize_measured(ForwardModel(errors.lens), allowed)
+    kept = measured.views._replace(weight=np.where(measured.gross, 0.0, measured.views.weight))
+    parts = errors.of_solved_poses(kept, measured.result, measured.sigma)
+    return measured._replace(result=measured.result._replace(covariance=parts.total)), parts
 
 
 def depth_errors(

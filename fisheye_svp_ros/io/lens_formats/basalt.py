@@ -40,12 +40,12 @@ def read(text: str, where: str) -> Foreign:
             f'{where}: resolution is {sizes!r}; a list of width and height of each of '
             f'the {len(cameras)} cameras of intrinsics is needed'
         )
-    found = {
+    lenses = {
         f'cam{i}': _lens(f'cam{i}', camera, size, f'{where}: camera {i}')
         for i, (camera, size) in enumerate(zip(cameras, sizes, strict=True))
     }
     rigs = _rigs(fields.sections({'T_imu_cam': [], **document}, 'T_imu_cam', where), where)
-    return Foreign.from_lenses('Basalt', found, rigs)
+    return Foreign.from_lenses('Basalt', lenses, rigs)
 
 
 def _lens(name: str, camera: Mapping[str, Any], size: Any, where: str) -> tuple[Lens, float]:

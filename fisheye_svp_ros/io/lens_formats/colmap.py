@@ -79,7 +79,7 @@ def _lines(text: str) -> list[str]:
 
 def read(text: str, where: str) -> Foreign:
     """Read all cameras, by their ids; raises LensError, naming camera and model."""
-    found = {}
+    lenses = {}
     for row in filter(None, map(_ROW.fullmatch, _lines(text))):
         camera, model, rest = row.groups()
         place = f'{where}: camera {camera}'
@@ -89,8 +89,8 @@ def read(text: str, where: str) -> Foreign:
             raise LensError(
                 f'{place}: width, height and the parameters of {model} must be numbers ({cause})'
             ) from cause
-        found[camera] = _lens(f'camera{camera}', model, (width, height), values, place)
-    return Foreign.from_lenses('COLMAP', found)
+        lenses[camera] = _lens(f'camera{camera}', model, (width, height), values, place)
+    return Foreign.from_lenses('COLMAP', lenses)
 
 
 def _lens(

@@ -30,11 +30,11 @@ def read(text: str, where: str) -> Foreign:
         (name for name in map(str, document) if name.startswith('cam')),
         key=lambda name: (len(name), name),
     )
-    found = {}
+    lenses = {}
     rigs: list[Pose] = []
     for number, name in enumerate(names):
         camera = fields.section(document, name, where)
-        found[name] = _lens(name, camera, f'{where}: {name}')
+        lenses[name] = _lens(name, camera, f'{where}: {name}')
         if number and 'T_cn_cnm1' in camera:
             if len(rigs) < number - 1:
                 raise LensError(
@@ -42,7 +42,7 @@ def read(text: str, where: str) -> Foreign:
                     'after it has one; the chain is broken'
                 )
             rigs.append(_rig(camera['T_cn_cnm1'], f'{where}: {name}'))
-    return Foreign.from_lenses('Kalibr', found, rigs)
+    return Foreign.from_lenses('Kalibr', lenses, rigs)
 
 
 def _lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float]:

@@ -31,21 +31,21 @@ def recognises(text: str) -> bool:
 def read(text: str, where: str) -> Foreign:
     """Read the lens, or those of all sensors; raises LensError, naming the field."""
     root = fields.xml(text, where, 'Metashape calibration')
-    found = (
+    values = (
         [root]
         if root.tag == 'calibration'
         else [
             one for one in root.iter('calibration') if one.get('class', 'adjusted') == 'adjusted'
         ]
     )
-    if not found:
+    if not values:
         raise LensError(f'{where}: no adjusted calibration in it; align the photographs first')
-    names = ['camera'] if len(found) == 1 else [f'sensor{i}' for i in range(len(found))]
+    names = ['camera'] if len(values) == 1 else [f'sensor{i}' for i in range(len(values))]
     return Foreign.from_lenses(
         'Metashape',
         {
-            name: _lens(name, one, f'{where}: {name}' if len(found) > 1 else where)
-            for name, one in zip(names, found, strict=True)
+            name: _lens(name, one, f'{where}: {name}' if len(values) > 1 else where)
+            for name, one in zip(names, values, strict=True)
         },
     )
 

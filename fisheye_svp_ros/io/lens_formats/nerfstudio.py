@@ -34,13 +34,13 @@ def read(text: str, where: str) -> Foreign:
     ]
     different = list({json.dumps(one): one for one in given}.values()) or [shared]
     if len(different) == 1:
-        found = {'camera': _lens('camera', different[0], where)}
+        lenses = {'camera': _lens('camera', different[0], where)}
     else:
-        found = {
+        lenses = {
             f'camera{i}': _lens(f'camera{i}', one, f'{where}: camera{i}')
             for i, one in enumerate(different, start=1)
         }
-    return Foreign.from_lenses('nerfstudio', found)
+    return Foreign.from_lenses('nerfstudio', lenses)
 
 
 def _lens(name: str, given: Mapping[str, Any], where: str) -> tuple[Lens, float]:

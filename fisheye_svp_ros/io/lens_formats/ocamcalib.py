@@ -79,14 +79,14 @@ def _heights(direct: Array, farthest: float) -> models.Base:
     rho, theta = rho[: last + 1], theta[: last + 1]
 
     def height(angle: Array) -> Array:
-        found = np.interp(angle, theta, rho)
+        radius = np.interp(angle, theta, rho)
         for _ in range(4):  # Newton's method: rho cos(angle) + f(rho) sin(angle) = 0
             value, slope = (
-                np.polynomial.polynomial.polyval(found, p)
+                np.polynomial.polynomial.polyval(radius, p)
                 for p in (direct, np.polynomial.polynomial.polyder(direct))
             )
             sin, cos = np.sin(angle), np.cos(angle)
-            found = found - (found * cos + value * sin) / (cos + slope * sin)
-        return np.asarray(found / -direct[0])
+            radius = radius - (radius * cos + value * sin) / (cos + slope * sin)
+        return np.asarray(radius / -direct[0])
 
     return models.Base(height, float(theta[-1]))

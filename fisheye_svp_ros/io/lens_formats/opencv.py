@@ -95,15 +95,15 @@ def read(text: str, where: str) -> Foreign:
         if all(any(name in named for name in _sided(_MATRIX, side)) for side in pair)
     ]
     if sides:
-        found = dict(zip(STEREO, map(lens, STEREO, sides[0]), strict=True))
+        lenses = dict(zip(STEREO, map(lens, STEREO, sides[0]), strict=True))
     else:
-        found = {'camera': lens('camera', _only_side(named))}
+        lenses = {'camera': lens('camera', _only_side(named))}
     rigs: tuple[Pose, ...] = ()
     if any(name in named for name in (*_ROTATION, *_TRANSLATION)):
         turn = np.reshape(_matrix(_value(named, _ROTATION, where), ((3, 3),), where), (3, 3))
         place = _matrix(_value(named, _TRANSLATION, where), ((3, 1), (1, 3)), where)
         rigs = (fields.pose(place, turn, f'{where}: R, T'),)
-    given = Foreign.from_lenses('OpenCV', found, rigs)
+    given = Foreign.from_lenses('OpenCV', lenses, rigs)
     assumed = not {_XI, *_IS_FISHEYE} & {*named}
     return given._replace(notes=(_FISHEYE_NOTE,) * (assumed and _has_four(named)))
 

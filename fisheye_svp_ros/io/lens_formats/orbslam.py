@@ -32,12 +32,12 @@ def read(text: str, where: str) -> Foreign:
         return Foreign.from_lenses(
             'ORB-SLAM3', {'camera': _lens('camera', prefixes['left'], document, where)}
         )
-    found = {
+    lenses = {
         camera: _lens(camera, prefix, document, f'{where}: {prefix.rstrip(".")}')
         for camera, prefix in prefixes.items()
     }
     rigs = tuple(_rig(document[name], f'{where}: {name}') for name in _STEREO if name in document)
-    return Foreign.from_lenses('ORB-SLAM3', found, rigs[:1])
+    return Foreign.from_lenses('ORB-SLAM3', lenses, rigs[:1])
 
 
 def _lens(name: str, prefix: str, document: Mapping[str, Any], where: str) -> tuple[Lens, float]:

@@ -44,14 +44,14 @@ def read(text: str, where: str) -> Foreign:
 
 def _camera(side: str, joints: list[_Joint], where: str) -> str:
     frames = list(dict.fromkeys(itertools.chain.from_iterable(j[:2] for j in joints)))
-    found = [frame for frame in frames if side in frame]
-    found = [frame for frame in found if _OPTICAL in frame] or found
-    if len(found) != 1:
+    named = [frame for frame in frames if side in frame]
+    named = [frame for frame in named if _OPTICAL in frame] or named
+    if len(named) != 1:
         raise LensError(
             f'{where}: one frame called {side} and {_OPTICAL} is needed; there are '
-            + (', '.join(found or frames) or 'no fixed transforms')
+            + (', '.join(named or frames) or 'no fixed transforms')
         )
-    return found[0]
+    return named[0]
 
 
 def _pose_in_root(frame: str, joints: list[_Joint]) -> tuple[str, Pose]:

@@ -115,10 +115,10 @@ def localize(
     """
     if not lens.is_bare:
         return None
-    found: tuple[Localization, int, int] | None = _running().localize(
+    solution: tuple[Localization, int, int] | None = _running().localize(
         lens, seen, row, minimum, start
     )
-    return found
+    return solution
 
 
 def adjust_rigs(

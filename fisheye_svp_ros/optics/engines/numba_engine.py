@@ -95,7 +95,7 @@ def localize(
     if numbers is None:
         return None
     systems, count = row.shape
-    found = Localization.of_one_minimum(
+    localization = Localization.of_one_minimum(
         Pose(start.rotation.copy(), start.position.copy()),
         np.empty((systems, 6, 6)),
         np.empty((systems, count, 2)),
@@ -103,9 +103,9 @@ def localize(
         np.empty(systems, dtype=np.bool_),
         np.empty(systems, dtype=np.int64),
     )
-    arrays = (*_contiguous(*seen, row), *found.pose, *found[1:6])
+    arrays = (*_contiguous(*seen, row), *localization.pose, *localization[1:6])
     if systems == 1:  # by the shortest way: it is called for every frame of a camera
-        return found, *entries.localize(numbers, minimum, limit, *arrays)
+        return localization, *entries.localize(numbers, minimum, limit, *arrays)
 
     def run(part: slice) -> tuple[int, int]:
         counts: tuple[int, int] = entries.localize(
@@ -114,7 +114,7 @@ def localize(
         return counts
 
     remaining, flat = map(sum, zip(*_run_threaded(run, systems, 4 * systems * count), strict=True))
-    return found, remaining, flat
+    return localization, remaining, flat
 
 
 def adjust_rigs(

@@ -78,19 +78,19 @@ def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
     return met(lens, sight(lens, points), limited)
 
 
-def met(lens: Lens, seen: Sight, limited: bool) -> Incidence:
+def met(lens: Lens, sight: Sight, limited: bool) -> Incidence:
     """Return where rays in air meet the lens."""
-    found = numpy_engine.incidence(lens.svp(), seen.direction, limited)
-    return found._replace(valid=found.valid & seen.valid)
+    found = numpy_engine.incidence(lens.svp(), sight.direction, limited)
+    return found._replace(valid=found.valid & sight.valid)
 
 
-def columns(lens: Lens, seen: Sight) -> tuple[Array, Array]:
+def columns(lens: Lens, sight: Sight) -> tuple[Array, Array]:
     """Return derivatives of image points by the lens's viewpoint shift (M, 2), px/m.
 
     And by the coefficients of its port (M, 2, K).
     """
-    _, _, by_direction = _image(lens, seen, False)
-    return (by_direction @ seen.d_shift[..., None])[..., 0], by_direction @ seen.d_port
+    _, _, by_direction = _image(lens, sight, False)
+    return (by_direction @ sight.d_shift[..., None])[..., 0], by_direction @ sight.d_port
 
 
 def linearise_views(
@@ -107,13 +107,13 @@ def linearise_views(
     return uv.reshape(*shape, 2), valid.reshape(shape), d_pose
 
 
-def _image(lens: Lens, seen: Sight, limited: bool) -> tuple[Array, Mask, Array]:
+def _image(lens: Lens, sight: Sight, limited: bool) -> tuple[Array, Mask, Array]:
     """Return image points (M, 2), validity, and derivatives (M, 2, 3) by the direction."""
     still = np.eye(3)[None], np.zeros((1, 3))
     uv, valid, d_pose = numpy_engine.linearise_views(
-        lens.svp(), *still, seen.direction[None], limited
+        lens.svp(), *still, sight.direction[None], limited
     )
-    valid = valid[0] & seen.valid
+    valid = valid[0] & sight.valid
     return np.where(valid[:, None], uv[0], np.nan), valid, -d_pose[0, ..., :3]
 
 

@@ -105,41 +105,41 @@ def _image_warnings(camera: CalibratedCamera) -> list[str]:
     return texts
 
 
-def hand_eye_sentence(found: HandEye) -> str:
+def hand_eye_sentence(hand_eye: HandEye) -> str:
     """Return how many poses there are, what the flange carries, the robot's noise, the scale."""
-    scale, error = found.scale, found.stderr[-1]
-    carried = 'target, the camera is fixed' if found.fixed_camera else 'camera'
-    sure = '' if found.odds < MAX_ODDS else 'more than '
+    scale, error = hand_eye.scale, hand_eye.stderr[-1]
+    carried = 'target, the camera is fixed' if hand_eye.fixed_camera else 'camera'
+    sure = '' if hand_eye.odds < MAX_ODDS else 'more than '
     return (
-        f'{len(found.frame)} poses of the flange, which carries the {carried} (odds '
-        f'{sure}{found.odds:.3g} to 1); noise of the robot '
-        f'{1e3 * found.noise_m:.3f} mm and {np.degrees(found.noise_rad):.4f} deg an axis; '
+        f'{len(hand_eye.frame)} poses of the flange, which carries the {carried} (odds '
+        f'{sure}{hand_eye.odds:.3g} to 1); noise of the robot '
+        f'{1e3 * hand_eye.noise_m:.3f} mm and {np.degrees(hand_eye.noise_rad):.4f} deg an axis; '
         f'lengths of the target are {scale:.5f} ± {error:.5f} times those of the robot'
     )
 
 
-def hand_eye_warnings(found: HandEye) -> list[str]:
+def hand_eye_warnings(hand_eye: HandEye) -> list[str]:
     """Return what there is to say against the poses."""
-    warnings, factor = [], max(found.scale, 1 / found.scale)
-    if found.fixed_camera:
+    warnings, factor = [], max(hand_eye.scale, 1 / hand_eye.scale)
+    if hand_eye.fixed_camera:
         warnings.append(
             'the poses are those of a flange that carries the target before a fixed camera; if it '
             'carries the camera, they are inverted: give the flange in the base'
         )
     if factor > _MAX_SCALE:
-        longer = 'the poses' if found.scale < 1 else 'the target'
+        longer = 'the poses' if hand_eye.scale < 1 else 'the target'
         likely = f': {longer} may be in mm' if factor > _MIN_MM else ''
         warnings.append(
             f'lengths of robot and target differ by a factor of {factor:.4g}{likely}; '
             'both are needed in m'
         )
-    noise = np.repeat((found.noise_m, found.noise_rad), 3)
-    squares = ((found.residual / noise) ** 2).sum(axis=1)
+    noise = np.repeat((hand_eye.noise_m, hand_eye.noise_rad), 3)
+    squares = ((hand_eye.residual / noise) ** 2).sum(axis=1)
     worst = int(np.argmax(squares))
     if len(squares) >= _MIN_FRAMES and squares[worst] >= _LARGE_SHARE * squares.sum():
-        off, turn = np.linalg.norm(found.residual[worst].reshape(2, 3), axis=1)
+        off, turn = np.linalg.norm(hand_eye.residual[worst].reshape(2, 3), axis=1)
         warnings.append(
-            f'the pose of frame {found.frame[worst]} is {1e3 * off:.1f} mm and '
+            f'the pose of frame {hand_eye.frame[worst]} is {1e3 * off:.1f} mm and '
             f'{np.degrees(turn):.2f} deg off the others: correct it, or remove it from the poses'
         )
     return warnings

@@ -38,10 +38,10 @@ class Section(NamedTuple):
 
 def sections(diagnosis: Diagnosis) -> list[Section]:
     """Return the external evidence that a diagnosis has."""
-    found = [_of_cameras(pair) for pair in diagnosis.cameras]
+    parts = [_of_cameras(pair) for pair in diagnosis.cameras]
     if diagnosis.hand_eye is not None:
-        found.append(_of_robot(diagnosis.hand_eye))
-    return found if diagnosis.against is None else [*found, _of_sets(diagnosis.against)]
+        parts.append(_of_robot(diagnosis.hand_eye))
+    return parts if diagnosis.against is None else [*parts, _of_sets(diagnosis.against)]
 
 
 def carried_row(transfer: Transfer, what: str) -> tuple[str, ...]:
@@ -57,17 +57,17 @@ def carried_row(transfer: Transfer, what: str) -> tuple[str, ...]:
     )
 
 
-def _of_robot(found: HandEye) -> Section:
-    x, y, z = 1e3 * found.camera.position
+def _of_robot(hand_eye: HandEye) -> Section:
+    x, y, z = 1e3 * hand_eye.camera.position
     sentence = (
         'The given poses are those of the flange, not of the camera, which is at '
         f'{x:.2f}, {y:.2f}, {z:.2f} mm in the flange. They were not used as camera poses: '
-        f'{hand_eye_sentence(found)}.'
+        f'{hand_eye_sentence(hand_eye)}.'
     )
     sentence += ''.join(
-        f' {warning[0].upper()}{warning[1:]}.' for warning in hand_eye_warnings(found)
+        f' {warning[0].upper()}{warning[1:]}.' for warning in hand_eye_warnings(hand_eye)
     )
-    return Section(ROBOT_TITLE, sentence, [], ROBOT_HEADER, hand_eye_rows(found))
+    return Section(ROBOT_TITLE, sentence, [], ROBOT_HEADER, hand_eye_rows(hand_eye))
 
 
 def _of_cameras(pair: TwoCameras) -> Section:
