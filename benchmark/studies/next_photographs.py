@@ -39,8 +39,8 @@ from fisheye_svp_ros.planning.optimal_design import (
     FlatBoard,
     ViewLimits,
     candidate_shots,
-    confounded_effects,
     information,
+    richest_forms,
 )
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.observations import Observations
@@ -127,7 +127,7 @@ def simulated(rng: np.random.Generator) -> tuple[Design, Linearization]:
     data = RigViews.of_one_camera(blank_views(board.landmark, points, count))
     state = RigState(shots.camera, identity(1), lens, ())
     linear = Linearization(data, state, intrinsic_names(lens))
-    alike = confounded_effects(linear, ('radial_profile', 'target_shape'))
+    alike = richest_forms(linear, ('radial_profile', 'target_shape'))
     return Design(linear, [EFFECT, *alike], board, shots, NOISE, known=False), linear
 
 
@@ -225,7 +225,7 @@ def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
     state = adjust(data, replace(state, terms=(ModelTerm(EFFECT, np.zeros(1)),)), free)
     linear = Linearization(data, state, free)
     square = float((linear.residual**2).sum()) / int(linear.row_mask.sum())
-    design = Taken(linear, confounded_effects(linear, ('radial_profile', 'target_shape')), square)
+    design = Taken(linear, richest_forms(linear, ('radial_profile', 'target_shape')), square)
     e0 = without(design, design.question('e0'))
     name = design.question('viewpoint_shift', ('radial_profile', 'target_shape'))
     count = len(design.added)

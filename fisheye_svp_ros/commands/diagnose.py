@@ -147,7 +147,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose, diagnose_against
     from fisheye_svp_ros.planning.plan import check_number
     from fisheye_svp_ros.reporting.terminal import stages
-    from fisheye_svp_ros.reporting.wording.provisional import provisional_headline, what_changed
+    from fisheye_svp_ros.reporting.wording.first_screen import provisional_headline, what_changed
     from fisheye_svp_ros.solve.measured_poses import poses_by_frame, rig_lenses
     from fisheye_svp_ros.solve.rig_state import free_parameters
     from fisheye_svp_ros.study.trust import known_errors

@@ -62,22 +62,22 @@ def run(args: argparse.Namespace) -> None:
         seen = find_tag_views(find_photographs(args.recording, args.every))
     check_sizes(args.recording[0], {'': seen.size}, {'': lens})
     with progress('mapping'):
-        found = map_tags(ForwardModel(lens), seen.image, seen.ids, seen.uv, size, args.origin)
-    tags = map_of_size(found.ids, size, found.poses)
+        tag_map = map_tags(ForwardModel(lens), seen.image, seen.ids, seen.uv, size, args.origin)
+    tags = map_of_size(tag_map.ids, size, tag_map.poses)
     print_table(
-        f'{len(found.ids)} tags from {len(found.images)} of {len(seen.names)} images, '
-        f'rms {found.rms_px:.3f} px',
+        f'{len(tag_map.ids)} tags from {len(tag_map.images)} of {len(seen.names)} images, '
+        f'rms {tag_map.rms_px:.3f} px',
         ('tag', 'x mm', 'y mm', 'z mm', 'std. error mm'),
         [
             (str(number), *(f'{1000 * one:.1f}' for one in place), f'{1000 * error:.2f}')
             for number, place, error in zip(
-                found.ids, found.poses.position, found.stderr, strict=True
+                tag_map.ids, tag_map.poses.position, tag_map.stderr, strict=True
             )
         ],
     )
-    for note in map_notes(found.missing, found.outside, found.rms_px, found.focal):
+    for note in map_notes(tag_map.missing, tag_map.outside, tag_map.rms_px, tag_map.focal):
         say(note)
     if args.output:
         with write_together():
-            write_tag_map(tags, args.output, found.stderr, 'fisheye-svp map')
-            write_poses(args.output.with_suffix('.poses.csv'), found.images, found.cameras)
+            write_tag_map(tags, args.output, tag_map.stderr, 'fisheye-svp map')
+            write_poses(args.output.with_suffix('.poses.csv'), tag_map.images, tag_map.cameras)

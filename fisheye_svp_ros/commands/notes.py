@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.io.lens_formats import READERS_TO_90_DEG, share_beyond_90_deg
 from fisheye_svp_ros.reporting.wording.inputs import points_extrapolated
-from fisheye_svp_ros.reporting.wording.landmarks import wrong_landmark_notes
+from fisheye_svp_ros.reporting.wording.poses import wrong_landmark_notes
 from fisheye_svp_ros.scene.observations import frame_name, list_frames
 from fisheye_svp_ros.solve.lens_checks import extrapolated_points
 

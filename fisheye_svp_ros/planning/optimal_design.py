@@ -277,7 +277,7 @@ class Design:
         return np.asarray(self.known + self.added[list(taken)].sum(axis=0))
 
 
-def confounded_effects(linear: Linearization, names: Sequence[str]) -> list[Effect]:
+def richest_forms(linear: Linearization, names: Sequence[str]) -> list[Effect]:
     """Return the richest forms of effects of lens or target that are not in a fit."""
     there = {term.name for term in linear.state.terms}
     found = []

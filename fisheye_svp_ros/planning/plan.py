@@ -26,8 +26,8 @@ from fisheye_svp_ros.planning.optimal_design import (
     Shots,
     ViewLimits,
     candidate_shots,
-    confounded_effects,
     max_view_angle,
+    richest_forms,
 )
 from fisheye_svp_ros.pose import identity, quaternion_from_rotation
 from fisheye_svp_ros.scene.observations import Observations
@@ -153,7 +153,7 @@ def _choose_question(
         # How a board sags, no photograph that is planned can tell.
         alike = tuple(name for name in cause.indistinguishable_from if name in CATALOGUE)
         if alike:
-            return cause.effect, alike, confounded_effects(after, alike)
+            return cause.effect, alike, richest_forms(after, alike)
     if mine:
         return mine[0].effect, (), []
     if after.free:

@@ -27,9 +27,8 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
-from fisheye_svp_ros.reporting.wording.external import sections
+from fisheye_svp_ros.reporting.wording.external import sections, travel_sentence
 from fisheye_svp_ros.reporting.wording.first_screen import first_screen, terminal_lines
-from fisheye_svp_ros.reporting.wording.travel import travel_sentence
 from fisheye_svp_ros.solve.rig_state import group_by_frame
 
 SHIFT, SKEW = CATALOGUE['viewpoint_shift'](), CATALOGUE['skew']()

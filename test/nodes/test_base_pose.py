@@ -16,7 +16,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped  # isort: skip
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.decoding import read_pose, read_transform, stamp_of
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.frame_tree import FrameTree
+from fisheye_svp_ros.nodes.frame_listener import FrameTree
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.pose import Pose, carried_pose, identity, rotation_from_vector

@@ -24,8 +24,8 @@ from fisheye_svp_ros.planning.optimal_design import (
     FlatBoard,
     ViewLimits,
     candidate_shots,
-    confounded_effects,
     max_view_angle,
+    richest_forms,
 )
 from fisheye_svp_ros.planning.plan import next_photographs, plan
 from fisheye_svp_ros.pose import rotation_from_vector
@@ -149,7 +149,7 @@ def test_chosen_photographs_tell_more_than_random_ones(linear, board, shots):
 
 
 def test_doubt_between_a_cause_and_its_look_alikes_is_settled(linear, board, shots):
-    effects = confounded_effects(linear, ('radial_profile', 'target_shape'))
+    effects = richest_forms(linear, ('radial_profile', 'target_shape'))
     design = Design(linear, effects, board, shots, NOISE)
     question = design.question('viewpoint_shift', ('radial_profile', 'target_shape'))
     _, answers = design.choose(question, 4)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fisheye_svp_ros.reporting.wording.landmarks import wrong_landmark_notes
+from fisheye_svp_ros.reporting.wording.poses import wrong_landmark_notes
 from fisheye_svp_ros.solve.outliers import WrongLandmark
 
 

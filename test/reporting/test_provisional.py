@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from fisheye_svp_ros.diagnosis import Finding, Reason
-from fisheye_svp_ros.reporting.wording.provisional import provisional_headline, what_changed
+from fisheye_svp_ros.reporting.wording.first_screen import provisional_headline, what_changed
 
 
 def answer(*names: str, candidates: tuple[Finding, ...] = ()) -> SimpleNamespace:

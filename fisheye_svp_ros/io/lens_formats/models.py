@@ -135,7 +135,7 @@ class Distortion:
         above, below = (1 + _powers(one, height * height) for one in (self.stretch, self.below))
         return np.asarray(height * (above / below))
 
-    def project(self, theta: Array, azimuth: Array) -> Array:
+    def image_points(self, theta: Array, azimuth: Array) -> Array:
         """Return image points (..., 2) for unit focal length."""
         around = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
         stretched = self.height(theta)[..., None] * around
@@ -225,7 +225,7 @@ def _fit_corrections(
     theta, azimuth = np.meshgrid(
         np.linspace(0, lens.max_incidence, _STEPS)[1:], np.linspace(0, 2 * np.pi, _STEPS)
     )
-    uv = distortion.project(theta, azimuth) * focal + (lens.cx, lens.cy)
+    uv = distortion.image_points(theta, azimuth) * focal + (lens.cx, lens.cy)
     sin = np.sin(theta)
     points = np.stack([sin * np.cos(azimuth), sin * np.sin(azimuth), np.cos(theta)], axis=-1)
     inside = ((uv >= 0) & (uv < (lens.width, lens.height))).all(axis=-1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
@@ -240,3 +241,18 @@ def _follows(against: TwoDatasets) -> str:
             'same, or the error belongs to the lens'
         )
     return '; the correction of the target does not transfer to the other target, as expected'
+
+
+def travel_sentence(against: TwoDatasets) -> str:
+    """Return how both lenses predict the other set; '' where it was not measured."""
+    if against.travel is None:
+        return ''
+    given, extended = map(_error, against.travel)
+    return (
+        f'{given} as given, {extended} extended: errors of the lenses on '
+        f'{Path(against.source).name}, its poses and landmark offsets fitted anew'
+    )
+
+
+def _error(px: float) -> str:
+    return f'{pixels(px)} px' if isfinite(px) else 'some points out of sight'

@@ -5,7 +5,7 @@ The headline is the largest cause, and what to do about the lens.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +26,7 @@ from fisheye_svp_ros.diagnosis import (
     frames_of,
     status_of,
 )
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.blocks import image_uri
 from fisheye_svp_ros.reporting.wording.adequacy import (
     NOT_CERTAIN,
@@ -53,6 +54,7 @@ from fisheye_svp_ros.reporting.wording.diagnosis import (
     lens_words,
     only_gross,
 )
+from fisheye_svp_ros.reporting.wording.external import travel_sentence
 from fisheye_svp_ros.reporting.wording.findings import (
     belief,
     chance,
@@ -60,7 +62,6 @@ from fisheye_svp_ros.reporting.wording.findings import (
     pixels,
     with_odds,
 )
-from fisheye_svp_ros.reporting.wording.travel import travel_sentence
 from fisheye_svp_ros.scene.observations import photograph_names
 
 _MAX_NAMES = 4  # photographs, and candidates, by name
@@ -463,3 +464,23 @@ def _statement(d: Diagnosis, cause: Cause) -> str:
 
 def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
+
+
+def provisional_headline(names: Sequence[str]) -> str:
+    """Return the first of some causes as a headline, the others by name."""
+    if not names:
+        return 'Provisional: no model error found yet'
+    first, *others = dict.fromkeys(names)
+    words = CATALOGUE[first].headline or describe_effect(first)
+    return f'Provisional: {words}' + (f' (also {", ".join(others)})' if others else '')
+
+
+def what_changed(names: Sequence[str], d: Diagnosis) -> list[str]:
+    """Return sentences: which causes were found since, and which are none after all."""
+    final = [cause.effect for cause in d.causes]
+    why = {step.effect: f' ({finding_reason(step)})' for step in (*d.trace, *d.candidates)}
+    gone = [f'{name}{why.get(name, "")}' for name in dict.fromkeys(names) if name not in final]
+    new = [name for name in dict.fromkeys(final) if name not in names]
+    parts = [f'found: {", ".join(new)}'] if new else []
+    parts += [f'not confirmed: {", ".join(gone)}'] if gone else []
+    return [f'Since the provisional answer: {"; ".join(parts)}.'] if parts else []
