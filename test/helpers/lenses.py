@@ -1,5 +1,7 @@
 """Lenses of every pair of curves, and points that they see."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -84,3 +86,22 @@ def points_around(rng, count, nearest, farthest, widest):
     return distance[:, None] * np.stack(
         [np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)], axis=-1
     )
+
+
+# A fisheye lens of four coefficients, and of two with a moving viewpoint, to be written to files.
+FRONT = Lens(
+    'front',
+    848,
+    800,
+    285.2,
+    284.9,
+    424.3,
+    398.7,
+    KannalaBrandt(-0.011, 0.0041, -0.0012, 0.0001),
+    np.radians(95.0),
+)
+SHORT = replace(
+    FRONT,
+    image_height=KannalaBrandt(-0.011, 0.0041),
+    viewpoint_shift=Gennery(0.0, 0.004, 0.001, -0.0002),
+)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from helpers.data import DATA, NO_DATA
+from helpers.lenses import FRONT, SHORT
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands.lenses import load_lenses
@@ -33,23 +34,6 @@ from fisheye_svp_ros.optics.curves import (
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_vector
 from fisheye_svp_ros.study.settings import SolverSettings
-
-LENS = Lens(
-    'front',
-    848,
-    800,
-    285.2,
-    284.9,
-    424.3,
-    398.7,
-    KannalaBrandt(-0.011, 0.0041, -0.0012, 0.0001),
-    np.radians(95.0),
-)
-SHORT = replace(
-    LENS,
-    image_height=KannalaBrandt(-0.011, 0.0041),
-    viewpoint_shift=Gennery(0.0, 0.004, 0.001, -0.0002),
-)
 
 # The example of Kalibr's wiki (yaml-formats), its second camera made one with fisheye lenses
 CAMCHAIN = """
@@ -94,10 +78,10 @@ def directions(lens: Lens, distance: float = 3.0) -> np.ndarray:
 @pytest.mark.parametrize('shift', [None, SHORT.viewpoint_shift])
 def test_round_trip(form: str, shift: Gennery | None, tmp_path: Path) -> None:
     path = tmp_path / 'lens.txt'
-    path.write_text(write_foreign(replace(LENS, viewpoint_shift=shift), form))
+    path.write_text(write_foreign(replace(FRONT, viewpoint_shift=shift), form))
     back = load_lens(path)
-    points = directions(LENS)
-    assert np.abs(project(back, points).uv - project(LENS, points).uv).max() < 1e-6
+    points = directions(FRONT)
+    assert np.abs(project(back, points).uv - project(FRONT, points).uv).max() < 1e-6
     assert (back.width, back.height) == (848, 800)
 
 
@@ -172,11 +156,11 @@ def test_the_loss_is_that_of_the_image(
 
 def test_a_curve_that_cahvore_does_not_hold_is_a_splined_model(tmp_path: Path) -> None:
     """A calibrated Kannala-Brandt lens was refused for a viewpoint shift that it has not."""
-    path, points = tmp_path / 'lens.cameramodel', directions(LENS)
-    path.write_text(write_foreign(LENS, 'mrcal'))
+    path, points = tmp_path / 'lens.cameramodel', directions(FRONT)
+    path.write_text(write_foreign(FRONT, 'mrcal'))
     assert 'SPLINED_STEREOGRAPHIC' in path.read_text()
     there = project(load_lens(path), points)
-    assert np.abs(there.uv - project(LENS, points).uv)[there.valid].max() < 0.01
+    assert np.abs(there.uv - project(FRONT, points).uv)[there.valid].max() < 0.01
     assert there.valid.mean() > 0.9
 
 
@@ -442,7 +426,7 @@ def test_the_folder_of_a_rig_is_its_lenses(
         for camera in ('left', 'right'):
             path = folder / name.format(camera)
             path.parent.mkdir(parents=True, exist_ok=True)
-            save_lens(replace(LENS, name=camera), path)
+            save_lens(replace(FRONT, name=camera), path)
             assert cameras_in(folder) == (() if camera == 'left' else ('left', 'right'))
         save_rig(Pose(np.eye(3), np.ones(3)), folder / 'rig.yaml', ('left', 'right'))
         assert cameras_in(folder) == ('left', 'right')
@@ -467,8 +451,8 @@ def test_the_folder_of_a_rig_is_its_lenses(
 
 def test_the_folder_of_one_camera_is_its_lens(tmp_path: Path) -> None:
     """As `diagnose` writes it."""
-    save_lens(LENS, tmp_path / 'diagnosis' / 'extended_lens.yaml')
-    assert load_lens(lens_path(f'{tmp_path}/diagnosis/')).name == LENS.name
+    save_lens(FRONT, tmp_path / 'diagnosis' / 'extended_lens.yaml')
+    assert load_lens(lens_path(f'{tmp_path}/diagnosis/')).name == FRONT.name
 
 
 ECHO = """\
@@ -517,7 +501,7 @@ def test_a_camera_info_as_it_is_echoed(tmp_path: Path) -> None:
 
 def test_a_camera_info_without_its_model_says_what_to_write(tmp_path: Path) -> None:
     path = tmp_path / 'info.yaml'
-    text = yaml.safe_load(write_foreign(LENS, 'ros'))
+    text = yaml.safe_load(write_foreign(FRONT, 'ros'))
     del text['distortion_model']
     path.write_text(yaml.safe_dump(text))
     with pytest.raises(LensError, match=r'distortion_model is missing; .* equidistant$'):
@@ -532,7 +516,7 @@ def test_a_camera_info_without_its_model_says_what_to_write(tmp_path: Path) -> N
 
 
 def test_curves_that_a_form_cannot_say() -> None:
-    bare = replace(LENS, image_height=Equidistant())
+    bare = replace(FRONT, image_height=Equidistant())
     assert yaml.safe_load(write_foreign(bare, 'kalibr'))['cam0']['distortion_coeffs'] == (
         pytest.approx([0, 0, 0, 0], abs=1e-9)
     )
@@ -579,7 +563,7 @@ def test_command_says_how_much_is_lost_with_corrections(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tilted = replace(
-        LENS,
+        FRONT,
         viewpoint_shift=None,
         image_height=Equidistant(),
         fx=400.0,
@@ -622,7 +606,7 @@ def test_command_shows_and_writes_all_cameras_of_a_rig(
 ) -> None:
     names = 'left', 'front', 'right'
     for name in names:
-        save_lens(replace(LENS, name=name), tmp_path / 'rig' / f'{name}.yaml')
+        save_lens(replace(FRONT, name=name), tmp_path / 'rig' / f'{name}.yaml')
     save_rig([RIG, RIG.inverse()], tmp_path / 'rig' / 'rig.yaml', names)
     out = tmp_path / 'out.yaml'
     assert cli.main(['lens', str(tmp_path / 'rig' / 'rig.yaml'), '-o', str(out)]) == 0
@@ -659,7 +643,7 @@ def of_opencv(folder: Path, suffix: str, shape: tuple[int, int] = (3, 1)) -> Pat
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write('image_width', 848)
     storage.write('image_height', 800)
-    for number, lens in ((1, LENS), (2, SHORT)):
+    for number, lens in ((1, FRONT), (2, SHORT)):
         storage.write(
             f'K{number}', np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
         )
@@ -740,7 +724,7 @@ def test_a_joint_without_an_end_leads_nowhere(tmp_path: Path, end: str) -> None:
 
 def test_both_lenses_of_a_rig_of_opencv(tmp_path: Path) -> None:
     path = of_opencv(tmp_path, '.yml')
-    assert load_lens(path).image_height == LENS.image_height
+    assert load_lens(path).image_height == FRONT.image_height
     assert load_lens(f'{path}#right').image_height.coefficients[:2] == (-0.011, 0.0041)
 
 

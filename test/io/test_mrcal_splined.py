@@ -8,32 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.lenses import FRONT, SHORT
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.effects.forward import back_project_corrected, project_corrected
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.lens_formats import write_foreign
-from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
+from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.image_field import ImageField
 from fisheye_svp_ros.optics.lens import Lens
 
-LENS = Lens(
-    'front',
-    848,
-    800,
-    285.2,
-    284.9,
-    424.3,
-    398.7,
-    KannalaBrandt(-0.011, 0.0041, -0.0012, 0.0001),
-    np.radians(95.0),
-)
-SHORT = replace(
-    LENS,
-    image_height=KannalaBrandt(-0.011, 0.0041),
-    viewpoint_shift=Gennery(0.0, 0.004, 0.001, -0.0002),
-)
 # mrcal.project of version 2.2, for the model and the points of the test
 MRCAL_POINTS = [
     [510.261171875, 372.331486111111],
@@ -63,7 +48,7 @@ def points_in_image(lens: Lens, count: int = 40) -> tuple[np.ndarray, np.ndarray
 
 
 def test_an_image_field_is_a_splined_model_of_mrcal(tmp_path: Path) -> None:
-    own = replace(with_smooth_field(LENS), corrections={'skew': {'parameters': {'shear': 0.001}}})
+    own = replace(with_smooth_field(FRONT), corrections={'skew': {'parameters': {'shear': 0.001}}})
     path = tmp_path / 'lens.cameramodel'
     path.write_text(write_foreign(own, 'mrcal'))
     assert "'LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx=" in path.read_text()
@@ -123,7 +108,7 @@ def test_a_splined_model_as_mrcal_writes_it(tmp_path: Path) -> None:
 )
 def test_a_broken_splined_model_is_refused(old: str, new: str, said: str, tmp_path: Path) -> None:
     path = tmp_path / 'x.cameramodel'
-    text = write_foreign(with_smooth_field(LENS), 'mrcal')
+    text = write_foreign(with_smooth_field(FRONT), 'mrcal')
     assert old in text
     path.write_text(text.replace(old, new))
     with pytest.raises(LensError, match=re.escape(said)) as refused:
@@ -134,7 +119,7 @@ def test_a_broken_splined_model_is_refused(old: str, new: str, said: str, tmp_pa
 def test_command_shows_an_image_field_and_what_a_form_loses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    save_lens(with_smooth_field(LENS), tmp_path / 'lens.yaml')
+    save_lens(with_smooth_field(FRONT), tmp_path / 'lens.yaml')
     assert (
         cli.main(
             [
@@ -172,7 +157,7 @@ def test_command_shows_an_image_field_and_what_a_form_loses(
 @pytest.mark.parametrize(
     ('lens', 'said'),
     [
-        (replace(LENS, corrections={'skew': {'parameters': {'shear': 0.001}}}), None),
+        (replace(FRONT, corrections={'skew': {'parameters': {'shear': 0.001}}}), None),
         (
             replace(SHORT, viewpoint_shift=Gennery(0.002, 0.004)),
             'left out: s0 of the viewpoint shift',
