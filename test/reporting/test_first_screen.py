@@ -152,6 +152,17 @@ def test_a_board_that_is_longer_one_way_is_not_one_of_another_scale(
     assert headline(replace(found, causes=[scale])).startswith(f'{words} ({parameter} = 0.47')
 
 
+def test_the_likelier_one_of_a_confounded_set_comes_first(found: Diagnosis) -> None:
+    tilt = replace(
+        _tilt(0.005, 0.001),
+        indistinguishable_from=['frame_sag'],
+        odds={'sensor_tilt': 0.005, 'frame_sag': 0.995},
+    )
+    assert headline(replace(found, causes=[tilt])).startswith(
+        'Bend of the board that follows its tilt (more than 99 % sure), or the sensor is tilted'
+    )
+
+
 def test_only_a_bent_target_is_to_be_flattened(found: Diagnosis) -> None:
     again = _deciding(found, 'target', say='measure_again')
     assert target_words(replace(again, causes=[])) == 'Measure the target, or replace it'

@@ -34,6 +34,7 @@ from fisheye_svp_ros.reporting.wording.adequacy import (
     flaw_statement,
 )
 from fisheye_svp_ros.reporting.wording.causes import (
+    COMPONENTS,
     HUMAN_UNITS,
     describe_effect,
     most_significant,
@@ -437,6 +438,14 @@ def _sentence(d: Diagnosis, cause: Cause) -> str:
     else:
         confirmed = cause.status is Status.CONFIRMED
         doubt = '' if confirmed else f' ({belief(cause.status, cause.probability)})'
+    likeliest = max(cause.odds, key=lambda name: cause.odds[name], default=cause.effect)
+    if likeliest != cause.effect:
+        words = COMPONENTS.get(likeliest) or describe_effect(likeliest)
+        own = _statement(d, cause)
+        return (
+            f'{_capital(words)} ({chance(cause.odds[likeliest])} sure), or '
+            f'{own[:1].lower()}{own[1:]} ({chance(cause.odds[cause.effect])}){doubt}'
+        )
     if cause.odds.get(cause.effect, 1.0) < CONFIRMED_PROBABILITY:
         others = ' or '.join(with_odds(cause, name) for name in cause.indistinguishable_from)
         sure = chance(cause.odds[cause.effect])
