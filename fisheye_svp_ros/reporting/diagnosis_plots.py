@@ -26,6 +26,7 @@ _WIDTH = 9.2  # in
 _BINS = 16
 _ARROWS = 2500
 _TICKS = 60  # names along an axis
+_LEGEND = 0.25  # in, height
 _CELLS = 18  # of the mean field, along the image
 
 
@@ -258,8 +259,9 @@ def _plot_bins(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> flo
 
 
 def _legend(figure: Figure, axis: Axes) -> None:
-    """Put the legend of an axis above all of them, where a blank title keeps a place for it."""
-    figure.suptitle(' ')
+    """Put the legend of an axis above all of them."""
+    layout: Any = figure.get_layout_engine()
+    layout.set(above=_LEGEND)
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(handles, labels, loc='upper right', ncols=len(labels), fontsize=8)
 

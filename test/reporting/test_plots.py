@@ -36,6 +36,17 @@ def test_nothing_is_cut_or_covered(tight: bool, below: bool) -> None:
     assert apart and not any(one.overlaps(other) for one, other in apart)
 
 
+def test_numbers_between_powers_of_ten_have_room_above_the_label() -> None:
+    with drawing(BytesIO(), 6.0, 4.0, tight=True) as figure:
+        axes = figure.subplots()
+        axes.plot([0.17, 0.6], [0.0, 1.0])
+        axes.set(xscale='log', xlabel='distance of the landmark / m')
+    label = axes.xaxis.label.get_window_extent()
+    numbers = [tick for tick in axes.get_xticklabels(which='both') if tick.get_text()]
+    assert label.y0 >= figure.bbox.y0 and numbers
+    assert all(label.y1 <= tick.get_window_extent().y0 for tick in numbers)
+
+
 def test_axes_have_few_texts_and_none_to_be_parsed() -> None:
     axes = draw(tight=True, below=False).axes[0]
     low, high = axes.get_xlim()
