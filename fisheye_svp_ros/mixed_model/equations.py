@@ -14,9 +14,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from scipy import linalg
@@ -112,6 +112,27 @@ def no_variances(components: int, units: int) -> Variances:
     return Variances(1.0, np.full(components, LAMBDA_ABSENT), np.ones(units))
 
 
+class _Core(NamedTuple):
+    """What a factorization has whatever its border: see `FactoredEquations`."""
+
+    precision: tuple[Array, Array]
+    inverse: Array
+    coupled: Array
+    factor: Array
+
+
+@dataclass
+class _Memory:
+    """What was made last of the products of random columns, whatever the border.
+
+    core: the factorization with the last precisions; selection: the components selected last,
+    their products ee, er, rr, and what was made of these.
+    """
+
+    core: _Core | None = None
+    selection: tuple[Mask, tuple[Array, Array, Array], _Memory] | None = None
+
+
 @dataclass(frozen=True)
 class Equations:
     """The mixed-model equations before any variance is known.
@@ -131,6 +152,7 @@ class Equations:
     width: int
     units: Index
     unit_width: int
+    memory: _Memory = field(default_factory=_Memory, compare=False, repr=False)
 
     @property
     def label(self) -> Index:
@@ -169,17 +191,30 @@ class Equations:
             width, units = int(e.sum()), self.unit_rows(r, r).any(axis=1)
         else:
             width, units = int(r[: groups * self.width].sum()) // groups, blocks
+        products, memory = self._select_products(alive, blocks, e, r)
         chosen = Blocks(
-            b.ee[np.ix_(blocks, e, e)],
-            b.er[np.ix_(blocks, e, r)],
-            b.rr[np.ix_(r, r)],
+            *products,
             b.ex[np.ix_(blocks, e)],
             b.rx[r],
             b.xx,
             np.where(present[b.e_label], b.e_label, ABSENT)[np.ix_(blocks, e)],
             np.where(present[b.r_label], b.r_label, ABSENT)[r],
         )
-        return replace(self, blocks=chosen, width=width, units=self.units[units])
+        return replace(self, blocks=chosen, width=width, units=self.units[units], memory=memory)
+
+    def _select_products(
+        self, alive: Mask, blocks: Mask, e: Mask, r: Mask
+    ) -> tuple[tuple[Array, Array, Array], _Memory]:
+        """Return ee, er, rr of some components, those of the last time if they are the same."""
+        b, last = self.blocks, self.memory.selection
+        if last is None or not np.array_equal(last[0], alive):
+            chosen = (
+                b.ee[np.ix_(blocks, e, e)],
+                b.er[np.ix_(blocks, e, r)],
+                b.rr[np.ix_(r, r)],
+            )
+            last = self.memory.selection = alive.copy(), chosen, _Memory()
+        return last[1:]
 
     def free_component(self, kind: int) -> Equations:
         """Return the equations with a shared component before the fixed columns, no prior."""
@@ -194,7 +229,7 @@ class Equations:
             b.e_label,
             b.r_label[~mine],
         )
-        return replace(self, blocks=blocks)
+        return replace(self, blocks=blocks, memory=_Memory())
 
     def with_ridge(self, ridge: float) -> Equations:
         """Return the equations with a small prior precision of the shared fixed columns."""
@@ -394,36 +429,52 @@ def prior_precisions(eq: Equations, lam: Array, weight: Array) -> tuple[Array, A
 def factor_equations(eq: Equations, lam: Array, weight: Array) -> FactoredEquations:
     """Factor the equations; lam (K,): sigma^2 / tau^2 of each component; weight (U,): of units."""
     b = eq.blocks
-    e, r = prior_precisions(eq, lam, weight)
-    diagonal = np.arange(b.ee.shape[1])
+    core = _factor_core(eq, *prior_precisions(eq, lam, weight))
+    _, inverse, coupled, factor = core
+    block_border = np.matmul(inverse, b.ex)
+    flat = coupled.reshape(block_border.shape[0] * block_border.shape[1], len(b.rr))
+    flat_border = block_border.reshape(len(flat), len(b.xx))
+    cut = len(inverse) // 2 * inverse.shape[1]
+    first, second = map_in_threads(
+        lambda part: flat[part].T @ flat_border[part],
+        (slice(cut), slice(cut, None)),
+        flat.size * len(b.xx),
+    )
+    border = b.rx - (first + second)
+    if len(factor):
+        border = solve_lower(factor, border)
+    information = b.xx - flat_border.T @ flat_border - border.T @ border
+    return FactoredEquations(
+        eq, core.precision, inverse, coupled, block_border, factor, border, information
+    )
+
+
+def _factor_core(eq: Equations, e: Array, r: Array) -> _Core:
+    """Factor the equations of the random columns, precisions e (E, k), r (R,); or remember it."""
+    known = eq.memory.core
+    if known is not None and all(map(np.array_equal, known.precision, (e, r))):
+        return known
+    b, diagonal = eq.blocks, np.arange(eq.blocks.ee.shape[1])
     ee = b.ee.copy()
     ee[:, diagonal, diagonal] += e
-    inverse, coupled, block_border = np.empty_like(ee), np.empty_like(b.er), np.empty_like(b.ex)
+    inverse, coupled = np.empty_like(ee), np.empty_like(b.er)
 
-    def eliminate_blocks(part: slice) -> tuple[Array, Array]:
+    def eliminate_blocks(part: slice) -> Array:
         inverse[part] = np.linalg.inv(np.linalg.cholesky(ee[part]))
         np.matmul(inverse[part], b.er[part], out=coupled[part])
-        np.matmul(inverse[part], b.ex[part], out=block_border[part])
         flat = coupled[part].reshape(e[part].size, len(b.rr))
-        return flat.T @ flat, flat.T @ block_border[part].reshape(len(flat), len(b.xx))
+        return np.asarray(flat.T @ flat)
 
     cut = len(e) // 2  # most of the time goes here
-    (rr, rx), (more, more_border) = map_in_threads(
+    rr, more = map_in_threads(
         eliminate_blocks, (slice(cut), slice(cut, None)), e.size * len(b.rr) ** 2
     )
     # In place: these may be as large as all else together.
     rr += more
-    rx += more_border
     np.subtract(b.rr, rr, out=rr)
-    np.subtract(b.rx, rx, out=rx)
-    flat_border = block_border.reshape(e.size, len(b.xx))
     rr[np.diag_indices_from(rr)] += r
     if len(rr):
-        factor = linalg.cholesky(rr, lower=True, overwrite_a=True, check_finite=False)
-        border = solve_lower(factor, rx)
-    else:
-        factor, border = rr, b.rx
-    information = b.xx - flat_border.T @ flat_border - border.T @ border
-    return FactoredEquations(
-        eq, (e, r), inverse, coupled, block_border, factor, border, information
-    )
+        rr = linalg.cholesky(rr, lower=True, overwrite_a=True, check_finite=False)
+    core = _Core((e, r), inverse, coupled, rr)
+    eq.memory.core = core
+    return core

@@ -202,14 +202,17 @@ def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
     first, numerous = initial_variances(eq, _INITIAL_SHARE), eq.components.numerous
     if before is None:
         p = score_components(
-            eq, no_variances(len(numerous), len(first.weight)), np.flatnonzero(~numerous)
+            eq,
+            no_variances(len(numerous), len(first.weight)),
+            np.flatnonzero(~numerous),
+            _SCREENING_P,
         )
         lam = np.where(p < _SCREENING_P, first.lam, LAMBDA_ABSENT)
         now, _ = estimate_variances(eq, Variances(1.0, lam, first.weight))
     else:
         now, _ = estimate_variances(eq, before, _WARM_STEPS)
     # What the data do not call for beside large residuals they may call for beside smaller ones.
-    p = score_components(eq, now, np.flatnonzero(~now.alive))
+    p = score_components(eq, now, np.flatnonzero(~now.alive), _ADDITION_P)
     lam = np.where(p < _ADDITION_P, first.lam, now.lam)
     if (lam < LAMBDA_ABSENT).sum() > now.alive.sum():
         now, _ = estimate_variances(eq, Variances(now.sigma, lam, now.weight))
@@ -218,7 +221,7 @@ def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
 
 def is_called_for(eq: Equations, now: Variances, kind: int) -> bool:
     """Return whether the data call for one more component beside those that are there."""
-    return bool(score_components(eq, now, [kind])[kind] < _ADDITION_P)
+    return bool(score_components(eq, now, [kind], _ADDITION_P)[kind] < _ADDITION_P)
 
 
 def component_p_values(eq: Equations, now: Variances) -> Array:

@@ -140,9 +140,12 @@ def identifiable_basis(group_fixed: Array, columns: Array, chosen: Index) -> Arr
     return basis
 
 
-def score_components(eq: Equations, now: Variances, kinds: Iterable[int]) -> Array:
+def score_components(
+    eq: Equations, now: Variances, kinds: Iterable[int], limit: float = 1.0
+) -> Array:
     """Return p-values (K,) of variances at zero, NaN for those not asked or not testable.
 
+    limit: where a p-value is certainly not less, a lower bound of it is enough.
     The sum of squares of the columns' products with the residual (Rao's score, 1948) against a
     gamma distribution of the same mean and variance.  Source: Lin, Variance component testing in
     generalised linear models with random effects, Biometrika 84 (1997).
@@ -159,13 +162,28 @@ def score_components(eq: Equations, now: Variances, kinds: Iterable[int]) -> Arr
             return np.nan
         size = float((_score(columns, solution) ** 2).sum()) / solution.variance
         remaining = _remaining_information(f, columns, True)
-        mean, spread = remaining.trace, 2 * remaining.sum_of_squares
-        if mean <= 1e-9 or spread <= 0:
+        mean = remaining.trace
+        if mean <= 1e-9:
+            return np.nan
+        least = _least_p_value(size / mean, columns.own.shape[0] * columns.own.shape[1])
+        if least >= limit:
+            return least
+        spread = 2 * remaining.sum_of_squares
+        if spread <= 0:
             return np.nan
         return float(special.gammaincc(mean**2 / spread, size * mean / spread))
 
     p_values[kinds] = map_in_threads(score, kinds, f.products)
     return p_values
+
+
+def _least_p_value(ratio: float, count: int) -> float:
+    """Return the least p-value of a sum of squares that is so many times its mean.
+
+    Its gamma distribution is of a shape between those of 1 and of `count` alike squares; between
+    them a p-value has no minimum.
+    """
+    return float(min(special.gammaincc(shape, shape * ratio) for shape in (0.5, count / 2)))
 
 
 def component_traces(eq: Equations, now: Variances) -> Array:
@@ -200,23 +218,42 @@ class _ComponentColumns(NamedTuple):
 
 
 class _Information(NamedTuple):
-    """The information of columns beside others: block (g, w, w) less u' u, u (C, g, w)."""
+    """The information of columns beside others: own (g, w, w) less what they share.
 
-    block: Array
+    first (b, k, w): with the blocks of some of the sets, `present` (g,), or of the one that there
+    is; u (C, g, w): with all the rest.
+    """
+
+    own: Array
+    first: Array
+    present: Mask
     u: Array
 
     @property
     def trace(self) -> float:
-        return float(np.einsum('gww->', self.block) - (self.u**2).sum())
+        own = float(np.einsum('gww->', self.own))
+        return own - float(np.einsum('bkw,bkw->', self.first, self.first) + (self.u**2).sum())
+
+    @property
+    def block(self) -> Array:
+        """What is left beside the blocks (g, w, w)."""
+        block = self.own.copy()
+        if len(block) > 1:
+            block[self.present] -= np.swapaxes(self.first, -1, -2) @ self.first
+        else:
+            flat = self.first.reshape(-1, self.first.shape[-1])
+            block -= flat.T @ flat
+        return block
 
     @property
     def sum_of_squares(self) -> float:
         """The sum of the squares of all its elements."""
-        u = self.u.reshape(len(self.u), self.block.shape[0] * self.block.shape[1])
+        block = self.block
+        u = self.u.reshape(len(self.u), block.shape[0] * block.shape[1])
         both = u @ u.T if u.shape[0] < u.shape[1] else u.T @ u
-        across = np.moveaxis(self.u, 1, 0) @ self.block
+        across = np.moveaxis(self.u, 1, 0) @ block
         mixed = np.einsum('gcw,cgw->', across, self.u)
-        return float((self.block**2).sum() - 2 * mixed + (both**2).sum())
+        return float((block**2).sum() - 2 * mixed + (both**2).sum())
 
 
 def _component_columns(eq: Equations, alive: Mask, kind: int) -> _ComponentColumns | None:
@@ -271,11 +308,6 @@ def _remaining_information(
         products[:, present] = np.moveaxis(np.swapaxes(part, -1, -2) @ first, 1, 0)
         return products
 
-    block = c.own.copy()
-    if groups > 1:
-        block[present] -= np.swapaxes(first, -1, -2) @ first
-    else:
-        block -= multiply_blocks(first)[:, 0]
     at = c.at[present]
     r = c.r - multiply_blocks(f.coupled[at])
     u = solve_lower(f.factor, r.reshape(len(r), groups * width))
@@ -283,4 +315,4 @@ def _remaining_information(
         x = c.x[:-1] - multiply_blocks(f.block_border[at, :, :-1])
         flat = x.reshape(len(x), groups * width) - f.border[:, :-1].T @ u
         u = np.concatenate([u, solve_lower(f.root, flat)])
-    return _Information(block, u.reshape(len(u), groups, width))
+    return _Information(c.own, first, present, u.reshape(len(u), groups, width))

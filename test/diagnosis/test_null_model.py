@@ -23,6 +23,7 @@ from fisheye_svp_ros.mixed_model import (
     initial_variances,
     leave_groups_out,
     make_equations,
+    no_variances,
     posterior_covariance,
     posterior_variances,
     score_components,
@@ -220,6 +221,45 @@ def test_score_tests_are_those_of_the_dense_matrices(frames, there):
         assert p_value == pytest.approx(
             special.gammaincc(mean**2 / spread, size * mean / spread), rel=1e-3, abs=1e-12
         ), name
+
+
+def test_a_bound_stands_for_p_values_above_a_limit_only():
+    linear = linearised()
+    random = make_random_effects(linear)
+    eq = make_equations(random.columns, linear.frame_columns, linear.residual[..., None])
+    nothing = no_variances(len(NAMES), len(random.landmark))
+    exact = score_components(eq, nothing, range(len(NAMES)))
+    for limit in (0.01, 0.3):
+        found = score_components(eq, nothing, range(len(NAMES)), limit)
+        np.testing.assert_array_equal(np.isnan(found), np.isnan(exact))
+        there = np.isfinite(exact)
+        np.testing.assert_array_equal(found[there] < limit, exact[there] < limit)
+        assert (found[there] <= exact[there] * (1 + 1e-9)).all()
+    assert (found[there] < 0.9 * exact[there]).any()
+
+
+def test_another_border_beside_the_same_variances_needs_no_other_factor():
+    linear = linearised()
+    random, probe = make_random_effects(linear).columns, linear.residual[..., None]
+
+    def equations():
+        border = np.concatenate([linear.frame_columns[..., :1] * probe, probe], axis=-1)
+        return make_equations(random, linear.frame_columns, border)
+
+    eq = equations()
+    now = some_variances(eq)
+    other = replace(now, lam=np.where(now.alive, 3 * now.lam, now.lam))
+    without = now.without_component(int(np.flatnonzero(now.alive)[0]))
+    half = eq.combine_columns(np.full((1, 1), 0.5))
+    first = factor_equations(eq.select(now.alive), now.lam, now.weight)
+    assert factor_equations(half.select(now.alive), now.lam, now.weight).factor is first.factor
+    for variances in (other, without, now):  # what was remembered is not what is asked for
+        again, alone = (
+            factor_equations(one.select(variances.alive), variances.lam, variances.weight)
+            for one in (half, equations().combine_columns(np.full((1, 1), 0.5)))
+        )
+        np.testing.assert_array_equal(again.factor, alone.factor)
+        np.testing.assert_array_equal(again.information, alone.information)
 
 
 def test_many_frames_need_no_matrix_of_all_that_they_have_of_their_own():
