@@ -69,6 +69,7 @@ _PICTURE_OF = {
     'scatter_vs_frame': 'frame',
     'size': 'histogram',
 }
+_QUICK = ('field', 'theta', 'range')  # pictures of a quick answer, beside those of what remains
 _BAR = 220  # px of a share of 1
 _ROWS = 24
 
@@ -92,6 +93,7 @@ def write_report(
         pictures.append(inputs.folder / 'next.png')
         state = diagnosis.evaluation.fixed_model.state
         draw_shots(pictures[-1], ForwardModel(state.lens, state.terms), wanted)
+    drawn = {p.stem: data_uri(p) for p in pictures}
     report = inputs.folder / 'report.html'
     write_text(
         report,
@@ -110,9 +112,9 @@ def write_report(
                 'target': None,
                 'evidence': None,
                 'next': None,
-                **{p.stem: data_uri(p) for p in pictures},
+                **drawn,
             },
-            shown=CAPTIONS.items(),
+            shown=[(name, text) for name, text in CAPTIONS.items() if name in drawn],
             **_causes(diagnosis),
             **_budget(diagnosis),
             **_evidence(diagnosis),
@@ -139,9 +141,14 @@ def write_report(
 
 
 def _draw(diagnosis: Diagnosis, points: PointResiduals, folder: Path) -> Iterator[Path]:
+    quick = diagnosis.evaluation.problem.options.quick
+    remaining = {_PICTURE_OF.get(structure.variable) for structure in diagnosis.remaining}
     for name, draw, arguments in residual_pictures(PlotData.from_diagnosis(diagnosis, points)):
-        draw(folder / f'{name}.png', *arguments)
-        yield folder / f'{name}.png'
+        if not quick or name in _QUICK or name in remaining:
+            draw(folder / f'{name}.png', *arguments)
+            yield folder / f'{name}.png'
+    if quick:
+        return
     if diagnosis.trace:
         draw_evidence(folder / 'evidence.png', diagnosis)
         yield folder / 'evidence.png'

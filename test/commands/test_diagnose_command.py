@@ -246,6 +246,16 @@ class TestFiles:
         assert not [path for path in output.iterdir() if path.name.startswith('.')]
 
 
+def test_the_report_of_a_quick_answer_has_few_pictures(scene, tmp_path):
+    assert run('shift.csv', scene, '--quick', '-o', tmp_path) == 0
+    pictures = {path.stem for path in tmp_path.glob('*.png')}
+    assert pictures == {'field', 'theta', 'range', 'uncertainty'}
+    page = (tmp_path / 'report.html').read_text(encoding='utf-8')
+    sources = re.findall(r'<img [^>]*src="(.{0,30})', page)
+    assert len(sources) == len(pictures)
+    assert all(source.startswith('data:image/png;base64,') for source in sources)
+
+
 @pytest.mark.usefixtures('undrawn')
 class TestTerminal:
     def test_known_poses(self, scene, capsys):
