@@ -163,8 +163,8 @@ def score_components(
         size = float((_score(columns, solution) ** 2).sum()) / solution.variance
         remaining = _remaining_information(f, columns, True)
         mean = remaining.trace
-        if mean <= 1e-9:
-            return np.nan
+        if mean <= IDENTIFIABLE * float(np.einsum('gww->', columns.own)):
+            return np.nan  # fixed columns take it up: what is left is rounding
         least = _least_p_value(size / mean, columns.own.shape[0] * columns.own.shape[1])
         if least >= limit:
             return least

@@ -20,6 +20,7 @@ from fisheye_svp_ros.mixed_model import (
     eliminate,
     estimate_variances,
     factor_equations,
+    identifiable_basis,
     initial_variances,
     leave_groups_out,
     make_equations,
@@ -236,6 +237,26 @@ def test_a_bound_stands_for_p_values_above_a_limit_only():
         np.testing.assert_array_equal(found[there] < limit, exact[there] < limit)
         assert (found[there] <= exact[there] * (1 + 1e-9)).all()
     assert (found[there] < 0.9 * exact[there]).any()
+
+
+@pytest.mark.parametrize('kind', ['image_broad', 'image_coarse'])
+def test_a_component_that_fixed_columns_take_up_is_not_testable(kind):
+    """On a board in a plane stretches were named by the rounding of what was left of them."""
+    linear, number = linearised(), NAMES.index(kind)
+    random = make_random_effects(linear).columns
+    random = random._replace(shared=1e4 * random.shared, fields=1e4 * random.fields)
+    columns = random.shared_columns[:, random.shared_label == number].toarray()
+    border = columns.reshape(*linear.residual.shape, -1)
+    basis = identifiable_basis(linear.frame_columns, border, np.arange(border.shape[-1]))
+    eq = make_equations(
+        random,
+        linear.frame_columns,
+        np.concatenate([border, linear.residual[..., None]], axis=-1),
+    ).combine_columns(basis)
+    nothing = no_variances(len(NAMES), len(random.unit_label))
+    p_values = score_components(eq, nothing, range(len(NAMES)))
+    assert np.isnan(p_values[number])
+    assert np.isfinite(p_values[NAMES.index('frame_bumps')])
 
 
 def test_another_border_beside_the_same_variances_needs_no_other_factor():
