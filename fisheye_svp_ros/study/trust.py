@@ -210,7 +210,9 @@ def _fit_targets(null: NullModel, count: int) -> list[_Fit]:
         more = prior[: len(at)] / share**2 if share else np.zeros(len(own))
         inside = information[np.ix_(at, at)] + np.diag(more)
         inverse, score = pseudo_inverse(inside, 1e-13), information[at, -1]
-        evidence = score @ inverse @ score - np.linalg.slogdet(inside)[1]
+        sign, determinant = np.linalg.slogdet(inside)
+        # Singular but for rounding, in data without noise: nothing tells such targets apart.
+        evidence = score @ inverse @ score - determinant if sign > 0 else -np.inf
         evidence += np.log(more[len(own) :]).sum()
         mine = inverse[:count, :count] / np.outer(scale, scale)
         fits.append(_Fit((inverse @ score)[:count] / scale, mine, float(evidence) / 2))
