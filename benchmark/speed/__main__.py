@@ -12,6 +12,7 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
 
 from benchmark.speed import (  # noqa: E402
     commands,
+    effort,
     growth,
     localization,
     maps,
@@ -34,6 +35,7 @@ _PARTS = {
     'variants': variants.rows,
     'nodes': nodes.tables,
     'commands': commands.tables,
+    'effort': effort.tables,
     'sweeps': sweeps.tables,
     'growth': growth.tables,
 }

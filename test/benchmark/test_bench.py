@@ -13,6 +13,7 @@ import pytest
 
 from benchmark.speed import (
     commands,
+    effort,
     growth,
     localization,
     maps,
@@ -202,3 +203,11 @@ def test_commands_are_timed_to_their_end_and_until_a_text(tmp_path):
     with pytest.raises(subprocess.CalledProcessError):
         commands._seconds([*commands._COMMAND, 'localize'], tmp_path)
     assert commands._seconds_until('localize', tmp_path, b'required') > 0
+
+
+def test_effort_counts_what_child_processes_take(monkeypatch):
+    monkeypatch.setattr(effort, 'COLUMNS', 300)
+    child = [sys.executable, '-c', 'import time\nwhile time.process_time() < 0.3: pass']
+    seconds, unit, units = map(float, effort._effort(partial(subprocess.run, child, check=True)))
+    assert seconds >= 0.3 and unit > 0
+    assert units == pytest.approx(seconds / unit, rel=0.05)
