@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.detect.finders import Grey
@@ -18,12 +19,19 @@ from fisheye_svp_ros.detect.finders import Grey
 _ALONG = 2 * np.linspace(0.1, 0.9, 24) - 1  # from corner to corner, -1 to 1; corners are rounded
 _ACROSS = np.linspace(-1, 1, 17)  # half widths of the strip
 _STEPS = (_ACROSS[1:] + _ACROSS[:-1]) / 2
-_POWERS = np.stack([np.ones_like(_ALONG), _ALONG, _ALONG**2 - 1], axis=-1)
 _STRIP_SHARE, _MIN_STRIP, _MAX_STRIP = 0.125, 1.2, 4.0  # of a side (a cell of a tag); px
 _ROUNDS, _MEETINGS = 3, 5
 _NOISE = 0.08  # px, of an edge at one place
 _BEND = 400.0  # px, the radius to which a fisheye may bend a straight edge
 _MIN_BEND = 0.02  # px
+
+
+def _powers(place: Array) -> Array:
+    """Return what a curve is made of (..., 3): its height, slope and bend."""
+    return np.stack([np.ones_like(place), place, place**2 - 1], axis=-1)
+
+
+_POWERS = _powers(_ALONG)
 
 
 class _Edges(NamedTuple):
@@ -57,16 +65,18 @@ def fit_quads(image: Grey, corners: Array) -> Array:
     normal *= np.sign((normal * outwards).sum(axis=-1, keepdims=True))
     edges = _Edges(corners, span, normal)
     strip = np.clip(_STRIP_SHARE * length.min(axis=1), _MIN_STRIP, _MAX_STRIP)
-    curve = np.zeros((*length.shape, 3))
+    curve, light = np.zeros((*length.shape, 3)), image.astype(np.float32)
     for _ in range(_ROUNDS):
-        curve = _fit_curves(image.astype(np.float32), edges, curve, strip, length)
+        curve = _fit_curves(light, edges, curve, strip, length)
     fitted = _meet(edges, curve)
     moved = np.linalg.norm(fitted - corners, axis=-1).max(axis=1)
     near = moved < 2 * strip  # False where not finite
     return np.where(near[:, None, None], fitted, corners)
 
 
-def _fit_curves(image: Array, edges: _Edges, curve: Array, strip: Array, length: Array) -> Array:
+def _fit_curves(
+    image: NDArray[np.float32], edges: _Edges, curve: Array, strip: Array, length: Array
+) -> Array:
     """Return coefficients (T, 4, 3) of _POWERS, px outwards, of the edges in strips about them."""
     middle = curve @ _POWERS.T
     off = middle[..., None] + strip[:, None, None, None] * _ACROSS
@@ -108,7 +118,6 @@ def _meet(edges: _Edges, curve: Array) -> Array:
 
 def _point_and_tangent(edges: _Edges, curve: Array, place: Array) -> tuple[Array, Array]:
     """Return pixels (T, 4, 2) of curves at places (T, 4), and their derivatives."""
-    powers = np.stack([np.ones_like(place), place, place**2 - 1], axis=-1)
     slope = curve[..., 1] + 2 * curve[..., 2] * place
-    point = edges.at(place, (curve * powers).sum(axis=-1))
+    point = edges.at(place, (curve * _powers(place)).sum(axis=-1))
     return point, edges.span / 2 + slope[..., None] * edges.normal

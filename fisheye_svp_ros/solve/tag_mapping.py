@@ -177,7 +177,7 @@ def _adjust(
     damping, (residual, jacobian, _) = 1e-4, _linearize(model, scene, tags, cameras)
     cost = _cost(residual)
     for _ in range(_MAX_ITERATIONS):
-        weight = 1 / (1 + (residual / _CAUCHY_PX) ** 2)
+        weight = _weights(residual)
         columns = jacobian[:, free]
         weighted = columns * weight[:, None]
         hessian, gradient = weighted.T @ columns, weighted.T @ residual
@@ -215,7 +215,7 @@ def _assess(
     """
     frames, count = scene.uv.shape[:2]
     residual, jacobian, uv = _linearize(model, scene, tags, cameras)
-    weight = 1 / (1 + (residual / _CAUCHY_PX) ** 2)
+    weight = _weights(residual)
     free = _free_columns(frames, count, anchor)
     columns = jacobian[:, free]
     variance = float((weight * residual**2).sum()) / max(len(residual) - len(free), 1)
@@ -230,6 +230,10 @@ def _assess(
     information = float((weight * growth**2).sum())
     change = -float((weight * growth * residual).sum()) / information
     return stderr, rms, (change, float(np.sqrt(variance / information)))
+
+
+def _weights(residual: Array) -> Array:
+    return np.asarray(1 / (1 + (residual / _CAUCHY_PX) ** 2))
 
 
 def _cost(residual: Array) -> float:
