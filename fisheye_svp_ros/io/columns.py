@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager
 from functools import cache
 from importlib import import_module
 from io import BytesIO, TextIOWrapper
+from itertools import zip_longest
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 _ROWS = 1 << 16  # of a row group
 _BLOCK_BYTES = 1 << 20  # bytes
 _MOST_CELLS = 100_000_000
+_NAMES = b'columns'  # in the metadata of Parquet: no checksum holds for the names themselves
 _MIN_PYARROW = 15  # of pyarrow: from there on pages have checksums
 _KINDS: Mapping[type, Any] = {int: np.int64, float: np.float64, str: object}
 _EXACT_BY_DEFAULT = (3, 1)  # pandas, from where on numbers read back to the same bits
@@ -226,9 +228,16 @@ def _read_parquet(pyarrow: Any, stream: IO[bytes], wanted: Callable[[str], bool]
     about, schema = file.metadata, file.schema_arrow
     if about.num_rows * about.num_columns > _MOST_CELLS:
         raise ValueError(f'more than {_MOST_CELLS} cells')
+    kinds = pyarrow.types
     for field in schema:
-        if pyarrow.types.is_nested(field.type) or pyarrow.types.is_binary(field.type):
+        if any(is_(field.type) for is_ in (kinds.is_nested, kinds.is_binary, kinds.is_duration)):
             raise ValueError(f'a column of {field.type}; numbers and text are read')
+    names = ', '.join(schema.names)
+    written = (about.metadata or {}).get(_NAMES, names.encode()).decode(errors='replace')
+    if names != written:
+        both = zip_longest(schema.names, written.split(', '))
+        now, before = next(pair for pair in both if len({*pair}) > 1)
+        raise ValueError(f'column {now!r} was written as {before!r}; write the table again')
     table = file.read([name for name in schema.names if wanted(name)])
     if {table.num_rows, sum(about.row_group(i).num_rows for i in range(about.num_row_groups))} != {
         about.num_rows
@@ -290,7 +299,7 @@ def _arrow_table(pyarrow: Any, table: DataFrame, schema: Any) -> Any:
         )
         schema = pyarrow.schema(zip(fields.names, kinds, strict=True))
     converted = pyarrow.Table.from_pandas(table, schema, preserve_index=False)
-    return converted.replace_schema_metadata(None)
+    return converted.replace_schema_metadata({_NAMES: ', '.join(schema.names)})
 
 
 def _is_text(pyarrow: Any, kind: Any) -> bool:
