@@ -18,7 +18,7 @@ from typing import NoReturn
 from fisheye_svp_ros import __version__
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.io.streams import tolerant_streams
-from fisheye_svp_ros.threads import set_thread_count
+from fisheye_svp_ros.process import set_thread_count
 
 _DESCRIPTION = (
     'Measure what the single-viewpoint (SVP) approximation of a fisheye lens costs, and find the '
@@ -144,7 +144,7 @@ def _run(arguments: Sequence[str]) -> None:
     if named in _ON_ONE_THREAD:
         set_thread_count()
     if named in _ON_LARGE_ARRAYS:
-        import_module('fisheye_svp_ros.memory').keep_memory()
+        import_module('fisheye_svp_ros.process').keep_memory()
     if named in COMMANDS:
         module = import_module(f'fisheye_svp_ros.commands.{named}')
         module.add_arguments(commands.choices[named])

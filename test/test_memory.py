@@ -8,12 +8,12 @@ import sys
 
 import pytest
 
-from fisheye_svp_ros.memory import keep_memory
+from fisheye_svp_ros.process import keep_memory
 
 _FAULTS = """
 import resource
 import numpy as np
-from fisheye_svp_ros.memory import keep_memory
+from fisheye_svp_ros.process import keep_memory
 keep_memory()
 np.ones(4_000_000)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from fisheye_svp_ros.threads import VARIABLES, limit_threads, set_thread_count
+from fisheye_svp_ros.process import VARIABLES, limit_threads, set_thread_count
 
 threadpoolctl = pytest.importorskip('threadpoolctl', reason='comes with pip, not with ROS 2')
 
@@ -41,7 +41,7 @@ def test_one_thread_inside_and_as_many_as_before_afterwards() -> None:
 _LOADED_INSIDE = """
 import numpy as np
 from threadpoolctl import threadpool_info
-from fisheye_svp_ros.threads import limit_threads
+from fisheye_svp_ros.process import limit_threads
 
 @limit_threads
 def count():

@@ -24,9 +24,8 @@ import numpy as np
 from benchmark import study
 from benchmark.studies.boards import directions
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.effects.base import Effect
+from fisheye_svp_ros.effects.base import Effect, ModelTerm
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations

@@ -1,4 +1,10 @@
-"""From photographs to observations: every photograph searched, the odd ones named."""
+"""From photographs to observations: every photograph searched, the odd ones named.
+
+How thoroughly, those before it have shown.  A chessboard is mostly found at a first look.  All
+that follows where it is not takes ten times as long, and is put off until some photograph shows
+the board; a few are searched thoroughly at once.  Boards whose dark squares are bright are found
+at a first look at the inverted image.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +12,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +20,6 @@ import cv2
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.detect.effort import Effort, Look
 from fisheye_svp_ros.detect.finders import (
     FIRST_LOOKS,
     NO_TAGS,
@@ -42,6 +48,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
+_FIRST_ONES, _ONE_OF = 3, 24  # photographs that are searched thoroughly in any case
 SECONDS = 30.0  # a photograph
 _BLUR_LIMITS = 1.5  # times the median blur, and px
 _STANDSTILL_PX = 0.3  # px
@@ -51,6 +58,43 @@ _ROTATION_NOTE = 'its orientation tag asks for a rotation; the pixels are used a
 LARGER_BOARD = 'the board is larger: its squares continue beyond the given corners'
 _OTHER_LAYOUT = 'its tags are printed or numbered otherwise than in most photographs'
 _DAMAGE_NOTE = 'damaged: the JPEG decodes only in part; copy it again'
+
+
+class Look(Enum):
+    """What is done with a photograph; SAMPLE: thorough, and whether the board is inverted."""
+
+    FIRST_SEARCH = 'first'
+    SAMPLE = 'sample'
+    THOROUGH = 'thorough'
+    INVERTED_IMAGE = 'inverted'
+
+
+class Effort:
+    """The looks at photographs, one after the other."""
+
+    def __init__(self, has_first_look: bool) -> None:
+        """Take whether a detector has a first look; others are always thorough."""
+        self._has_first_look = has_first_look
+        self._found = self._inverted = 0
+
+    @property
+    def has_found_board(self) -> bool:
+        """Whether any photograph showed the board."""
+        return self._found > 0
+
+    def note(self, found: bool, inverted: bool) -> None:
+        """Take note of what a photograph has shown."""
+        self._found += found
+        self._inverted += inverted
+
+    def look(self, number: int, repeatable: bool) -> Look:
+        """Return how to look at a photograph; repeatable: it can be read once more."""
+        if not self._has_first_look:
+            return Look.THOROUGH
+        if self.has_found_board:
+            return Look.INVERTED_IMAGE if self._inverted == self._found else Look.THOROUGH
+        sample = number < _FIRST_ONES or number % _ONE_OF == 0 or not repeatable
+        return Look.SAMPLE if sample else Look.FIRST_SEARCH
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,9 +15,8 @@ Other rooms import what stands here, and nothing else.
 
 from fisheye_svp_ros.diagnosis.adequacy import Adequacy
 from fisheye_svp_ros.diagnosis.causes import CONFOUNDED_P, Cause
-from fisheye_svp_ros.diagnosis.checks.travel import Travel, predict_board
 from fisheye_svp_ros.diagnosis.checks.two_cameras import Transfer, TwoCameras, deviations
-from fisheye_svp_ros.diagnosis.checks.two_datasets import TwoDatasets
+from fisheye_svp_ros.diagnosis.checks.two_datasets import Travel, TwoDatasets, predict_board
 from fisheye_svp_ros.diagnosis.conclusion import (
     RETAKE,
     TURNED,
@@ -51,13 +50,14 @@ from fisheye_svp_ros.diagnosis.evaluation import MAX_RMS_RATIO
 from fisheye_svp_ros.diagnosis.findings import (
     CONFIRMED_PROBABILITY,
     Finding,
+    Flaw,
+    FlawKind,
     Reason,
     Rival,
     Status,
     status_of,
 )
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
-from fisheye_svp_ros.diagnosis.flaws import Flaw, FlawKind
 from fisheye_svp_ros.diagnosis.model_errors import ErrorParts, LensErrors, pose_maps, pose_summary
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, can_be_included

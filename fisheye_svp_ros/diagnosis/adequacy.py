@@ -17,7 +17,7 @@ from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.decision import Decision, PhotographsAnswer
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
-from fisheye_svp_ros.diagnosis.flaws import Flaw, FlawKind
+from fisheye_svp_ros.diagnosis.findings import Flaw, FlawKind
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, SAG
 from fisheye_svp_ros.diagnosis.variance_budget import REPEATED_COMPONENT, Component
 from fisheye_svp_ros.effects.recording_effects import FocalDriftEffect, SessionStepEffect

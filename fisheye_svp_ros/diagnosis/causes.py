@@ -17,11 +17,10 @@ from fisheye_svp_ros.diagnosis.findings import Status, probability_of, status_of
 from fisheye_svp_ros.diagnosis.random_effects import SAG
 from fisheye_svp_ros.diagnosis.sagging import SagOdds, bend_over_sag
 from fisheye_svp_ros.diagnosis.variance_budget import NoiseGrowth
-from fisheye_svp_ros.effects.base import Effect
+from fisheye_svp_ros.effects.base import Effect, ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import FlatPortEffect, RadialProfileEffect
 from fisheye_svp_ros.effects.target_effects import TargetShapeEffect
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.mixed_model import project_out, pseudo_inverse
 from fisheye_svp_ros.scene.observations import Observations, photograph_entry
 from fisheye_svp_ros.solve.outliers import Outliers

@@ -8,8 +8,7 @@ from enum import Enum
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
-from fisheye_svp_ros.diagnosis.findings import LIKELY_PROBABILITY
-from fisheye_svp_ros.diagnosis.flaws import Flaw
+from fisheye_svp_ros.diagnosis.findings import LIKELY_PROBABILITY, Flaw
 
 LensAnswer = Literal['keep', 'use_extended', 'recalibrate', 'undecided']
 TargetAnswer = Literal['keep', 'correct', 'measure_again', 'undecided']

@@ -1,6 +1,7 @@
 """What came of an effect that was tried, and why: a round of the selection, or the last word.
 
 One probability and one status: of confirmed causes, of what is not confirmed, everywhere alike.
+Flaws: what can be wrong with data, whatever lens and target are.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from enum import Enum
 from math import e, exp, log
 from typing import Any, NamedTuple, Protocol
 
-from fisheye_svp_ros.effects.terms import ModelTerm
+from fisheye_svp_ros.effects.base import ModelTerm
 
 CONFIRMED_PROBABILITY = 0.95
 LIKELY_PROBABILITY = 0.5
@@ -198,3 +199,41 @@ def find_doubt(evidence: Evidence) -> Doubt | None:
 def is_implausible(cause: ModelTerm) -> bool:
     """Say whether an effect is larger than in any real lens."""
     return cause.name == 'viewpoint_shift' and bool(abs(cause.values[0]) > _MAX_SHIFT)
+
+
+class FlawKind(Enum):
+    """What is wrong with the data; of the first ones nothing is told of lens or target."""
+
+    CAMERAS_MIXED = 1
+    FOCAL_VARIES = 2
+    CENTER_VARIES = 3
+    FRAMES_DIFFER = 4
+    NO_FIT = 5
+    LENS_UNKNOWN = 6
+    ANGLE_SHORT = 7
+    OFF_CENTER = 8
+
+    @property
+    def is_misfit(self) -> bool:
+        """Whether residuals are left that no camera explains."""
+        return self.value <= FlawKind.NO_FIT.value
+
+
+@dataclass(frozen=True)
+class Flaw:
+    """One thing that is wrong with the data.
+
+    size, beside: of mixed cameras and other misfits, px rms that is left and noise; of a focal
+    length, its relative range, of a center, its rms, px, and how many times noise that is; of rays
+    the error, rad, and that of one image point; of an angle, rad, those that points and the lens
+    reach; of a center, px off in u and v.
+    groups: frames by number, those of each camera or state, or those that differ most; names: the
+    photographs of these, as far as they are known.
+    """
+
+    kind: FlawKind
+    size: float
+    beside: float
+    groups: tuple[tuple[int, ...], ...] = ()
+    names: tuple[tuple[str, ...], ...] = ()
+    camera: str = ''

@@ -27,9 +27,8 @@ from fisheye_svp_ros.diagnosis.random_effects import (
     RandomEffects,
     make_random_effects,
 )
-from fisheye_svp_ros.effects.base import Effect
+from fisheye_svp_ros.effects.base import Effect, ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.mixed_model import (
     LAMBDA_ABSENT,
     Equations,

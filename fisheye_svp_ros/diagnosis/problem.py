@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.diagnosis.null_model import NullModel
-from fisheye_svp_ros.effects.base import Effect
+from fisheye_svp_ros.effects.base import Effect, camera_terms
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.detection_effects import QuantisationEffect
 from fisheye_svp_ros.effects.extension import (
@@ -26,7 +26,6 @@ from fisheye_svp_ros.effects.extension import (
     on_boards,
 )
 from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
-from fisheye_svp_ros.effects.terms import camera_terms
 from fisheye_svp_ros.errors import GeometryError, ObservationError, ParameterError
 from fisheye_svp_ros.mixed_model import eliminate
 from fisheye_svp_ros.optics.lens import Lens

@@ -32,11 +32,10 @@ from fisheye_svp_ros.diagnosis.stepwise import (
     find_single_landmarks,
 )
 from fisheye_svp_ros.diagnosis.variance_budget import NoiseGrowth, noise_growth
-from fisheye_svp_ros.effects.base import Effect, Untestable
+from fisheye_svp_ros.effects.base import Effect, ModelTerm, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.detection_effects import NoiseVsAngleEffect
 from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.mixed_model import Variances, pseudo_inverse
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, shorten_step

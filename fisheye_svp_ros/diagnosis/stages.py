@@ -22,7 +22,6 @@ from fisheye_svp_ros.diagnosis.causes import (
     table_causes,
 )
 from fisheye_svp_ros.diagnosis.checks.medium import Medium, behind_port, find_medium
-from fisheye_svp_ros.diagnosis.checks.travel import measure_travel
 from fisheye_svp_ros.diagnosis.checks.turned_boards import (
     TurnedFrame,
     find_turned_frames,
@@ -30,7 +29,11 @@ from fisheye_svp_ros.diagnosis.checks.turned_boards import (
     turn_frames,
 )
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras, agree_on_target
-from fisheye_svp_ros.diagnosis.checks.two_datasets import DatasetModel, compare_datasets
+from fisheye_svp_ros.diagnosis.checks.two_datasets import (
+    DatasetModel,
+    compare_datasets,
+    measure_travel,
+)
 from fisheye_svp_ros.diagnosis.conclusion import advice_on_lens, advise, conclude, turn_advice
 from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, cross_validate
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
@@ -63,7 +66,7 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
     remaining_structure,
     significant_components,
 )
-from fisheye_svp_ros.effects.terms import ModelTerm
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose

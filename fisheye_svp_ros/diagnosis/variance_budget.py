@@ -22,8 +22,8 @@ from fisheye_svp_ros.diagnosis.fitted_model import MIN_PAIRS, FittedModel
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.mixed_model import (
     component_p_values,
     component_traces,

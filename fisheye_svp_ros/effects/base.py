@@ -9,15 +9,17 @@ image    D = 2, px: the optical image moves
 detector D = 2, px: the detected point moves
 noise    nothing moves; the scatter or the table changes
 Nearly all effects are linear in their parameters: displacement = columns @ values.
+A model holds them as terms: effects with their values, and where their columns stand.
 """
 
 from __future__ import annotations
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
+from math import prod
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -422,3 +424,43 @@ def _to_json(value: Any) -> Any:
 
 def _frozen(value: Any) -> Any:
     return tuple(_frozen(item) for item in value) if isinstance(value, list) else value
+
+
+@dataclass(frozen=True, eq=False)
+class ModelTerm:
+    """An effect in a model, of one camera, of a pair or of a rig.
+
+    values (P,): of its parameters; columns (P,): theirs among those that all frames share; none
+    before the model is linearized.
+    """
+
+    effect: Effect
+    values: Array
+    columns: Index = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    @property
+    def name(self) -> str:
+        """The name of the effect."""
+        return self.effect.name
+
+    def displacement(self, scene: Scene) -> Array:
+        """Displacement (S, N, D) at the effect's stage."""
+        return self.effect.displacement(scene, self.values)
+
+
+def camera_terms(terms: Iterable[ModelTerm], camera: int) -> tuple[ModelTerm, ...]:
+    """Return what acts in the views of one camera, with that camera's values."""
+    return tuple(
+        ModelTerm(form, np.asarray(term.values)[own])
+        for term in terms
+        for form, own in term.effect.forms_of_camera(camera)
+    )
+
+
+def noise_scale(terms: Sequence[ModelTerm], scene: Scene) -> Array | float:
+    """Return the factor (S, N) of noise effects on the standard deviation of the noise."""
+    return prod(
+        term.effect.noise_scale(scene, term.values)
+        for term in terms
+        if isinstance(term.effect, NoiseEffect)
+    )

@@ -15,8 +15,7 @@ from fisheye_svp_ros.effects import pose_effects as pose
 from fisheye_svp_ros.effects import ray_effects as ray
 from fisheye_svp_ros.effects import recording_effects as recording
 from fisheye_svp_ros.effects import target_effects as target
-from fisheye_svp_ros.effects.base import Effect
-from fisheye_svp_ros.effects.terms import ModelTerm
+from fisheye_svp_ros.effects.base import Effect, ModelTerm
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.registry import Registry
 

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.effects.base import Scene
+from fisheye_svp_ros.effects.base import ModelTerm, Scene
 from fisheye_svp_ros.effects.catalogue import load_effects
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.lens import Lens, curve_limit, monotone_limit
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views

@@ -14,10 +14,16 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask, gather_rows
-from fisheye_svp_ros.effects.base import Effect, NoiseEffect, PupilEffect, Scene
+from fisheye_svp_ros.effects.base import (
+    Effect,
+    ModelTerm,
+    NoiseEffect,
+    PupilEffect,
+    Scene,
+    camera_terms,
+)
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import Target, curved_lens
-from fisheye_svp_ros.effects.terms import ModelTerm, camera_terms
 from fisheye_svp_ros.optics import camera, engines
 from fisheye_svp_ros.optics.camera import Image, Incidence, LinearImage, Rays, lens_columns
 from fisheye_svp_ros.optics.lens import Lens

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.effects.base import Scene
-from fisheye_svp_ros.effects.terms import ModelTerm
+from fisheye_svp_ros.effects.base import ModelTerm, Scene
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import cross_matrix, identity
 from fisheye_svp_ros.scene.boards import find_boards

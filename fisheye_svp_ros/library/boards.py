@@ -35,12 +35,12 @@ from fisheye_svp_ros.library.functions import (
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.planning import MAX_VIEWS
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.process import limit_threads
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.solve import rig_calibration, rig_localization
 from fisheye_svp_ros.solve.measured_poses import posable_observations, rig_lenses
 from fisheye_svp_ros.solve.rig_calibration import RigCalibration
 from fisheye_svp_ros.solve.rig_localization import RigLocalization
-from fisheye_svp_ros.threads import limit_threads
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.planning.plan import PhotographPlan

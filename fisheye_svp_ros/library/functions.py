@@ -47,6 +47,7 @@ from fisheye_svp_ros.library.results import (
 )
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.process import limit_threads
 from fisheye_svp_ros.rectify.cameras import camera_for
 from fisheye_svp_ros.rectify.maps import RANGE, Rectification, RectifiedPair, rectify_pair
 from fisheye_svp_ros.scene.observations import STEREO, Observations, stereo_views
@@ -59,7 +60,6 @@ from fisheye_svp_ros.solve.reliability import noise_sigma
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate
 from fisheye_svp_ros.study import budget as budgets
 from fisheye_svp_ros.study import sweep as sweeps
-from fisheye_svp_ros.threads import limit_threads
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.optics.camera import Image, Rays

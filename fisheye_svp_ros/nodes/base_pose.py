@@ -12,9 +12,8 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
-from fisheye_svp_ros.nodes.frame_listener import FrameListener
 from fisheye_svp_ros.nodes.quality import TRANSFORMS
-from fisheye_svp_ros.nodes.transforms import Transforms
+from fisheye_svp_ros.nodes.transforms import FrameListener, Transforms
 from fisheye_svp_ros.pose import Pose, carried_pose
 from fisheye_svp_ros.study.settings import RobotSettings
 

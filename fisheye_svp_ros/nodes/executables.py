@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from fisheye_svp_ros import __version__
 from fisheye_svp_ros.io.streams import tolerant_streams
 from fisheye_svp_ros.nodes import NODES
-from fisheye_svp_ros.threads import set_thread_count
+from fisheye_svp_ros.process import set_thread_count
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.io.parameters import Row

@@ -19,10 +19,9 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base_pose import BasePose
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
 from fisheye_svp_ros.nodes.detections import detections_reader
-from fisheye_svp_ros.nodes.lenses import lens_of
 from fisheye_svp_ros.nodes.messages import camera_shape
 from fisheye_svp_ros.nodes.quality import LATCHED
-from fisheye_svp_ros.nodes.solver import SolverNode
+from fisheye_svp_ros.nodes.solver import SolverNode, lens_of
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.nodes.validation import Items, KnownPoints
 from fisheye_svp_ros.optics.lens import Lens

@@ -23,10 +23,10 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
-from fisheye_svp_ros.nodes.progress import Progress
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.set_collection import (
     CollectedSet,
+    Progress,
     is_repeated,
     make_set,
     scenario_of,

@@ -1,13 +1,21 @@
-"""Sets of image points, collected by the nodes that solve for many of them at once."""
+"""Sets of image points, collected by the nodes that solve for many of them at once.
+
+How far that is, `Progress` publishes: what the feedback of an action would tell.  An action needs
+a type of its own, which no package of Python alone can have.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes.base import BaseNode
+from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.validation import Items, KnownPoints
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
@@ -83,3 +91,18 @@ def scenario_of(items: Items) -> frozenset[tuple[str, str]]:
     """Return what the sets of one scenario have in common."""
     scenario: dict[str, str] = items.get('scenario', {})
     return frozenset((k, v) for k, v in scenario.items() if k not in _WITHIN_SCENARIO)
+
+
+class Progress:
+    """Publishes `~/progress`: views, how many are missing, and what else a node has to tell."""
+
+    def __init__(self, node: BaseNode) -> None:
+        self._node = node
+        self._publisher = node.announce(DiagnosticArray, '~/progress', LATCHED)
+
+    def tell(self, stamp: int, views: int, missing: int, more: Mapping[str, object]) -> None:
+        """Tell it; missing: views until the next result that counts."""
+        name = f'{self._node.get_fully_qualified_name()}: progress'
+        text = f'{missing} more views are needed' if missing else 'enough views'
+        values = {'views': views, 'views_missing': missing, **more}
+        self._publisher.publish(messages.key_values_message(name, values, stamp, text))

@@ -26,21 +26,24 @@ from fisheye_svp_ros.io.decoding import (
     read_key_values,
     read_landmarks,
 )
+from fisheye_svp_ros.io.lens_files import cameras_in
+from fisheye_svp_ros.io.parameters import rows
+from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import ManagedNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.declaration import check_access
-from fisheye_svp_ros.nodes.frame_listener import FrameListener
 from fisheye_svp_ros.nodes.join import LIMIT, LatchedLandmarks, Pending, StampJoin
-from fisheye_svp_ros.nodes.lenses import lens_of, lenses_of, shift_scale
 from fisheye_svp_ros.nodes.quality import INFO_INPUT
 from fisheye_svp_ros.nodes.subscriptions import Unread
+from fisheye_svp_ros.nodes.transforms import FrameListener
 from fisheye_svp_ros.nodes.validation import Items, KnownPoints, SetValidation
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.wording import inputs as wording
 from fisheye_svp_ros.scene.observations import STEREO, Views
+from fisheye_svp_ros.simulate.scenario import Scenario, true_lens
 from fisheye_svp_ros.solve.lens_checks import extrapolated_points
 from fisheye_svp_ros.study.settings import SolverSettings
 from fisheye_svp_ros.study.solutions import Pair
@@ -52,6 +55,7 @@ _MAX_UNANSWERED = 10  # sets that wait for a topic on which nothing has ever com
 _SAME_WAY = 0.7  # cosine of the angle between two viewing axes
 _ENDS = ('taken', 'solved', 'not solved', 'dropped', 'incomplete')  # of sets
 _COUNTS = (*_ENDS, 'solved with a warning')
+_SHIFT_SCALE = next(row for row in rows(Scenario) if row.name == 'shift_scale')
 
 
 class Pace:
@@ -488,3 +492,34 @@ def exchange_reason(rig: Pose) -> str:
     if rig.rotation[2, 2] > _SAME_WAY and x > max(abs(y), abs(z)):
         return wording.cameras_exchanged(float(x))
     return ''
+
+
+def lenses_of(settings: SolverSettings, cameras: Sequence[str]) -> dict[str, Lens]:
+    """Return the lens of the parameter by camera; raise LensError for a bad one.
+
+    cameras: namespaces, each with its slash.
+    """
+    names = cameras_in(lens_path(settings.lens))
+    if len(cameras) < 2 or not names:
+        return dict.fromkeys(('', *cameras), lens_of(settings.lens, 1.0, settings))
+    return {
+        camera: lens_of(f'{settings.lens}#{name}', 1.0, settings)
+        for camera, name in zip(cameras, names, strict=False)
+    }
+
+
+def lens_of(name: str, scale: float, settings: SolverSettings) -> Lens:
+    """Return a lens as it is to be solved with; raise FisheyeSvpError where it cannot be."""
+    lens = true_lens(name, scale)
+    return lens.approximate() if settings.solves_svp else lens
+
+
+def shift_scale(text: str) -> float:
+    """Return the factor that a scenario names; raise FisheyeSvpError where it cannot be used."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise ObservationError(
+            f'scenario: shift_scale is {text[:40]!r}; a number is needed'
+        ) from None
+    return float(_SHIFT_SCALE.check(value))

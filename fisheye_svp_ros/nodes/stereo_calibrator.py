@@ -13,9 +13,14 @@ from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterE
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.progress import Progress
 from fisheye_svp_ros.nodes.quality import LATCHED
-from fisheye_svp_ros.nodes.set_collection import CollectedSet, make_set, scenario_of, table_of
+from fisheye_svp_ros.nodes.set_collection import (
+    CollectedSet,
+    Progress,
+    make_set,
+    scenario_of,
+    table_of,
+)
 from fisheye_svp_ros.nodes.solver import SolverNode, exchange_reason, true_rig
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.nodes.validation import Items

@@ -17,9 +17,9 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.optics.lens import Lens, field_of_view, intrinsic_names
 from fisheye_svp_ros.planning.optimal_design import ViewLimits

@@ -22,9 +22,8 @@ from fisheye_svp_ros.diagnosis import (
     Status,
 )
 from fisheye_svp_ros.reporting.wording.adequacy import flaw_document
-from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
-from fisheye_svp_ros.reporting.wording.decisions import decision_reason
-from fisheye_svp_ros.reporting.wording.findings import finding_reason
+from fisheye_svp_ros.reporting.wording.causes import finding_reason
+from fisheye_svp_ros.reporting.wording.decisions import advised_action, decision_reason, separation
 from fisheye_svp_ros.scene.observations import photograph_names
 
 

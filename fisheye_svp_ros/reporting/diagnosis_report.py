@@ -18,18 +18,20 @@ from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, PointResiduals, 
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
 from fisheye_svp_ros.reporting.shot_plots import draw_shots
 from fisheye_svp_ros.reporting.wording import shots
-from fisheye_svp_ros.reporting.wording.advice import separation
 from fisheye_svp_ros.reporting.wording.causes import (
     bare_probability,
+    belief,
     budget_rows,
     cause_rows,
     describe_effect,
+    finding_reason,
     intrinsic_rows,
     outlier_rows,
     percent,
     quantity,
     uncertainty_rows,
 )
+from fisheye_svp_ros.reporting.wording.decisions import separation
 from fisheye_svp_ros.reporting.wording.diagnosis import (
     CAPTIONS,
     STAGE_WORDS,
@@ -48,7 +50,6 @@ from fisheye_svp_ros.reporting.wording.external import (
     CARRIED_HEADER,
     sections,
 )
-from fisheye_svp_ros.reporting.wording.findings import belief, finding_reason
 from fisheye_svp_ros.reporting.wording.first_screen import first_screen, tone, verdict_words
 from fisheye_svp_ros.reporting.wording.next_steps import (
     ReportInputs,

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.effects.base import noise_scale
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.effects.terms import noise_scale
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import (

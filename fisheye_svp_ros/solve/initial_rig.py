@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.rig_effect import assign_camera
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import Views

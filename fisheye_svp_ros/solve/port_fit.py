@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, flat_rows
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.ray_effects import RadialProfileEffect
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.mixed_model import project_out, pseudo_inverse
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens

@@ -9,9 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.effects.base import Effect, Scene
+from fisheye_svp_ros.effects.base import Effect, ModelTerm, Scene, noise_scale
 from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews
-from fisheye_svp_ros.effects.terms import ModelTerm, noise_scale
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, intrinsic_names, parameter_values
 from fisheye_svp_ros.pose import Pose, cross_matrix

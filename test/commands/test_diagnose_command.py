@@ -24,14 +24,13 @@ from fisheye_svp_ros.diagnosis import (
     diagnose,
 )
 from fisheye_svp_ros.diagnosis.variance_budget import Structure
-from fisheye_svp_ros.effects.base import NO_TIME
+from fisheye_svp_ros.effects.base import NO_TIME, ModelTerm
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.pose_effects import StereoTimeOffsetEffect
 from fisheye_svp_ros.effects.target_effects import TargetShapeEffect
 from fisheye_svp_ros.effects.target_map import board_maps
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.csv_files import CsvTable
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, save_lens

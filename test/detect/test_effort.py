@@ -10,8 +10,7 @@ import pytest
 from helpers.photographs import BOARD, LENS, photograph, poses, write
 
 from fisheye_svp_ros.detect import detection, points
-from fisheye_svp_ros.detect.detection import Detection, detect
-from fisheye_svp_ros.detect.effort import Effort, Look
+from fisheye_svp_ros.detect.detection import Detection, Effort, Look, detect
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import find_photographs
 from fisheye_svp_ros.errors import ObservationError

@@ -18,8 +18,8 @@ from fisheye_svp_ros.diagnosis import (
     diagnose,
 )
 from fisheye_svp_ros.diagnosis.findings import probability_of, status_of
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.terms import ModelTerm
 
 
 def test_a_corrected_p_value_bounds_the_probability() -> None:

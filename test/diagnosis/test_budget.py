@@ -6,8 +6,8 @@ from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import NullModel
 from fisheye_svp_ros.diagnosis.variance_budget import cause_squares
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.rig_state import group_by_frame, with_effect

@@ -11,11 +11,11 @@ from fisheye_svp_ros.diagnosis import Action, DiagnosisOptions, diagnose
 from fisheye_svp_ros.diagnosis.problem import Inputs, Problem
 from fisheye_svp_ros.diagnosis.selection import select_causes
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import intrinsic_names

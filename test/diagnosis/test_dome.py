@@ -10,7 +10,7 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import DomePortEffect
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import DomeGlass
-from fisheye_svp_ros.reporting.wording.advice import separation
+from fisheye_svp_ros.reporting.wording.decisions import separation
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame

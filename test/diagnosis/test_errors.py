@@ -16,9 +16,9 @@ from fisheye_svp_ros.diagnosis.uncertainty import (
     standard_errors,
     total_errors,
 )
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.optics.lens import parameter_values
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state

@@ -11,9 +11,8 @@ from fisheye_svp_ros.diagnosis import EffectTests, NullModel, diagnose
 from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain, sum_gains
 from fisheye_svp_ros.diagnosis.fitted_model import refit
 from fisheye_svp_ros.diagnosis.stepwise import bulk_p_values
-from fisheye_svp_ros.effects.base import Scene
+from fisheye_svp_ros.effects.base import ModelTerm, Scene
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.solve.bundle_adjustment import adjust

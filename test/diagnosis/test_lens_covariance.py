@@ -18,8 +18,8 @@ from fisheye_svp_ros.diagnosis.uncertainty import (
     standard_errors,
     total_errors,
 )
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.ray_errors import SAMPLES, ray_model, typical_points

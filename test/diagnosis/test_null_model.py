@@ -11,8 +11,8 @@ from scipy import special, stats
 from fisheye_svp_ros.diagnosis import EffectTests, NullModel
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, OF_LANDMARKS, make_random_effects
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.mixed_model import (
     LAMBDA_ABSENT,
     Variances,

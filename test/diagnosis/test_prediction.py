@@ -6,8 +6,8 @@ from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import NullModel
 from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.mixed_model import project_out
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import initial_state

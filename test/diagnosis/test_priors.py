@@ -12,9 +12,9 @@ from fisheye_svp_ros.diagnosis import NullModel
 from fisheye_svp_ros.diagnosis.fitted_model import refit
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.effects.rig_effect import assign_camera
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.mixed_model import Variances, no_variances
 from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust

@@ -14,10 +14,10 @@ from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain
 from fisheye_svp_ros.diagnosis.findings import Doubt, find_doubt
 from fisheye_svp_ros.diagnosis.stages import find_rival
 from fisheye_svp_ros.diagnosis.stepwise import eliminate_effects
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.effects.recording_effects import FocalDriftEffect, SessionStepEffect
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting.wording.first_screen import first_screen, headline
 from fisheye_svp_ros.scene.observations import views_of

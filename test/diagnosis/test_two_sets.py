@@ -17,11 +17,10 @@ from fisheye_svp_ros.diagnosis import (
     diagnose_against,
     predict_board,
 )
-from fisheye_svp_ros.diagnosis.checks.travel import measure_travel
-from fisheye_svp_ros.diagnosis.checks.two_datasets import SharedParameter
+from fisheye_svp_ros.diagnosis.checks.two_datasets import SharedParameter, measure_travel
 from fisheye_svp_ros.diagnosis.cross_validation import HeldOut, gain_and_confidence, rms_reduction
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import write_observations

@@ -7,8 +7,8 @@ from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import DiagnosisOptions
 from fisheye_svp_ros.diagnosis.problem import Inputs, Problem
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
-from fisheye_svp_ros.effects.terms import ModelTerm
 
 SIGMA = 0.2
 

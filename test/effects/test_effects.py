@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, scene
 
-from fisheye_svp_ros.effects.base import Scene, Untestable
+from fisheye_svp_ros.effects.base import ModelTerm, Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE, load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.ray_effects import PupilDecenteringEffect
 from fisheye_svp_ros.effects.rig_effect import rig_kind
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.optics.camera import project

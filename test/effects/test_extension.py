@@ -7,10 +7,10 @@ import pytest
 from helpers.scenes import lens, observe, scene
 
 import fisheye_svp_ros as fsvp
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE, load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import lens_from_dict, lens_to_dict, load_lens, save_lens
 from fisheye_svp_ros.io.share import lens_path

@@ -22,7 +22,7 @@ from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file,
 from fisheye_svp_ros.io.lens_formats import READERS_TO_90_DEG, WRITABLE, write_foreign
 from fisheye_svp_ros.io.rig_files import load_cameras, load_rig, save_rig
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.nodes.lenses import lenses_of as of_rig
+from fisheye_svp_ros.nodes.solver import lenses_of as of_rig
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import (
     Equidistant,

@@ -20,7 +20,7 @@ from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.complaints import Complaints
+from fisheye_svp_ros.nodes.base import Complaints
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.scene.observations import Landmarks

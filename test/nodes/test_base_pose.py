@@ -16,9 +16,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped  # isort: skip
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.decoding import read_pose, read_transform, stamp_of
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.frame_listener import FrameTree
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
+from fisheye_svp_ros.nodes.transforms import FrameTree
 from fisheye_svp_ros.pose import Pose, carried_pose, identity, rotation_from_vector
 
 MOUNT = Pose(rotation_from_vector(np.array([0.3, -0.5, 0.2])), np.array([0.2, -0.1, 0.6]))

@@ -14,7 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from fisheye_svp_ros.io.decoding import read_key_values  # noqa: E402
 from fisheye_svp_ros.nodes.localizer import Localizer  # noqa: E402
 from fisheye_svp_ros.optics import engines  # noqa: E402
-from fisheye_svp_ros.optics.engines import compilation, numpy_engine  # noqa: E402
+from fisheye_svp_ros.optics.engines import cache, numpy_engine  # noqa: E402
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def told(reports: list[Any]) -> str:
 
 
 def test_a_start_never_waits_for_numba(graph, uncompiled, monkeypatch):
-    monkeypatch.setattr(compilation, '_CODE', 'import time; time.sleep(600)')
+    monkeypatch.setattr(cache, '_CODE', 'import time; time.sleep(600)')
     g = graph('lens:=fish214')
     reports = g.hear(DiagnosticArray, '/diagnostics')
     node = g.start(Localizer)
@@ -55,7 +55,7 @@ def test_a_start_never_waits_for_numba(graph, uncompiled, monkeypatch):
 def test_numba_is_taken_once_it_has_compiled(
     graph, uncompiled, monkeypatch, capfd, code, taken, line
 ):
-    monkeypatch.setattr(compilation, '_CODE', code)
+    monkeypatch.setattr(cache, '_CODE', code)
     g = graph('lens:=fish214')
     reports = g.hear(DiagnosticArray, '/diagnostics')
     node = g.start(Localizer)

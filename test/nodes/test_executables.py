@@ -183,7 +183,7 @@ def test_hardly_anything_is_loaded_before_signals_end_a_node_quietly() -> None:
         'fisheye_svp_ros.io.streams',
         'fisheye_svp_ros.nodes',
         'fisheye_svp_ros.nodes.executables',
-        'fisheye_svp_ros.threads',
+        'fisheye_svp_ros.process',
     ]
 
 

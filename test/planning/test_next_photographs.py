@@ -10,9 +10,9 @@ from helpers.water import AIR, photographs
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.diagnosis import Cause
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations

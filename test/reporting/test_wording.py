@@ -24,9 +24,13 @@ from fisheye_svp_ros.diagnosis import (
 )
 from fisheye_svp_ros.diagnosis.causes import Imitation
 from fisheye_svp_ros.diagnosis.decision import EffectBound, Figure, FileFigure, LensOffset
-from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
-from fisheye_svp_ros.reporting.wording.decisions import decision_reason, target_error
-from fisheye_svp_ros.reporting.wording.findings import finding_reason
+from fisheye_svp_ros.reporting.wording.causes import finding_reason
+from fisheye_svp_ros.reporting.wording.decisions import (
+    advised_action,
+    decision_reason,
+    separation,
+    target_error,
+)
 from fisheye_svp_ros.reporting.wording.metrics import metric_text
 from fisheye_svp_ros.reporting.wording.poses import map_notes
 

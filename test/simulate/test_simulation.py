@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.detection_effects import (
     NoiseVsAngleEffect,
     QuantisationEffect,
     WrongIdsEffect,
 )
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import LensError, ParameterError
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens

@@ -7,11 +7,11 @@ import pytest
 from helpers.scenes import lens, observe, scene
 from scipy.optimize import least_squares
 
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.image_effects import DecenteringEffect, SkewEffect
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.effects.rig_effect import assign_camera
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.pose import Pose, identity

@@ -6,9 +6,9 @@ from helpers import scenes
 from helpers.differences import derivative, jacobian
 from scipy.optimize import least_squares
 
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens

@@ -5,9 +5,9 @@ import pytest
 from helpers.differences import jacobian
 from scipy.optimize import brentq, least_squares, minimize_scalar
 
+from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.effects.terms import ModelTerm
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path

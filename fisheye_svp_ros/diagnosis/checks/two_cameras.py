@@ -26,8 +26,8 @@ from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import Progress
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.selection import Selection, select_causes
+from fisheye_svp_ros.effects.base import ModelTerm, camera_terms
 from fisheye_svp_ros.effects.target_map import KnownTarget, at_landmarks, less_similarity
-from fisheye_svp_ros.effects.terms import ModelTerm, camera_terms
 from fisheye_svp_ros.pose import Pose, identity, vector_from_rotation
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.rig_checks import MIN_SHARED_FRAMES, is_unpaired

@@ -19,7 +19,7 @@ from types import ModuleType
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.engines import cache, numpy_engine, port_projection
-from fisheye_svp_ros.optics.engines.compilation import Compilation
+from fisheye_svp_ros.optics.engines.cache import Compilation
 from fisheye_svp_ros.optics.engines.results import Incidence, Localization, Rigs, Seen
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose

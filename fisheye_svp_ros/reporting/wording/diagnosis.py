@@ -17,15 +17,15 @@ from fisheye_svp_ros.diagnosis import (
 from fisheye_svp_ros.effects.base import NO_TIME
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.wording.adequacy import flaw_headline, flaw_reason
-from fisheye_svp_ros.reporting.wording.advice import advised_action, separation
 from fisheye_svp_ros.reporting.wording.causes import (
     describe_effect,
     percent,
+    pixels,
     probability,
     size,
+    with_odds,
 )
-from fisheye_svp_ros.reporting.wording.decisions import decision_reason
-from fisheye_svp_ros.reporting.wording.findings import pixels, with_odds
+from fisheye_svp_ros.reporting.wording.decisions import advised_action, decision_reason, separation
 from fisheye_svp_ros.scene.observations import frame_name
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
 

@@ -10,9 +10,8 @@ from typing import NamedTuple
 from fisheye_svp_ros.diagnosis import Comparison, Diagnosis, Transfer, TwoCameras, TwoDatasets
 from fisheye_svp_ros.reporting.calibrated_camera import ROBOT_HEADER, hand_eye_rows
 from fisheye_svp_ros.reporting.wording.calibration import hand_eye_sentence, hand_eye_warnings
-from fisheye_svp_ros.reporting.wording.causes import quantity
+from fisheye_svp_ros.reporting.wording.causes import pixels, quantity
 from fisheye_svp_ros.reporting.wording.diagnosis import compared_row, join_names
-from fisheye_svp_ros.reporting.wording.findings import pixels
 from fisheye_svp_ros.solve.hand_eye import HandEye
 
 CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'less by (95 %)')

@@ -36,10 +36,15 @@ from fisheye_svp_ros.reporting.wording.adequacy import (
 from fisheye_svp_ros.reporting.wording.causes import (
     COMPONENTS,
     HUMAN_UNITS,
+    belief,
+    chance,
     describe_effect,
+    finding_reason,
     most_significant,
     percent,
+    pixels,
     size,
+    with_odds,
 )
 from fisheye_svp_ros.reporting.wording.decisions import (
     bound_place,
@@ -56,13 +61,6 @@ from fisheye_svp_ros.reporting.wording.diagnosis import (
     only_gross,
 )
 from fisheye_svp_ros.reporting.wording.external import travel_sentence
-from fisheye_svp_ros.reporting.wording.findings import (
-    belief,
-    chance,
-    finding_reason,
-    pixels,
-    with_odds,
-)
 from fisheye_svp_ros.scene.observations import photograph_names
 
 _MAX_NAMES = 4  # photographs, and candidates, by name

@@ -1,12 +1,15 @@
-"""How many threads linear algebra uses: one, unless the environment says otherwise.
+"""What a process asks of its system: threads of linear algebra, and memory.
 
-The matrices here are small.  Threads of BLAS that wait for each other at every product cost
-several times what they bring, and some BLAS returns other last digits on more of them.
+One thread, unless the environment says otherwise.  The matrices here are small.  Threads of BLAS
+that wait for each other at every product cost several times what they bring, and some BLAS returns
+other last digits on more of them.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 from collections.abc import Callable
 from functools import wraps
 from importlib.util import find_spec
@@ -16,6 +19,9 @@ VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 
 _P = ParamSpec('_P')
 _R = TypeVar('_R')
+# Of malloc.h: no array has pages of its own, none of those on top goes back, one arena for all
+# threads, steps of 64 MB.
+_MMAP_MAX, _TRIM_THRESHOLD, _ARENA_MAX, _TOP_PAD = (-4, 0), (-1, 2**31 - 1), (-8, 1), (-2, 1 << 26)
 
 
 def set_thread_count() -> None:
@@ -41,3 +47,16 @@ def limit_threads(function: Callable[_P, _R]) -> Callable[_P, _R]:
             return function(*args, **kwargs)
 
     return wrapper
+
+
+def keep_memory() -> None:
+    """Have malloc keep what is freed, for a process that makes large arrays and ends.
+
+    Fresh pages cost about as much as sums over them.  Of glibc alone; does nothing elsewhere.
+    """
+    if sys.platform != 'linux':
+        return
+    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
+    if mallopt is not None:
+        for option in (_MMAP_MAX, _TRIM_THRESHOLD, _ARENA_MAX, _TOP_PAD):
+            mallopt(*option)
