@@ -68,7 +68,7 @@ EXAMPLES = {
     'undistort': 'lens.yaml photographs --as pinhole -o undistorted',
     'watch': '',
 }
-_FIRST = """{description}
+_FIRST_COMMANDS = """{description}
 
 with photographs of a board:
   fisheye-svp calibrate {calibrate}
@@ -106,26 +106,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return status
         if isinstance(error, BrokenPipeError):  # nobody reads on
             return status or _BROKEN_PIPE
-        return _tell(f'standard output cannot be written ({error.strerror})')
+        return _print_error(f'standard output cannot be written ({error.strerror})')
 
 
 def _status(arguments: Sequence[str]) -> int:
     try:
         _run(arguments)
     except FisheyeSvpError as error:
-        return _tell(str(error))
+        return _print_error(str(error))
     except ModuleNotFoundError as error:
         if str(error.name).startswith('fisheye_svp_ros'):
             raise
-        return _tell(f'this needs the Python package {error.name}, which is not installed')
+        return _print_error(f'this needs the Python package {error.name}, which is not installed')
     except OSError as error:  # of a path that no check has asked for
-        return _tell(f'{error.filename or "a file"!r:.200}: {error.strerror or error}')
+        return _print_error(f'{error.filename or "a file"!r:.200}: {error.strerror or error}')
     except KeyboardInterrupt:
         return _EXIT_SIGINT
     return 0
 
 
-def _tell(text: str) -> int:
+def _print_error(text: str) -> int:
     """Print the one line of bad input; return its exit code."""
     print(f'fisheye-svp: {text}', file=sys.stderr)
     return _BAD_INPUT
@@ -133,7 +133,7 @@ def _tell(text: str) -> int:
 
 def _run(arguments: Sequence[str]) -> None:
     if not arguments:
-        print(_FIRST.format(description=_DESCRIPTION, **EXAMPLES), end='')
+        print(_FIRST_COMMANDS.format(description=_DESCRIPTION, **EXAMPLES), end='')
         return
     parser = _Parser(prog='fisheye-svp', description=_DESCRIPTION)
     parser.add_argument('--version', action='version', version=f'%(prog)s {__version__}')

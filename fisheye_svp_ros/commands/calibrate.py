@@ -20,7 +20,7 @@ from fisheye_svp_ros.commands.detect import (
 )
 from fisheye_svp_ros.commands.lenses import add_port_arguments, load_with_notes, port_of
 from fisheye_svp_ros.commands.notes import (
-    counted,
+    count_text,
     note_copies,
     note_gross_errors,
     note_huge,
@@ -427,7 +427,7 @@ def _warnings(
                 else 'are shared'
             )
             yield (
-                f'only {counted(shared, "frame")} {what}, and it is assumed that all '
+                f'only {count_text(shared, "frame")} {what}, and it is assumed that all '
                 'cameras saw one target; take more photographs of it with two cameras at once'
             )
             if len(found.cameras) == 2:

@@ -147,7 +147,10 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose, diagnose_against
     from fisheye_svp_ros.planning.plan import check_number
     from fisheye_svp_ros.reporting.terminal import stages
-    from fisheye_svp_ros.reporting.wording.first_screen import provisional_headline, what_changed
+    from fisheye_svp_ros.reporting.wording.first_screen import (
+        headline_changes,
+        provisional_headline,
+    )
     from fisheye_svp_ros.solve.measured_poses import poses_by_frame, rig_lenses
     from fisheye_svp_ros.solve.rig_state import free_parameters
     from fisheye_svp_ros.study.trust import known_errors
@@ -170,7 +173,7 @@ def run(args: argparse.Namespace) -> None:
     told: list[tuple[str, ...]] = []
     with stages('diagnosing') as progress:
 
-        def tell(names: tuple[str, ...]) -> None:
+        def show_provisional(names: tuple[str, ...]) -> None:
             """Show on a terminal, once, what the first round has found."""
             if not told and sys.stderr.isatty():
                 told.append(names)
@@ -184,7 +187,7 @@ def run(args: argparse.Namespace) -> None:
                 tuple(args.included), effects_left_out(args), args.quick, args.range_m, stated
             ),
             'progress': progress,
-            'provisional': tell,
+            'provisional': show_provisional,
         }
         try:
             if other is None:
@@ -204,7 +207,7 @@ def run(args: argparse.Namespace) -> None:
                 _write(args, diagnosis, known, bool(fitted), wanted)
     _print(diagnosis, known, args, wanted)
     for names in told:
-        print(*what_changed(names, diagnosis), sep='\n', end='', file=sys.stderr)
+        print(*headline_changes(names, diagnosis), sep='\n', end='', file=sys.stderr)
     note_wrong_landmarks(diagnosis.evaluation.selection.revision.outliers.landmarks)
     if not args.poses:
         note_unconnected(observations)

@@ -36,22 +36,22 @@ class Workers(NamedTuple):
     ahead: int
 
 
-def completed(
+def completed_tasks(
     work: Callable[[T], R], tasks: Iterable[T], workers: Workers
 ) -> Iterator[tuple[T, R]]:
     """Yield tasks and what work makes of them, as they are done; few are under way at once."""
     under_way: dict[Future[R], T] = {}
 
-    def finished() -> Iterator[tuple[T, R]]:
+    def results_so_far() -> Iterator[tuple[T, R]]:
         for future in wait(under_way, return_when=FIRST_COMPLETED).done:
             yield under_way.pop(future), future.result()
 
     for task in tasks:
         under_way[workers.executor.submit(work, task)] = task
         if len(under_way) >= workers.ahead:
-            yield from finished()
+            yield from results_so_far()
     while under_way:
-        yield from finished()
+        yield from results_so_far()
 
 
 @contextmanager

@@ -50,7 +50,7 @@ def note_extrapolated(what: str, lens: Lens, uv: Array) -> None:
         say(points_extrapolated(what, beyond))
 
 
-def counted(count: int, noun: str) -> str:
+def count_text(count: int, noun: str) -> str:
     """Return a number of things, one of them in the singular."""
     return f'{count} {noun}' if count == 1 else f'{count} {noun}s'
 

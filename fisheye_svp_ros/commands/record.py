@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> None:
 
 def _sweep(name: str, bag: Path) -> None:
     from fisheye_svp_ros.commands.node_sweeps import read_sweep, record_sweep
-    from fisheye_svp_ros.commands.notes import counted, say
+    from fisheye_svp_ros.commands.notes import count_text, say
     from fisheye_svp_ros.io.bags import Bag
     from fisheye_svp_ros.reporting.terminal import progress
 
@@ -72,7 +72,7 @@ def _sweep(name: str, bag: Path) -> None:
     with progress('sweeping', len(plan.sweep)) as advance:
         record_sweep(path, plan, bag, bag.with_name(f'{bag.name}_logs'), advance)
     count = sum(1 for _ in Bag(bag).records(lambda topic, _: topic == '/scenario'))
-    say(f'{count} sets of {counted(len(plan.sweep), "scenario")} are in {bag}')
+    say(f'{count} sets of {count_text(len(plan.sweep), "scenario")} are in {bag}')
 
 
 def _record(args: argparse.Namespace) -> None:

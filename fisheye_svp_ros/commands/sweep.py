@@ -10,9 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fisheye_svp_ros.commands.executors import completed, dask, process_pool
+from fisheye_svp_ros.commands.executors import completed_tasks, dask, process_pool
 from fisheye_svp_ros.commands.node_sweeps import read_sweep
-from fisheye_svp_ros.commands.notes import counted, note_formats, say
+from fisheye_svp_ros.commands.notes import count_text, note_formats, say
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.errors import OutputError, ParameterError
 from fisheye_svp_ros.io.columns import TableParts
@@ -162,12 +162,14 @@ def _written(
     write = partial(write_rows, parts, engine, plan)
     if args.dask:
         with dask(args.dask) as workers:
-            for numbers, rows in completed(partial(solve_rows, engine, plan), remaining, workers):
+            for numbers, rows in completed_tasks(
+                partial(solve_rows, engine, plan), remaining, workers
+            ):
                 parts.write(numbers.start, rows)
                 yield numbers
     elif args.workers:
         with process_pool(args.workers) as workers:
-            for numbers, _ in completed(write, remaining, workers):
+            for numbers, _ in completed_tasks(write, remaining, workers):
                 yield numbers
     else:
         for numbers in remaining:
@@ -184,7 +186,7 @@ def _report(path: Path, folder: Path, plan: Plan, mine: str, metrics: DataFrame)
     summaries = {name: summarise(metrics[name].to_numpy()) for name in metrics}
     count = len(plan.sweep)
     print_table(
-        f'{path}: {counted(count, "scenario")}',
+        f'{path}: {count_text(count, "scenario")}',
         ('metric', 'sets', 'not solved', 'median', 'mean', 'largest'),
         [
             (name, str(s.solved), str(s.missing), *(f'{v:.6g}' for v in s[2:]))

@@ -13,7 +13,7 @@ _CAMERA = re.compile(
     r'((?:[Ll]eft|LEFT|[Rr]ight|RIGHT)(?![a-z])|(?:cam(?:era)?|CAM(?:ERA)?|Cam(?:era)?)[_-]?\d+)'
     r'|(?<![A-Za-z0-9])([LRlr])(?=[_\-\d]|$)'
 )
-_WORDS = re.compile(r'\d+|[A-Za-z]+')
+_NAME_PARTS = re.compile(r'\d+|[A-Za-z]+')
 _MIN_SHARED = 3  # names of two kinds that go on alike, before they look like two cameras'
 
 
@@ -42,7 +42,7 @@ def alike_series(names: Sequence[str]) -> tuple[str, ...]:
     """
     series: dict[str, set[str]] = {}
     for name in names:
-        words = [*_WORDS.finditer(name)]
+        words = [*_NAME_PARTS.finditer(name)]
         if not words or not words[-1][0].isdigit():
             return ()
         series.setdefault(name[: words[-1].start()], set()).add(words[-1][0])

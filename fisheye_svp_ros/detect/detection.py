@@ -82,9 +82,9 @@ class Effort:
         """Whether any photograph showed the board."""
         return self._found > 0
 
-    def note(self, found: bool, inverted: bool) -> None:
+    def note(self, has_board: bool, inverted: bool) -> None:
         """Take note of what a photograph has shown."""
-        self._found += found
+        self._found += has_board
         self._inverted += inverted
 
     def look(self, number: int, repeatable: bool) -> Look:
@@ -135,9 +135,9 @@ class Detection(NamedTuple):
     pairing: Pairing
 
     def __repr__(self) -> str:
-        found = sum(one.points is not None for one in self.searched)
+        count = sum(photo.points is not None for photo in self.searched)
         return (
-            f'Detection(board in {found} of {len(self.searched)} photographs, {self.observations})'
+            f'Detection(board in {count} of {len(self.searched)} photographs, {self.observations})'
         )
 
     @property
@@ -183,11 +183,13 @@ def detect(
         for index, result in bounded_map(examine, todo, SECONDS):
             number = index if numbers is None else numbers[index]
             if isinstance(result, TimedOut):
-                one = begun[number].photograph
+                photo = begun[number].photograph
                 why = (
                     f'no board within {SECONDS:g} s' if result.timed_out else 'the search crashed'
                 )
-                result = SearchedPhotograph(one.name, one.key, one.camera, one.t, reason=why)
+                result = SearchedPhotograph(
+                    photo.name, photo.key, photo.camera, photo.t, reason=why
+                )
             results[number] = result
             effort.note(result.points is not None, result.inverted)
             if numbers is None:
@@ -207,8 +209,8 @@ def detect(
     if pattern.kind == 'aprilgrid':
         search(*_by_common_layout(begun, results))
     searched = _add_notes(_of_cameras(_one_size([results[number] for number in sorted(results)])))
-    if not any(one.points for one in searched):
-        reasons = Counter(one.reason.partition(';')[0] for one in searched).most_common(2)
+    if not any(photo.points for photo in searched):
+        reasons = Counter(photo.reason.partition(';')[0] for photo in searched).most_common(2)
         said = ', '.join(f'{reason} ({count})' for reason, count in reasons)
         raise ObservationError(
             f'{source}: no {pattern.spec} in {len(searched)} photographs: '
@@ -224,16 +226,16 @@ def _by_common_layout(
 
     Results with points of another layout are left out, since these are other landmarks.
     """
-    layout = common_layout([one.tags.layouts for one in results.values()])
+    layout = common_layout([photo.tags.layouts for photo in results.values()])
     again = list[int]()
-    for number, one in results.items():
-        own = one.points.grid.layout if one.points and one.points.grid else None
-        if layout is None or not one.tags.layouts or own == layout:
+    for number, photo in results.items():
+        own = photo.points.grid.layout if photo.points and photo.points.grid else None
+        if layout is None or not photo.tags.layouts or own == layout:
             continue
-        if layout in one.tags.layouts and isinstance(begun[number].photograph.data, Path):
+        if layout in photo.tags.layouts and isinstance(begun[number].photograph.data, Path):
             again.append(number)
-        elif own is not None or layout not in one.tags.layouts:
-            results[number] = replace(one, points=None, reason=_OTHER_LAYOUT)
+        elif own is not None or layout not in photo.tags.layouts:
+            results[number] = replace(photo, points=None, reason=_OTHER_LAYOUT)
     return [
         begun[i]._replace(pattern=begun[i].pattern.with_layout(layout)) for i in again if layout
     ], again
@@ -243,19 +245,19 @@ def _moments(
     searched: tuple[SearchedPhotograph, ...], sync: float | None
 ) -> tuple[tuple[SearchedPhotograph, ...], Pairing]:
     """Return photographs with the time that their names say, and equal keys for one moment."""
-    t = np.array([one.t for one in searched])
-    stamps = [stamp for one in searched if (stamp := stamp_of(one.key)) is not None]
+    t = np.array([photo.t for photo in searched])
+    stamps = [stamp for photo in searched if (stamp := stamp_of(photo.key)) is not None]
     if len(stamps) == len(searched) and np.isnan(t).all():
         searched = tuple(
-            replace(one, t=stamp / 1e9) for one, stamp in zip(searched, stamps, strict=True)
+            replace(photo, t=stamp / 1e9) for photo, stamp in zip(searched, stamps, strict=True)
         )
         # Numbers of s since 1970 are no finer than a quarter of a microsecond.
         t = np.array([stamp - min(stamps) for stamp in stamps]) / 1e9
     pairing = pair_photographs(
-        [one.key for one in searched], [one.camera for one in searched], t, sync
+        [photo.key for photo in searched], [photo.camera for photo in searched], t, sync
     )
     return tuple(
-        replace(one, key=key) for one, key in zip(searched, pairing.keys, strict=True)
+        replace(photo, key=key) for photo, key in zip(searched, pairing.keys, strict=True)
     ), pairing
 
 
@@ -322,71 +324,73 @@ def _is_rotated(photograph: Photograph) -> bool:
 def _one_size(searched: list[SearchedPhotograph]) -> list[SearchedPhotograph]:
     """Leave out boards in photographs of another size than most with a board of their camera."""
     sizes = {
-        camera: Counter(one.size for one in searched if one.camera == camera and one.points)
-        for camera in {one.camera for one in searched}
+        camera: Counter(
+            photo.size for photo in searched if photo.camera == camera and photo.points
+        )
+        for camera in {photo.camera for photo in searched}
     }
     usual = {camera: count.most_common(1)[0][0] for camera, count in sizes.items() if count}
     return [
-        one
-        if not one.points or one.size == usual[one.camera]
+        photo
+        if not photo.points or photo.size == usual[photo.camera]
         else replace(
-            one,
+            photo,
             points=None,
-            reason='is {}x{} px; the others are {}x{}'.format(*one.size, *usual[one.camera]),
+            reason='is {}x{} px; the others are {}x{}'.format(*photo.size, *usual[photo.camera]),
         )
-        for one in searched
+        for photo in searched
     ]
 
 
 def _of_cameras(searched: list[SearchedPhotograph]) -> list[SearchedPhotograph]:
     """Leave out boards in photographs of no camera where others are of one."""
-    cameras = sorted({one.camera for one in searched if one.camera and one.points})
+    cameras = sorted({photo.camera for photo in searched if photo.camera and photo.points})
     reason = (
         f'of no camera, others are of {", ".join(cameras)}; put it into a folder of its camera'
     )
     return [
-        replace(one, points=None, reason=reason)
-        if cameras and one.points and not one.camera
-        else one
-        for one in searched
+        replace(photo, points=None, reason=reason)
+        if cameras and photo.points and not photo.camera
+        else photo
+        for photo in searched
     ]
 
 
 def _add_notes(searched: list[SearchedPhotograph]) -> tuple[SearchedPhotograph, ...]:
     """Leave out copies; name photographs that are blurred, burnt out or from the same place."""
-    blur = float(np.median([one.points.blur for one in searched if one.points] or [0.0]))
+    blur = float(np.median([photo.points.blur for photo in searched if photo.points] or [0.0]))
     done: list[SearchedPhotograph] = []
-    for one in searched:
-        if one.points is None:
-            done.append(one)
+    for photo in searched:
+        if photo.points is None:
+            done.append(photo)
             continue
-        notes = list(one.notes)
-        if one.points.blur > max(_BLUR_LIMITS, _BLUR_LIMITS * blur):
-            notes.append(f'blurred by {one.points.blur:.1f} px')
-        if one.bright > SATURATED_SHARE:
-            notes.append(f'over-exposed: {100 * one.bright:.0f} % of the board at full scale')
-        for other in (o for o in done if o.points is not None and o.camera == one.camera):
-            if one.digest == other.digest:
-                one = replace(one, points=None, reason=f'a copy of {other.name}')
+        notes = list(photo.notes)
+        if photo.points.blur > max(_BLUR_LIMITS, _BLUR_LIMITS * blur):
+            notes.append(f'blurred by {photo.points.blur:.1f} px')
+        if photo.bright > SATURATED_SHARE:
+            notes.append(f'over-exposed: {100 * photo.bright:.0f} % of the board at full scale')
+        for other in (o for o in done if o.points is not None and o.camera == photo.camera):
+            if photo.digest == other.digest:
+                photo = replace(photo, points=None, reason=f'a copy of {other.name}')
                 break
-            if one.key == other.key:
-                one = replace(
-                    one,
+            if photo.key == other.key:
+                photo = replace(
+                    photo,
                     points=None,
                     reason=(
                         f'the same frame as {other.name}, by name or stamp; rename or remove it'
                     ),
                 )
                 break
-            if _is_same_moment(one, other):
+            if _is_same_moment(photo, other):
                 notes.append(f'from the same viewpoint as {Path(other.name).name}')
                 break
-        done.append(replace(one, notes=tuple(notes)))
+        done.append(replace(photo, notes=tuple(notes)))
     return tuple(done)
 
 
-def _is_same_moment(one: SearchedPhotograph, other: SearchedPhotograph) -> bool:
-    a, b = one.points, other.points
+def _is_same_moment(photo: SearchedPhotograph, other: SearchedPhotograph) -> bool:
+    a, b = photo.points, other.points
     if a is None or b is None:
         return False
     _, mine, theirs = np.intersect1d(a.ids, b.ids, return_indices=True)
@@ -396,36 +400,38 @@ def _is_same_moment(one: SearchedPhotograph, other: SearchedPhotograph) -> bool:
 def _table(
     searched: tuple[SearchedPhotograph, ...], pairing: Pairing, pattern: Pattern, source: str
 ) -> Detection:
-    keys = sorted({one.key for one in searched}, key=[o.key for o in searched].index)
+    keys = sorted({photo.key for photo in searched}, key=[o.key for o in searched].index)
     number = {key: i for i, key in enumerate(keys)}
-    cameras = tuple(sorted({one.camera for one in searched if one.points}))
-    found = [one for one in searched if one.points is not None]
+    cameras = tuple(sorted({photo.camera for photo in searched if photo.points}))
+    with_board = [photo for photo in searched if photo.points is not None]
     certainty = np.ones(len(searched))
     if len(pattern.symmetries) > 1:
-        found, sure = _agree_on_order(found, pattern, cameras, number, source)
-        certainty[[one.points is not None for one in searched]] = sure
-        again = iter(found)
-        searched = tuple(next(again) if one.points is not None else one for one in searched)
-    frames = np.array([number[one.key] if one.points else -1 for one in searched])
-    observations = _observations(found, pattern, cameras, number, source)
-    sizes = {name: next(one.size for one in found if one.camera == name) for name in cameras}
+        with_board, sure = _agree_on_order(with_board, pattern, cameras, number, source)
+        certainty[[photo.points is not None for photo in searched]] = sure
+        again = iter(with_board)
+        searched = tuple(next(again) if photo.points is not None else photo for photo in searched)
+    frames = np.array([number[photo.key] if photo.points else -1 for photo in searched])
+    observations = _observations(with_board, pattern, cameras, number, source)
+    sizes = {
+        name: next(photo.size for photo in with_board if photo.camera == name) for name in cameras
+    }
     return Detection(observations, searched, frames, sizes, certainty, pairing)
 
 
 def _agree_on_order(
-    found: list[SearchedPhotograph],
+    with_board: list[SearchedPhotograph],
     pattern: Pattern,
     cameras: tuple[str, ...],
     number: dict[str, int],
     source: str,
 ) -> tuple[list[SearchedPhotograph], Array]:
     """Return the photographs with their corners in one order, and how sure that is."""
-    table = _observations(found, pattern, cameras, number, source)
-    field = np.full((len(found), len(pattern.points), 2), np.nan)
-    poses = Pose(np.full((len(found), 3, 3), np.nan), np.full((len(found), 3), np.nan))
+    table = _observations(with_board, pattern, cameras, number, source)
+    field = np.full((len(with_board), len(pattern.points), 2), np.nan)
+    poses = Pose(np.full((len(with_board), 3, 3), np.nan), np.full((len(with_board), 3), np.nan))
     for camera, name in enumerate(cameras):
-        mine = {number[one.key]: i for i, one in enumerate(found) if one.camera == name}
-        size = next(one.size for one in found if one.camera == name)
+        mine = {number[photo.key]: i for i, photo in enumerate(with_board) if photo.camera == name}
+        size = next(photo.size for photo in with_board if photo.camera == name)
         try:
             # With a viewpoint shift, lest that be taken for the board's errors.
             fitted = calibrate(table.take(table.camera == camera), 'kannala_brandt', size, _FREE)
@@ -442,42 +448,44 @@ def _agree_on_order(
             for whole, part in zip(poses, fitted.adjusted.pose, strict=True):
                 whole[mine[frame]] = part[view]
     seen = np.isfinite(field).any(axis=(1, 2))
-    sure = np.full(len(found), np.nan)
+    sure = np.full(len(with_board), np.nan)
     if seen.sum() < 3:
-        return found, sure
-    leader, own = _order_by_left(found, cameras, poses, pattern)
+        return with_board, sure
+    leader, own = _order_by_left(with_board, cameras, poses, pattern)
     together = np.zeros_like(field)
     for i in np.flatnonzero(seen):
         together[leader[i]] += np.nan_to_num(turn_field(field[i], pattern.symmetries[own[i]]))
     leaders = np.unique(leader[seen])
     agreement: Agreement = agree(together[leaders], pattern.symmetries)
-    done = list(found)
+    done = list(with_board)
     for i in np.flatnonzero(seen):
         at = np.searchsorted(leaders, leader[i])
-        points, sure[i] = found[i].points, agreement.certainty[at]
+        points, sure[i] = with_board[i].points, agreement.certainty[at]
         assert points is not None
         for turn in (own[i], agreement.turn[at]):
             points = _turned_points(points, pattern.symmetries[turn])
-        done[i] = replace(found[i], points=points)
+        done[i] = replace(with_board[i], points=points)
     return done, sure
 
 
 def _order_by_left(
-    found: list[SearchedPhotograph], cameras: tuple[str, ...], poses: Pose, pattern: Pattern
+    with_board: list[SearchedPhotograph], cameras: tuple[str, ...], poses: Pose, pattern: Pattern
 ) -> tuple[Index, Index]:
     """Return with which photograph (S,) each one is turned, and how it is turned to fit that.
 
     Those of a rig go with the first camera's of the same moment, all others by themselves.
     """
-    leader, own = np.arange(len(found)), np.zeros(len(found), dtype=int)
+    leader, own = np.arange(len(with_board)), np.zeros(len(with_board), dtype=int)
     posed = set(np.flatnonzero(np.isfinite(poses.position).all(axis=1)).tolist())
-    first = {found[i].key: i for i in posed if found[i].camera == cameras[0]}
+    first = {with_board[i].key: i for i in posed if with_board[i].camera == cameras[0]}
     for name in cameras[1:]:
         mine = np.array(
-            sorted(i for i in posed if found[i].camera == name and found[i].key in first),
+            sorted(
+                i for i in posed if with_board[i].camera == name and with_board[i].key in first
+            ),
             dtype=int,
         )
-        theirs = np.array([first[found[i].key] for i in mine], dtype=int)
+        theirs = np.array([first[with_board[i].key] for i in mine], dtype=int)
         turns = (
             of_rig(poses.take(theirs), poses.take(mine), pattern.points[:, :2], pattern.symmetries)
             if len(mine) >= _MIN_RIG_FRAMES
@@ -500,31 +508,32 @@ def _turned_points(points: Points, turn: Turn) -> Points:
 
 
 def _observations(
-    found: list[SearchedPhotograph],
+    with_board: list[SearchedPhotograph],
     pattern: Pattern,
     cameras: tuple[str, ...],
     number: dict[str, int],
     source: str,
 ) -> Observations:
-    points = [one.points for one in found if one.points is not None]
-    count = [len(one.ids) for one in points]
-    index = np.concatenate([one.ids for one in points])
+    points = [photo.points for photo in with_board if photo.points is not None]
+    count = [len(part.ids) for part in points]
+    index = np.concatenate([part.ids for part in points])
 
     def column(values: list[float]) -> Array:
         return np.repeat(np.array(values, dtype=float), count)
 
-    t = [one.t for one in found]
+    t = [photo.t for photo in with_board]
     table = make_observations(
-        column([number[one.key] for one in found]).astype(np.int64),
+        column([number[photo.key] for photo in with_board]).astype(np.int64),
         index,
-        np.concatenate([one.uv for one in points]),
+        np.concatenate([part.uv for part in points]),
         pattern.points[index],
-        camera=column([cameras.index(one.camera) for one in found]).astype(np.int64),
+        camera=column([cameras.index(photo.camera) for photo in with_board]).astype(np.int64),
         t=column(t if np.isfinite(t).all() else [np.nan] * len(t)),
         cameras=cameras,
         source=source,
-        sigma=np.concatenate([one.sigma for one in points]),
+        sigma=np.concatenate([part.sigma for part in points]),
     )
     return replace(
-        table, photographs=tuple((number[one.key], one.camera, one.name) for one in found)
+        table,
+        photographs=tuple((number[photo.key], photo.camera, photo.name) for photo in with_board),
     )

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.grids import find_circles, find_squares
-from fisheye_svp_ros.detect.patterns import Found, Pattern
+from fisheye_svp_ros.detect.patterns import LocatedPoints, Pattern
 from fisheye_svp_ros.detect.tag_grids import GridReading, GridSize, TagLayout, read_grid
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.registry import Registry
 
 Grey = NDArray[np.uint8]
-Finder = Callable[[Grey, Pattern], Found | None]
+Finder = Callable[[Grey, Pattern], LocatedPoints | None]
 
 _ARUCO: Any = getattr(cv2, 'aruco', None)  # of opencv-contrib alone before 4.7
 _SEARCH_SIZE = 1600  # px; larger images are searched smaller first
@@ -35,7 +35,7 @@ _SB_HARD = _SB | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
 def _at_small_scale(find: Finder) -> Finder:
     """Return a finder that searches large images at a smaller scale."""
 
-    def search(image: Grey, pattern: Pattern) -> Found | None:
+    def search(image: Grey, pattern: Pattern) -> LocatedPoints | None:
         scale = _SEARCH_SIZE / max(image.shape)
         if scale >= 1:
             return find(image, pattern)
@@ -49,7 +49,7 @@ def _at_small_scale(find: Finder) -> Finder:
 def _search_scaled(find: Finder) -> Finder:
     """Return a finder that searches large images at a smaller scale first."""
 
-    def search(image: Grey, pattern: Pattern) -> Found | None:
+    def search(image: Grey, pattern: Pattern) -> LocatedPoints | None:
         found = _at_small_scale(find)(image, pattern)
         return find(image, pattern) if found is None and max(image.shape) > _SEARCH_SIZE else found
 
@@ -64,7 +64,7 @@ def invert_image(find: Finder) -> Finder:
 def _sharper(find: Finder) -> Finder:
     """Return a finder that looks again, at the sharpened image, where it finds few points."""
 
-    def search(image: Grey, pattern: Pattern) -> Found | None:
+    def search(image: Grey, pattern: Pattern) -> LocatedPoints | None:
         found = find(image, pattern)
         if found is not None and len(found.ids) >= _MIN_SHARE * len(pattern.points):
             return found
@@ -80,13 +80,13 @@ def _either_color(find: Finder) -> Finder:
     return lambda image, pattern: find(image, pattern) or invert_image(find)(image, pattern)
 
 
-def classic(image: Grey, pattern: Pattern) -> Found | None:
+def classic(image: Grey, pattern: Pattern) -> LocatedPoints | None:
     """cv2.findChessboardCorners."""
     ok, corners = cv2.findChessboardCorners(image, (pattern.columns, pattern.rows), flags=_CLASSIC)
     return _all_corners(ok, corners)
 
 
-def sector_based(image: Grey, pattern: Pattern) -> Found | None:
+def sector_based(image: Grey, pattern: Pattern) -> LocatedPoints | None:
     """cv2.findChessboardCornersSB (Duda and Frese, BMVC 2018), thoroughly where need be."""
     for flags in (_SB, _SB_HARD):
         ok, corners = cv2.findChessboardCornersSB(
@@ -97,7 +97,7 @@ def sector_based(image: Grey, pattern: Pattern) -> Found | None:
     return None
 
 
-def classic_subpixel(image: Grey, pattern: Pattern) -> Found | None:
+def classic_subpixel(image: Grey, pattern: Pattern) -> LocatedPoints | None:
     """cv2.findChessboardCorners and cv2.cornerSubPix, as most programs do it."""
     found = classic(image, pattern)
     if found is None:
@@ -108,12 +108,12 @@ def classic_subpixel(image: Grey, pattern: Pattern) -> Found | None:
     return _all_corners(True, refined)
 
 
-def chessboard(image: Grey, pattern: Pattern) -> Found | None:
+def chessboard(image: Grey, pattern: Pattern) -> LocatedPoints | None:
     """The classic search, which is fast, and where it fails the sector-based one."""
     return _sharper(classic)(image, pattern) or sector_based(image, pattern)
 
 
-def charuco(image: Grey, pattern: Pattern) -> Found | None:
+def charuco(image: Grey, pattern: Pattern) -> LocatedPoints | None:
     """Chessboard corners between ArUco markers, by cv2.aruco; parts of a board as well."""
     dictionary = dictionary_of(pattern)
     size = (pattern.columns, pattern.rows)
@@ -135,13 +135,13 @@ def charuco(image: Grey, pattern: Pattern) -> Found | None:
         _, corners, ids = _ARUCO.interpolateCornersCharuco(tags, tag_ids, image, board)
     if ids is None or len(ids) < 4:
         return None
-    return Found(ids.ravel().astype(np.int64), corners.reshape(-1, 2).astype(float))
+    return LocatedPoints(ids.ravel().astype(np.int64), corners.reshape(-1, 2).astype(float))
 
 
-def aprilgrid(image: Grey, pattern: Pattern) -> Found | None:
+def aprilgrid(image: Grey, pattern: Pattern) -> LocatedPoints | None:
     """An AprilGrid of tags 36h11, printed as Kalibr does it or otherwise, by cv2.aruco."""
     grid = _read_aprilgrid(image, pattern)
-    return Found(grid.ids, grid.uv, grid) if len(grid.ids) else None
+    return LocatedPoints(grid.ids, grid.uv, grid) if len(grid.ids) else None
 
 
 def _read_aprilgrid(image: Grey, pattern: Pattern) -> GridReading:
@@ -244,11 +244,11 @@ def default_detector(pattern: Pattern) -> str:
     return next(name for name, (kinds, _) in DETECTORS.items() if pattern.kind in kinds)
 
 
-def _all_corners(ok: bool, corners: Any) -> Found | None:
+def _all_corners(ok: bool, corners: Any) -> LocatedPoints | None:
     if not ok:
         return None
     uv = np.asarray(corners, dtype=float).reshape(-1, 2)
-    return Found(np.arange(len(uv)), uv)
+    return LocatedPoints(np.arange(len(uv)), uv)
 
 
 def need_markers(spec: str) -> None:

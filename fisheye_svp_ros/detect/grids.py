@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.detect.patterns import Found, Pattern
+from fisheye_svp_ros.detect.patterns import LocatedPoints, Pattern
 
 _BLOCKS = (31, 91, 271)  # px, of the local threshold
 _MIN_DARKNESS = 8  # grey levels from the mean there
@@ -42,7 +42,7 @@ class Ellipses(NamedTuple):
     matrix: Array
 
 
-def find_circles(image: NDArray[np.uint8], pattern: Pattern) -> Found | None:
+def find_circles(image: NDArray[np.uint8], pattern: Pattern) -> LocatedPoints | None:
     """Return the circles of a grid in a grey image, dark or bright; None without a whole one."""
     wanted = _lattice(pattern)
     for soft, bright in itertools.product(_SMOOTHING, (False, True)):
@@ -54,9 +54,9 @@ def find_circles(image: NDArray[np.uint8], pattern: Pattern) -> Found | None:
         inner = np.lexsort((off, -near.sum(axis=1)))
         for seed in inner[:_SEEDS].tolist():
             grid = _grow_grid(seen, near, seed)
-            found = _assign_blobs(grid, wanted) if len(grid) >= len(wanted) else None
-            if found is not None:
-                return Found(np.arange(len(found)), seen.centre[found])
+            order = _assign_blobs(grid, wanted) if len(grid) >= len(wanted) else None
+            if order is not None:
+                return LocatedPoints(np.arange(len(order)), seen.centre[order])
     return None
 
 
@@ -102,7 +102,7 @@ def _elliptic(contours: list[Any], largest: float) -> Ellipses:
     parts = parts[(parts[:, 0] >= _LEAST) & (parts[:, 0] <= largest)]
     # The largest first: a circle larger than the block has a hole.
     area, *rest = parts[np.argsort(-parts[:, 0], kind='stable')].T
-    u, v, *spreads = (one / area for one in rest)
+    u, v, *spreads = (part / area for part in rest)
     spread = np.stack(spreads, axis=-1)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     inner = np.linalg.det(spread)
     own = inner > 0
@@ -112,38 +112,38 @@ def _elliptic(contours: list[Any], largest: float) -> Ellipses:
     return Ellipses(np.stack([u, v], axis=-1)[own], matrices)
 
 
-def _standing_out(image: NDArray[np.uint8], found: Ellipses, bright: bool) -> Ellipses:
+def _standing_out(image: NDArray[np.uint8], blobs: Ellipses, bright: bool) -> Ellipses:
     """Return the ellipses around which all is darker, or brighter, and much the same.
 
     Noise is not, nor is the paper between circles.
     """
     height, width = image.shape
     circle = _RING * np.stack([np.cos(_AZIMUTHS), np.sin(_AZIMUTHS)], axis=-1)
-    ring = circle @ np.linalg.inv(found.matrix)
-    places = np.concatenate([found.centre[:, None], found.centre[:, None] + ring], axis=1)
+    ring = circle @ np.linalg.inv(blobs.matrix)
+    places = np.concatenate([blobs.centre[:, None], blobs.centre[:, None] + ring], axis=1)
     u, v = np.moveaxis(np.round(places).astype(np.int64), -1, 0)
     level = image[v.clip(0, height - 1), u.clip(0, width - 1)].astype(float)
     step = (level[:, 1:] - level[:, :1]) * (-1 if bright else 1)
     even = step.min(axis=1) > np.maximum(_EVEN * step.max(axis=1), _MIN_DARKNESS)
-    return Ellipses(found.centre[even], found.matrix[even])
+    return Ellipses(blobs.centre[even], blobs.matrix[even])
 
 
-def _neighbours(found: Ellipses) -> Mask:
+def _neighbours(blobs: Ellipses) -> Mask:
     """Return which ellipses (B, B) are as far apart as most are from their nearest ones."""
-    move = found.centre[None] - found.centre[:, None]
-    far = np.linalg.norm(np.einsum('iab,ijb->ija', found.matrix, move), axis=-1)
+    move = blobs.centre[None] - blobs.centre[:, None]
+    far = np.linalg.norm(np.einsum('iab,ijb->ija', blobs.matrix, move), axis=-1)
     far = (far + far.T) / 2
     np.fill_diagonal(far, np.inf)
     usual = np.median(np.sort(far, axis=1)[:, 1])
     return np.asarray((far < _NEIGHBOUR * usual) & (far > usual / _NEIGHBOUR))
 
 
-def _grow_grid(found: Ellipses, near: Mask, seed: int) -> Grid:
+def _grow_grid(blobs: Ellipses, near: Mask, seed: int) -> Grid:
     """Return ellipses by column and row that can be reached from a first one, step by step."""
-    move = found.centre[near[seed]] - found.centre[seed]
+    move = blobs.centre[near[seed]] - blobs.centre[seed]
     if len(move) < 2:
         return {}
-    unit = _units(move, found.matrix[seed])
+    unit = _units(move, blobs.matrix[seed])
     second = move[np.argmin(np.abs(unit @ unit[0]))]
     clockwise = move[0][0] * second[1] - move[0][1] * second[0] > 0
     steps = np.array([move[0], second if clockwise else -second])
@@ -152,17 +152,17 @@ def _grow_grid(found: Ellipses, near: Mask, seed: int) -> Grid:
         place = waiting.pop(0)
         here = grid[place]
         others = np.flatnonzero(near[here])
-        units = _units(found.centre[others] - found.centre[here], found.matrix[here])
+        units = _units(blobs.centre[others] - blobs.centre[here], blobs.matrix[here])
         for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
             other = (place[0] + sign * (axis == 0), place[1] + sign * (axis == 1))
-            along = units @ _units(sign * own[place][axis], found.matrix[here])
+            along = units @ _units(sign * own[place][axis], blobs.matrix[here])
             if other in grid or not len(along) or along.max() < _MIN_STEP_COSINE:
                 continue
             next_one = int(others[np.argmax(along)])
             if next_one in used:
                 continue
             steps = own[place].copy()
-            steps[axis] = sign * (found.centre[next_one] - found.centre[here])
+            steps[axis] = sign * (blobs.centre[next_one] - blobs.centre[here])
             grid[other], own[other] = next_one, steps
             used.add(next_one)
             waiting.append(other)
@@ -177,7 +177,7 @@ def _units(move: Array, matrix: Array) -> Array:
 
 def _assign_blobs(grid: Grid, wanted: Index) -> list[int] | None:
     """Return the blobs (N,) of the wanted places, turned and moved to where all are; once."""
-    found = []
+    placements = []
     turned = wanted
     low = np.array(list(grid)).min(axis=0)
     size = np.ptp(np.array(list(grid)), axis=0)
@@ -189,12 +189,12 @@ def _assign_blobs(grid: Grid, wanted: Index) -> list[int] | None:
             for down in range(spare[1] + 1):
                 keys = [(int(a), int(b)) for a, b in places + low + (right, down)]
                 if all(key in grid for key in keys):
-                    found.append([grid[key] for key in keys])
-    same = {tuple(sorted(one)) for one in found}
-    return found[0] if len(same) == 1 else None
+                    placements.append([grid[key] for key in keys])
+    same = {tuple(sorted(placement)) for placement in placements}
+    return placements[0] if len(same) == 1 else None
 
 
-def find_squares(image: NDArray[np.uint8], pattern: Pattern) -> Found | None:
+def find_squares(image: NDArray[np.uint8], pattern: Pattern) -> LocatedPoints | None:
     """Return the corners of a grid of dark squares in a grey image, None without a whole one.
 
     Corners go around each square from its corner of least x and y, squares row by row.
@@ -212,9 +212,9 @@ def find_squares(image: NDArray[np.uint8], pattern: Pattern) -> Found | None:
         together = _merge_quads(together, quads)
         for squares in (quads, together):
             for first in range(len(squares)):
-                found = _complete_corners(_grow_squares(squares, first, step), pattern)
-                if found is not None:
-                    return Found(np.arange(4 * pattern.columns * pattern.rows), found)
+                corners = _complete_corners(_grow_squares(squares, first, step), pattern)
+                if corners is not None:
+                    return LocatedPoints(np.arange(4 * pattern.columns * pattern.rows), corners)
     return None
 
 

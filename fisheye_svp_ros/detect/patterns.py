@@ -50,7 +50,7 @@ class Turn(NamedTuple):
     same: bool
 
 
-class Found(NamedTuple):
+class LocatedPoints(NamedTuple):
     """Which points (M,) of a pattern are in an image, and where, (M, 2), px, roughly.
 
     grid: what tags say about an AprilGrid.

@@ -136,7 +136,7 @@ def doubtful_folders(paths: Sequence[str]) -> Iterator[str]:
     for folder in folders:
         if len(given) > 1 and not any(map(_media, photograph_folders(folder))):
             yield _no_photograph(folder)
-        yield from _skipped(folder, given)
+        yield from _unsearched_media(folder, given)
         yield from _doubtful_names(str(folder), _media(folder))
 
 
@@ -157,7 +157,7 @@ def _equal_names(folders: Sequence[Path]) -> Iterator[str]:
             )
 
 
-def _skipped(folder: Path, given: Sequence[Path]) -> Iterator[str]:
+def _unsearched_media(folder: Path, given: Sequence[Path]) -> Iterator[str]:
     """Yield which subfolders, and videos beside images, are not searched."""
     for above in photograph_folders(folder):
         for sub in (p for p in sorted(above.iterdir()) if p.is_dir() and p not in given):

@@ -18,7 +18,7 @@ from fisheye_svp_ros.detect.finders import (
     Grey,
     explain_failure,
 )
-from fisheye_svp_ros.detect.patterns import LOOSE_TAGS, Found, Pattern, local_axes
+from fisheye_svp_ros.detect.patterns import LOOSE_TAGS, LocatedPoints, Pattern, local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.detect.tag_grids import GridReading
 from fisheye_svp_ros.detect.windows import halve_image
@@ -86,11 +86,11 @@ def _search(
     pixels: Pixels, pattern: Pattern, detector: str, near: Array | None, finder: Finder
 ) -> Points | str:
     grey = eight_bit(pixels)
-    found = _search_near(grey, pattern, finder, near) if near is not None else None
-    found = found or finder(grey, pattern)
-    if found is None:
+    located = _search_near(grey, pattern, finder, near) if near is not None else None
+    located = located or finder(grey, pattern)
+    if located is None:
         return explain_failure(grey, pattern)
-    index, uv, grid = found
+    index, uv, grid = located
     if grid is not None and grid.layout is not None:
         pattern = pattern.with_layout(grid.layout)
     if len(index) < _MIN_POINTS:
@@ -168,33 +168,33 @@ def _complete_tags(
     of this photograph says where the next ones are; corners of the right colours are there.
     """
     points, (height, width) = pattern.points, pixels.shape
-    found, where = index[:0], uv[:0]
+    fitted, where = index[:0], uv[:0]
     new, start, agreed = index, uv, 0.0
     missing = np.ones(len(points), dtype=bool)
     image_of, known = None, 0
     while len(new):
-        axes, reach = _surroundings(np.append(found, new), np.vstack([where, start]), pattern)
-        narrow = np.minimum(_NARROW * reach, _NARROWEST)[len(found) :]
-        corners = fit_corners(pixels, start, axes[len(found) :], narrow)
+        axes, reach = _surroundings(np.append(fitted, new), np.vstack([where, start]), pattern)
+        narrow = np.minimum(_NARROW * reach, _NARROWEST)[len(fitted) :]
+        corners = fit_corners(pixels, start, axes[len(fitted) :], narrow)
         tint = np.sign(corners.contrast) * pattern.tint[new]
         agreed = agreed or np.sign(tint[corners.ok].sum())
         ok = corners.ok & (tint == agreed)
-        found, where = np.append(found, new[ok]), np.vstack([where, corners.uv[ok]])
-        missing[found] = False
-        far, _ = cKDTree(points[found]).query(points)
+        fitted, where = np.append(fitted, new[ok]), np.vstack([where, corners.uv[ok]])
+        missing[fitted] = False
+        far, _ = cKDTree(points[fitted]).query(points)
         new = np.flatnonzero(missing & (far < _STEP * pattern.size))
         missing[new] = False
-        if len(new) and len(found) > _REFIT_GROWTH * known:
-            image_of, known = imaging(points[found], where, pixels.shape, _FREE), len(found)
+        if len(new) and len(fitted) > _REFIT_GROWTH * known:
+            image_of, known = imaging(points[fitted], where, pixels.shape, _FREE), len(fitted)
         if image_of is None:
             break
         start = image_of(points[new])
         inside = ((start > 0) & (start < (width, height))).all(axis=1)
         new, start = new[inside], start[inside]
-    if len(found) < len(index):
+    if len(fitted) < len(index):
         return index, uv
-    order = np.argsort(found)
-    return found[order], where[order]
+    order = np.argsort(fitted)
+    return fitted[order], where[order]
 
 
 def _fit_corners(
@@ -236,10 +236,10 @@ def _fit_corners(
         square,
         censored,
     )
-    found = soft[again.ok]
+    refitted = soft[again.ok]
     size = {'uv': 2 * again.uv + 0.5, 'sigma': 2 * again.sigma, 'blur': 2 * again.blur}
     for name, whole, part in zip(Corners._fields, corners, again, strict=True):
-        whole[found] = size.get(name, part)[again.ok]
+        whole[refitted] = size.get(name, part)[again.ok]
     return corners, reach
 
 
@@ -279,7 +279,9 @@ def _least_square(uv: Array, pattern: Pattern) -> Array:
     )
 
 
-def _search_near(grey: Grey, pattern: Pattern, finder: Finder, near: Array) -> Found | None:
+def _search_near(
+    grey: Grey, pattern: Pattern, finder: Finder, near: Array
+) -> LocatedPoints | None:
     low, high = near.min(axis=0), near.max(axis=0)
     margin = _MARGIN * float((high - low).max()) + 10
     height, width = grey.shape
@@ -292,8 +294,8 @@ def _search_near(grey: Grey, pattern: Pattern, finder: Finder, near: Array) -> F
     crop = cv2.resize(
         grey[top:bottom, left:right], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
     )
-    found = finder(crop, pattern)
-    return found and found._replace(uv=(found.uv + 0.5) / scale - 0.5 + (left, top))
+    located = finder(crop, pattern)
+    return located and located._replace(uv=(located.uv + 0.5) / scale - 0.5 + (left, top))
 
 
 def _fix_handedness(uv: Array, pattern: Pattern) -> Array:

@@ -114,7 +114,9 @@ def common_layout(each: Sequence[frozenset[TagLayout]]) -> TagLayout | None:
         for layout in layouts:
             count[layout] = count.get(layout, 0) + 1
     return max(
-        sorted(count), key=lambda one: (count[one], one.is_standard, one.first == 0), default=None
+        sorted(count),
+        key=lambda layout: (count[layout], layout.is_standard, layout.first == 0),
+        default=None,
     )
 
 
@@ -183,10 +185,10 @@ def _one_grid(
     label = connected_components(joined, directed=False)[1]
     first = layout.first if layout else 0
     expected = (ids >= first) & (ids < first + size.tags)
-    groups = [np.flatnonzero(label == one) for one in np.unique(label)]
+    groups = [np.flatnonzero(label == number) for number in np.unique(label)]
     # A grid with the ids of the target comes before a larger one with others.
-    grid = max(groups, key=lambda one: (len(one) > 1 and expected[one].any(), len(one)))
-    return grid, sum(len(one) for one in groups if one is not grid and len(one) > 1)
+    grid = max(groups, key=lambda group: (len(group) > 1 and expected[group].any(), len(group)))
+    return grid, sum(len(group) for group in groups if group is not grid and len(group) > 1)
 
 
 def _firsts(ids: Index, residue: int, size: GridSize) -> list[int]:
@@ -199,8 +201,8 @@ def _firsts(ids: Index, residue: int, size: GridSize) -> list[int]:
 
 def _choose(layouts: frozenset[TagLayout]) -> TagLayout | None:
     """Return the layout that is meant: the only standard one, or else the only one."""
-    standard = [one for one in layouts if one.is_standard] or [
-        one for one in layouts if one.first == 0
+    standard = [layout for layout in layouts if layout.is_standard] or [
+        layout for layout in layouts if layout.first == 0
     ]
     open_ones = standard or [*layouts]
     return open_ones[0] if len(open_ones) == 1 else None
@@ -231,6 +233,6 @@ def _wrong_columns(ids: Index, pairs: Index, offset: Array, size: GridSize) -> s
 def _ambiguity(layouts: frozenset[TagLayout]) -> str:
     if not layouts:
         return 'no board found: ids of its tags are beyond the grid'
-    if len({one.turn for one in layouts}) > 1:
+    if len({layout.turn for layout in layouts}) > 1:
         return 'no board found: a single tag does not tell how the grid is printed'
     return 'no board found: ids do not begin at 0; show the whole grid in at least one photograph'

@@ -73,7 +73,7 @@ class Action(Enum):
     SEPARATE_CAUSE = 18
 
 
-_KINDS = {
+_ACTION_KINDS = {
     Action.RETAKE: RETAKE,
     Action.CHECK_VIEWS: RETAKE,
     Action.CHECK_FRAMES: RETAKE,
@@ -103,7 +103,7 @@ class Advice:
     @property
     def kind(self) -> str:
         """RETAKE, UNLIKE where others do not predict these, TURNED; '' of other advice."""
-        return _KINDS.get(self.action, '')
+        return _ACTION_KINDS.get(self.action, '')
 
 
 def advise(
@@ -375,7 +375,7 @@ def conclude(
                 candidate.effect for candidate in candidates if candidate.status is Status.REFUTED
             ],
             rays=_worst_rays(ray_errors),
-            written=_unnamed_parts(evaluation),
+            written=_unexplained_corrections(evaluation),
             open=open_effects,
         )
     )
@@ -438,7 +438,7 @@ def _worst_rays(errors: Mapping[str, Mapping[str, Sequence[RayError]]]) -> tuple
     return given, extended
 
 
-def _unnamed_parts(evaluation: Evaluation) -> list[str]:
+def _unexplained_corrections(evaluation: Evaluation) -> list[str]:
     """Return what the written lens has that no confirmed cause stands for."""
     field = evaluation.written_field
     parts = {

@@ -28,14 +28,14 @@ class LensReason(Enum):
     """What a decision about the lens rests on."""
 
     FITTED_ERROR_RISES = 1
-    OFF = 2
+    LENS_IS_OFF = 2
     ONE_FRAME = 3
     INTRINSICS_WRONG = 4
     PREDICTS_BETTER = 5
     LENS_ALONE_PREDICTS_WORSE = 6
     GAIN_UNCERTAIN = 7
     EFFECT_POSSIBLE = 8
-    NOTHING_CONFIRMED = 9
+    NO_CAUSE_CONFIRMED = 9
     RAYS_BETTER = 10
 
 
@@ -56,10 +56,10 @@ class PhotographsReason(Enum):
     """What a decision about the photographs rests on."""
 
     SOME_ARE_WRONG = 1
-    TOO_FEW = 2
+    TOO_FEW_FRAMES = 2
     LENS_UNDECIDED = 3
-    NOT_PREDICTED = 4
-    PREDICTED = 5
+    FRAMES_NOT_PREDICTED = 4
+    FRAMES_PREDICTED = 5
 
 
 class Figure(NamedTuple):
@@ -241,7 +241,7 @@ def decide_lens(facts: LensFacts) -> Decision:
         return decide('undecided', LensReason.FITTED_ERROR_RISES, 0.0, bounded=True)
     if off is not None and off.matters(facts.noise_px):
         figure = Figure('ray_error', off.mrad, 'mrad')
-        return Decision('recalibrate', LensReason.OFF, facts, figure, off.better)
+        return Decision('recalibrate', LensReason.LENS_IS_OFF, facts, figure, off.better)
     if facts.frames < 2 and not facts.causes:
         return decide('undecided', LensReason.ONE_FRAME, None)
     if facts.wrong_intrinsics:
@@ -258,7 +258,7 @@ def decide_lens(facts: LensFacts) -> Decision:
     if facts.possible_effects:
         probability = facts.open.get(facts.possible_effects[0].effect)
         return decide('undecided', LensReason.EFFECT_POSSIBLE, probability, bounded=True)
-    return decide('keep', LensReason.NOTHING_CONFIRMED, 0.95, bounded=True)
+    return decide('keep', LensReason.NO_CAUSE_CONFIRMED, 0.95, bounded=True)
 
 
 class TargetError(NamedTuple):
@@ -366,9 +366,9 @@ def decide_photographs(facts: PhotographsFacts) -> Decision:
     if facts.bad and len(facts.bad) >= many * facts.frames:
         return decide('retake', PhotographsReason.SOME_ARE_WRONG)
     if facts.frames < MIN_FRAMES:
-        return decide('more', PhotographsReason.TOO_FEW)
+        return decide('more', PhotographsReason.TOO_FEW_FRAMES)
     if facts.lens == 'undecided':
         return decide('more', PhotographsReason.LENS_UNDECIDED)
     if len(facts.unlike) >= many * facts.frames:
-        return decide('more', PhotographsReason.NOT_PREDICTED)
-    return decide('enough', PhotographsReason.PREDICTED)
+        return decide('more', PhotographsReason.FRAMES_NOT_PREDICTED)
+    return decide('enough', PhotographsReason.FRAMES_PREDICTED)

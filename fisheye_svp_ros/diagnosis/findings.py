@@ -35,7 +35,7 @@ class Reason(Enum):
     PREDICTS_BETTER = 1
     BEYOND_BULK = 2  # landmarks: further off than most
     NO_CONVINCING_GAIN = 3  # significant, and no gain beyond its error when it was tried
-    EXPLAINED_BY_OTHERS = 4
+    EXPLAINED_BY_OTHER_CAUSES = 4
     NO_LASTING_GAIN = 5  # taken in for its gain, and none is left beside the other causes
     REFUTED_BY_FRAMES = 6
     REFUTED_BY_FILE = 7
@@ -53,7 +53,7 @@ class Reason(Enum):
     @property
     def is_removal(self) -> bool:
         """Whether an effect was given up in the selection that had been taken in."""
-        return self in (Reason.EXPLAINED_BY_OTHERS, Reason.NO_LASTING_GAIN)
+        return self in (Reason.EXPLAINED_BY_OTHER_CAUSES, Reason.NO_LASTING_GAIN)
 
 
 def probability_of(p_corrected: float) -> float:
@@ -120,7 +120,7 @@ class Finding:
         """What is to be thought of the effect."""
         if self.reason.refutes:
             return Status.REFUTED
-        return status_of(self.probability, self.accepted)
+        return status_of(self.probability, self.is_accepted)
 
     @property
     def probability(self) -> float:
@@ -132,7 +132,7 @@ class Finding:
         return probability_of(self.p_corrected) if self.averaged is None else self.averaged
 
     @property
-    def accepted(self) -> bool:
+    def is_accepted(self) -> bool:
         """Whether it was taken into the model."""
         return self.reason in (Reason.PREDICTS_BETTER, Reason.BEYOND_BULK)
 

@@ -208,7 +208,7 @@ def find_lens_rays(
     known = LensCovariance.from_model(
         evaluation.null, evaluation.averaged_model, None if quick else evaluation.other_models
     )
-    fresh = evaluation.extended_lenses(_generalized_fit(evaluation.selection.first))
+    fresh = evaluation.extended_lenses(_generalized_state(evaluation.selection.first))
     views = known.linear.data.views
     errors, offsets, asked = {}, [], evaluation.problem.options.range_m
     for number, (name, given) in enumerate(lenses.items()):
@@ -230,7 +230,7 @@ def find_lens_rays(
     return errors, least_likely_offset(offsets)
 
 
-def _generalized_fit(null: NullModel) -> RigState:
+def _generalized_state(null: NullModel) -> RigState:
     """Return the state that generalized least squares finds: nearly what `calibrate` writes."""
     own, linear = null.included_columns, null.linear
     inverse = pseudo_inverse(null.information[np.ix_(own, own)], 1e-13)

@@ -248,15 +248,15 @@ class NullModel:
         """
         own = np.append(self.included_columns, len(self.scale))
         if np.isin(at, own).all():
-            return self._own_left_out.select(np.searchsorted(own, at))
-        return self._all_left_out.select(at)
+            return self._prediction_of_fixed.select(np.searchsorted(own, at))
+        return self._prediction_with_effects.select(at)
 
     @cached_property
-    def _own_left_out(self) -> LeaveOneOut:
+    def _prediction_of_fixed(self) -> LeaveOneOut:
         return self._leave_one_out(np.append(self.included_columns, len(self.scale)))
 
     @cached_property
-    def _all_left_out(self) -> LeaveOneOut:
+    def _prediction_with_effects(self) -> LeaveOneOut:
         return self._leave_one_out(np.arange(len(self.scale) + 1))
 
     def _leave_one_out(self, at: Index) -> LeaveOneOut:

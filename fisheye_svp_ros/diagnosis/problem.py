@@ -70,7 +70,7 @@ _STEP_OVER_NOISE = 0.1  # a step this small beside the noise is how numbers are 
 _MAX_RATIO = 4.0
 
 
-def tell_nobody(names: tuple[str, ...]) -> None:
+def ignore_progress(names: tuple[str, ...]) -> None:
     """Keep what a diagnosis has found so far from everybody."""
 
 
@@ -131,7 +131,7 @@ class Inputs:
     options: DiagnosisOptions
     poses: dict[int, Pose] | None = None
     held_out: Observations | None = None
-    provisional: Provisional = tell_nobody
+    provisional: Provisional = ignore_progress
 
     @classmethod
     def check(
@@ -262,9 +262,9 @@ def _displace_landmarks(
         simulated.model,
         lambda rows: fit(rows).model if inputs.free else simulated.model,
     )
-    lost = [landmark for landmark in wrong if not landmark.displaced]
+    lost = [landmark for landmark in wrong if not landmark.is_displaced]
     rejected = NO_OUTLIERS.append_landmarks(observations, lost)
-    moved = [landmark for landmark in wrong if landmark.displaced]
+    moved = [landmark for landmark in wrong if landmark.is_displaced]
     effect = LandmarkSurveyEffect(tuple(landmark.number for landmark in moved))
     if wrong and inputs.free:
         numbers = [landmark.number for landmark in wrong]

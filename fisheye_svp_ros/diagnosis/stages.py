@@ -55,8 +55,8 @@ from fisheye_svp_ros.diagnosis.problem import (
     Progress,
     Provisional,
     find_hand_eye,
+    ignore_progress,
     prepare_problem,
-    tell_nobody,
 )
 from fisheye_svp_ros.diagnosis.selection import Selection, select_causes, without_cause
 from fisheye_svp_ros.diagnosis.variance_budget import (
@@ -84,7 +84,7 @@ def diagnose(
     held_out: Observations | None = None,
     options: DiagnosisOptions | None = None,
     progress: Progress = lambda *_: None,
-    provisional: Provisional = tell_nobody,
+    provisional: Provisional = ignore_progress,
 ) -> Diagnosis:
     """Find what a lens's simulation gets wrong about observations.
 

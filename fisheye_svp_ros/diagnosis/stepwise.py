@@ -149,7 +149,7 @@ def _test_removal(
     """Return why an effect is not needed beside everything else that is included, if so."""
     score = tests.test_removal(included, columns, effect)
     corrected = tests.correct(effect, score.p_value)
-    gain, reason = HeldOutGain(np.nan, np.nan), Reason.EXPLAINED_BY_OTHERS
+    gain, reason = HeldOutGain(np.nan, np.nan), Reason.EXPLAINED_BY_OTHER_CAUSES
     if corrected < SIGNIFICANCE:
         if quick or effect.per_frame:
             return None
@@ -172,33 +172,33 @@ def find_single_landmarks(
     count, bulk = len(statistic), null.variances.alive[OF_LANDMARKS].any()
     p = np.asarray(special.chdtrc(np.maximum(rank, 1), statistic))
     number = 2 * count * tests.effect_count
-    standing_out = found = np.flatnonzero((rank > 0) & (p * number < SIGNIFICANCE))
+    standing_out = outliers = np.flatnonzero((rank > 0) & (p * number < SIGNIFICANCE))
     most = _MAX_BESIDE_BULK if bulk else max(3, int(_MAX_SHARE * count))
-    if found.size > most:
+    if outliers.size > most:
         # A landmark that is far off makes others seem so.
-        found = found[statistic[found] > statistic[found].max() / _OUTWEIGHED_RATIO]
-    if found.size > most:
+        outliers = outliers[statistic[outliers] > statistic[outliers].max() / _OUTWEIGHED_RATIO]
+    if outliers.size > most:
         return None
-    if bulk and found.size:
+    if bulk and outliers.size:
         p = bulk_p_values(statistic, rank, standing_out)
-        found = found[p[found] * number < SIGNIFICANCE]
-    if not found.size:
+        outliers = outliers[p[outliers] * number < SIGNIFICANCE]
+    if not outliers.size:
         return None
-    found = found[np.argsort(p[found], kind='stable')]
-    ids = null.random.landmark[found]
+    outliers = outliers[np.argsort(p[outliers], kind='stable')]
+    ids = null.random.landmark[outliers]
     effect = LandmarkSurveyEffect(tuple(int(i) for i in ids))
     step = Finding(
         form=effect.key,
         reason=Reason.BEYOND_BULK,
-        p_value=float(p[found[0]]),
-        p_corrected=float(p[found[0]] * number),
-        statistic=float(statistic[found].sum()),
-        rank=int(rank[found].sum()),
+        p_value=float(p[outliers[0]]),
+        p_corrected=float(p[outliers[0]] * number),
+        statistic=float(statistic[outliers].sum()),
+        rank=int(rank[outliers].sum()),
     )
-    return effect, offset[found].ravel(), step
+    return effect, offset[outliers].ravel(), step
 
 
-def bulk_p_values(statistic: Array, rank: Array, found: Index) -> Array:
+def bulk_p_values(statistic: Array, rank: Array, outliers: Index) -> Array:
     """Return p-values (L,) beside landmarks whose offsets have tails as long as the others' have.
 
     An F distribution of the statistics, its median theirs, its denominator's degrees of freedom
@@ -206,9 +206,9 @@ def bulk_p_values(statistic: Array, rank: Array, found: Index) -> Array:
     that scatter by very different amounts the largest is no single one.  One far beyond them all
     is in no tail of theirs, and makes others seem off.
     """
-    one, others = np.maximum(rank, 1), np.setdiff1d(np.flatnonzero(rank > 0), found)
+    dof, others = np.maximum(rank, 1), np.setdiff1d(np.flatnonzero(rank > 0), outliers)
     if not others.size:
-        return np.asarray(special.chdtrc(one, statistic))
+        return np.asarray(special.chdtrc(dof, statistic))
     size, of = rank[others], statistic[others] / np.maximum(rank[others], 1)
     fits = []
     for freedom in _TAIL_FREEDOMS:
@@ -219,7 +219,7 @@ def bulk_p_values(statistic: Array, rank: Array, found: Index) -> Array:
     _, scale, freedom = best if best[0] > normal[0] + _TAIL_GAIN else normal
     beyond = statistic > _OUTWEIGHED_RATIO * statistic[others].max()
     freedom_of_each = np.where(beyond, normal[2], freedom)
-    return np.asarray(special.fdtrc(one, freedom_of_each, statistic / one / scale))
+    return np.asarray(special.fdtrc(dof, freedom_of_each, statistic / dof / scale))
 
 
 def _log_density_of_f(x: Array, rank: Array, freedom: float) -> Array:

@@ -115,7 +115,7 @@ class OpenShifts(NamedTuple):
             kind.replace(FlatPortEffect.name, ViewpointShiftEffect.name)
             for kind in null.effect_kinds
         }
-        found = [
+        forms = [
             (effect, null.form_columns(form)[0])
             for form, effect in enumerate(null.fixed.forms.effects)
             if effect.name == ViewpointShiftEffect.name
@@ -123,8 +123,8 @@ class OpenShifts(NamedTuple):
             and not named & {*effect.kinds, effect.name}
         ]
         return cls(
-            tuple(effect for effect, _ in found),
-            np.array([column for _, column in found], dtype=np.int64),
+            tuple(effect for effect, _ in forms),
+            np.array([column for _, column in forms], dtype=np.int64),
         )
 
     def posterior(self, null: NullModel, information: Array) -> ShiftPosterior:
@@ -181,14 +181,14 @@ class AveragedModel:
         shifts, null = OpenShifts.from_selection(selection), selection.null
         linear = null.linear
         at = null.columns_and_residual(shifts.columns)
-        found = shifts.posterior(null, null.information[np.ix_(at, at)])
-        follow = found.follow / null.scale[: null.column_count, None]
+        posterior = shifts.posterior(null, null.information[np.ix_(at, at)])
+        follow = posterior.follow / null.scale[: null.column_count, None]
         state = linear.state.retract(
-            linear.free, np.zeros((linear.data.frames, 6)), follow @ found.mean
+            linear.free, np.zeros((linear.data.frames, 6)), follow @ posterior.mean
         )
-        likely = np.flatnonzero(found.weight)
+        likely = np.flatnonzero(posterior.weight)
         for i in likely:
-            state = with_effect(state, shifts.effects[i], found.mean[i : i + 1])
+            state = with_effect(state, shifts.effects[i], posterior.mean[i : i + 1])
         averaged = Linearization(linear.data, state, linear.free) if len(likely) else linear
         names, before = shared_names(averaged), shared_names(linear)
         place = np.array([names.index(name) for name in before], dtype=np.int64)
@@ -200,15 +200,15 @@ class AveragedModel:
             tuple(
                 AveragedShift(
                     next(iter(effect.cameras), ''),
-                    float(found.weight[i]),
-                    float(found.mean[i]),
-                    float(found.stderr[i]),
+                    float(posterior.weight[i]),
+                    float(posterior.mean[i]),
+                    float(posterior.stderr[i]),
                 )
                 for i, effect in enumerate(shifts.effects)
-                if found.weight[i]
+                if posterior.weight[i]
             ),
             tuple(kind for i in likely for kind in shifts.effects[i].kinds),
-            root * found.stderr[likely],
+            root * posterior.stderr[likely],
             place,
         )
 
@@ -224,12 +224,12 @@ class AveragedModel:
         Each is there in its share of the samples: either none, or one beside its estimate.
         """
         off = np.zeros((len(self.shifts), samples))
-        for i, one in enumerate(self.shifts):
-            estimate = one.e0 / one.weight
-            within = one.stderr**2 / one.weight - (1 - one.weight) * estimate**2
-            there = rng.random(samples) < one.weight
+        for i, shift in enumerate(self.shifts):
+            estimate = shift.e0 / shift.weight
+            within = shift.stderr**2 / shift.weight - (1 - shift.weight) * estimate**2
+            there = rng.random(samples) < shift.weight
             drawn = estimate + np.sqrt(max(within, 0.0)) * rng.standard_normal(samples)
-            off[i] = (np.where(there, drawn, 0.0) - one.e0) / one.stderr
+            off[i] = (np.where(there, drawn, 0.0) - shift.e0) / shift.stderr
         return np.asarray(self.root @ off)
 
     def errors(self, errors: ModelErrors) -> ModelErrors:
@@ -376,7 +376,7 @@ def _fields(selection: Selection, fitted: FittedModel) -> dict[int, CameraField]
         )[2]
     )
     shared = sigma * posterior.shared / fitted.scale[:, None]
-    found, camera_of = (
+    fields, camera_of = (
         {},
         np.concatenate([np.full(2 * len(grid.centres), grid.camera) for grid in random.grids]),
     )
@@ -384,10 +384,10 @@ def _fields(selection: Selection, fitted: FittedModel) -> dict[int, CameraField]
         grids = tuple(grid for grid in random.grids if grid.camera == camera)
         mine = np.flatnonzero(camera_of == camera)
         known = fitted.linear.state.lenses[camera].image_field
-        found[camera] = CameraField(
+        fields[camera] = CameraField(
             _field(grids, values[mine], root[mine], known), grids, root[mine], shared
         )
-    return found
+    return fields
 
 
 def _shared_coefficients(selection: Selection, fitted: FittedModel) -> Array:

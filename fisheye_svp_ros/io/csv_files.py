@@ -23,7 +23,7 @@ from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.files import path_of, read_text, write_text
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_quaternion
 from fisheye_svp_ros.scene.observations import MOST_LANDMARK, Observations, make_observations
-from fisheye_svp_ros.scene.table_checks import SIGMA_BOUND, too_exact
+from fisheye_svp_ros.scene.table_checks import SIGMA_BOUND, implausible_sigma
 
 _MAX_HEADER = 60  # characters of a header
 _RECENT = 1e9  # s since 1970, in 2001
@@ -233,7 +233,7 @@ def read(path: str | Path) -> Observations:
     sigma = table.known_numbers('sigma') if 'sigma' in table else None
     if sigma is not None:
         table.refuse(sigma <= 0, 'sigma', 'a number above 0')
-        table.refuse(too_exact(sigma), 'sigma', SIGMA_BOUND)
+        table.refuse(implausible_sigma(sigma), 'sigma', SIGMA_BOUND)
     return make_observations(
         frame,
         landmark,

@@ -115,7 +115,7 @@ def with_values(table: S, values: Mapping[str, Any]) -> S:
     Raises ParameterError for a value that is not allowed.
     """
     given = {
-        row.name: _checked(row, values[row.name])
+        row.name: _check_value(row, values[row.name])
         if row.name in values
         else getattr(table, row.name)
         for row in rows(table)
@@ -123,7 +123,7 @@ def with_values(table: S, values: Mapping[str, Any]) -> S:
     return type(table)(**given)
 
 
-def _checked(row: Row, value: Any) -> Any:
+def _check_value(row: Row, value: Any) -> Any:
     checked = row.check(value)
     return expand_path(checked) if row.file and isinstance(checked, str) else checked
 

@@ -66,12 +66,12 @@ def tolerant_streams() -> Iterator[Callable[[], OSError | None]]:
     output, error = _Stream(sys.stdout), _Stream(sys.stderr)
     sys.stdout, sys.stderr = cast('TextIO', output), cast('TextIO', error)
 
-    def lost() -> OSError | None:
+    def output_error() -> OSError | None:
         output.flush()
         return output.error
 
     try:
-        yield lost
+        yield output_error
     finally:
         output.flush()
         error.flush()

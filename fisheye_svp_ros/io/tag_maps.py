@@ -21,7 +21,7 @@ CORNERS = 4  # of a tag, landmark CORNERS * id + corner: from its lower left, ag
 CENTER_OFFSET = 100_000_000  # landmark of the middle of a tag, before its id
 _MAX_ID = 1_000_000
 _MAX_SIZE = 10.0  # m; a larger tag is a slip of the unit
-_PLACES = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
+_UNIT_CORNERS = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
 
 
 class TagMap(NamedTuple):
@@ -34,7 +34,7 @@ class TagMap(NamedTuple):
     @property
     def corners(self) -> Array:
         """The corners (T, CORNERS, 3), m."""
-        local = self.sizes[:, None, None] * _PLACES
+        local = self.sizes[:, None, None] * _UNIT_CORNERS
         turned = local @ np.swapaxes(self.poses.rotation, -1, -2)
         return np.asarray(turned + self.poses.position[:, None])
 

@@ -185,7 +185,7 @@ class ModelCritic(SolverNode):
         least, every = self.settings.min_frames, self.settings.every_frames
         missing = max(least - len(self._frames), every - self._new if self._judged else 0, 0)
         more = {'views_repeated': self._repeated, 'diagnosing': self._running is not None}
-        self._progress.tell(stamp, len(self._frames), missing, more)
+        self._progress.publish(stamp, len(self._frames), missing, more)
 
     def _reset(self, _: Any, response: Any) -> Any:
         """Forget all frames and the verdict: the next frame is the first."""

@@ -100,8 +100,8 @@ class Progress:
         self._node = node
         self._publisher = node.announce(DiagnosticArray, '~/progress', LATCHED)
 
-    def tell(self, stamp: int, views: int, missing: int, more: Mapping[str, object]) -> None:
-        """Tell it; missing: views until the next result that counts."""
+    def publish(self, stamp: int, views: int, missing: int, more: Mapping[str, object]) -> None:
+        """Publish it; missing: views until the next result that counts."""
         name = f'{self._node.get_fully_qualified_name()}: progress'
         text = f'{missing} more views are needed' if missing else 'enough views'
         values = {'views': views, 'views_missing': missing, **more}

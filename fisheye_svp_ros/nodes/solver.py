@@ -52,7 +52,7 @@ _UNREAD = 5 * LIMIT  # messages to look at while there is nothing to solve
 _LONGEST_INTAKE = 0.05  # s of taking in before a set is solved, come what may
 _NS = 10**9
 _MAX_UNANSWERED = 10  # sets that wait for a topic on which nothing has ever come
-_SAME_WAY = 0.7  # cosine of the angle between two viewing axes
+_MIN_AXIS_COSINE = 0.7  # cosine of the angle between two viewing axes
 _ENDS = ('taken', 'solved', 'not solved', 'dropped', 'incomplete')  # of sets
 _COUNTS = (*_ENDS, 'solved with a warning')
 _SHIFT_SCALE = next(row for row in rows(Scenario) if row.name == 'shift_scale')
@@ -305,7 +305,7 @@ class SolverNode(ManagedNode):
         if compilation.state == 'compiling':
             return 'numpy, until Numba has compiled'
         self._compilation = None
-        self.get_logger().info(wording.compiled(compilation.state))
+        self.get_logger().info(wording.compilation_text(compilation.state))
         return engines.settle(0)
 
     def _listen_to_camera_info(self) -> None:
@@ -489,7 +489,7 @@ def exchange_reason(rig: Pose) -> str:
     rig: the left camera in the right one.  Both look the same way, and it is on the right.
     """
     x, y, z = rig.position
-    if rig.rotation[2, 2] > _SAME_WAY and x > max(abs(y), abs(z)):
+    if rig.rotation[2, 2] > _MIN_AXIS_COSINE and x > max(abs(y), abs(z)):
         return wording.cameras_exchanged(float(x))
     return ''
 

@@ -90,7 +90,7 @@ class StereoCalibrator(SolverNode):
         self._window, self._scenario, self._found = window, scenario, solved
         self._publish(stamp, items, solved)
         fit = {name: float(solved.metrics[name][0]) for name in ('points', 'rms_px')}
-        self._progress.tell(stamp, len(window), self.settings.views - len(window), fit)
+        self._progress.publish(stamp, len(window), self.settings.views - len(window), fit)
 
     def _save(self, _: Any, response: Any) -> Any:
         """Write the latest rig to `output`."""
@@ -113,7 +113,7 @@ class StereoCalibrator(SolverNode):
         """Forget all views: the next set is the first."""
         response.success, response.message = True, f'{len(self._window)} views forgotten'
         self._window, self._found = [], None
-        self._progress.tell(0, 0, self.settings.views, {})
+        self._progress.publish(0, 0, self.settings.views, {})
         return response
 
     def _publish(self, stamp: int, items: Items, solved: SetSolutions[StereoCalibration]) -> None:

@@ -49,7 +49,7 @@ _MAX_LOSS = 0.1  # of the messages between two reports, lost on the way
 # The same of so many messages or more: what is seldom lost is told as well
 _MAX_LOSS_OF_MANY, _MANY = 0.01, 200
 _PROFILE_VARIABLE, _PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE', 'fastdds/images.xml'
-_LARGE = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
+_IMAGE_TYPES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 
 
 @dataclass
@@ -396,7 +396,7 @@ def _reason(
 
 def _remedy(subscription: Input, offers: Sequence[Any]) -> str:
     """Return what may help where a publisher that is heard has sent nothing, or nothing came."""
-    if subscription.typename not in _LARGE:
+    if subscription.typename not in _IMAGE_TYPES:
         volatile = all(offer.durability == DurabilityPolicy.VOLATILE for offer in offers)
         if subscription.latched and volatile:
             return ' (volatile: what was sent before this node started is lost; publish it again)'
@@ -410,7 +410,7 @@ def _remedy(subscription: Input, offers: Sequence[Any]) -> str:
 
 def _loss_remedy(typename: str, topic: str) -> str:
     """Say what helps against the loss of messages of a type on a topic."""
-    if typename not in _LARGE:
+    if typename not in _IMAGE_TYPES:
         return wording.small_message_remedy(f'{PREFIX}{topic}')
     takes_profiles = get_rmw_implementation_identifier().startswith('rmw_fastrtps')
     named = takes_profiles and _PROFILE_VARIABLE not in os.environ

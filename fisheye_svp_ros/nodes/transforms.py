@@ -56,13 +56,13 @@ class Transforms:
             self._node.warn(f'no transform: frame_id {frame!r} cannot be the parent of {child!r}')
             return
         transform = messages.transform_message(pose, stamp, frame, child)
-        if self._static and not self._has_changed(transform):
+        if self._static and not self._differs_from_latest(transform):
             return
         self._sent.append(transform)
         self._children.add(child)
         self._publisher.publish(self._kind(transforms=[transform]))
 
-    def _has_changed(self, transform: Any) -> bool:
+    def _differs_from_latest(self, transform: Any) -> bool:
         """Say whether a transform is another than the latest of its child: by 1e-6 m or so."""
         child = transform.child_frame_id
         last = next((one for one in reversed(self._sent) if one.child_frame_id == child), None)
@@ -123,7 +123,7 @@ class _Frame:
         self.poses.append(pose)
         del self.stamps[:-_MAX_LENGTH], self.poses[:-_MAX_LENGTH]
 
-    def at(self, stamp: int) -> Pose | None:
+    def pose_at(self, stamp: int) -> Pose | None:
         if not self.stamps:
             return self.poses[-1]
         after = bisect_left(self.stamps, stamp)
@@ -174,7 +174,7 @@ class FrameTree:
     def _in_ancestor(self, frame: str, ancestor: str, stamp: int) -> Pose | None:
         pose = identity()
         while frame != ancestor:
-            own = self._frames[frame].at(stamp)
+            own = self._frames[frame].pose_at(stamp)
             if own is None:
                 return None
             pose, frame = own.compose(pose), self._frames[frame].parent

@@ -123,44 +123,49 @@ def _diagnose_session(session: Session, table: Observations, lens: Lens) -> Sess
     Settled once the number is known and what it belongs to is told from all else, or cannot be.
     """
     number, room = session.number, session.room
-    found = diagnose(table, lens, free_intrinsics=True)
+    diagnosis = diagnose(table, lens, free_intrinsics=True)
     alike: tuple[str, ...] = ()
-    for cause in found.causes if number == _EFFECT.parameters[0].name else ():
+    for cause in diagnosis.causes if number == _EFFECT.parameters[0].name else ():
         names = cause.effect, *cause.indistinguishable_from
         if len(names) == 1 or _EFFECT.name not in names:
             continue
         wanted = next_photographs(
-            found.evaluation.fixed_model, (cause,), found.noise_px, _VIEWS_AHEAD, room=room
+            diagnosis.evaluation.fixed_model, (cause,), diagnosis.noise_px, _VIEWS_AHEAD, room=room
         )
         if wanted.answers[-1] > MIN_PROBABILITY and len(session.taken) < _MAX_UNDECIDED:
             return _session_state(
                 session,
-                _model(found.evaluation.fixed_model),
+                _model(diagnosis.evaluation.fixed_model),
                 wanted,
                 named=(cause.effect,),
                 alike=names[1:],
             )
         # No photograph will tell: what is it, if it is what is asked for?
         alike = tuple(name for name in names if name != _EFFECT.name)
-        found = diagnose(
+        diagnosis = diagnose(
             table, lens, free_intrinsics=True, options=DiagnosisOptions(left_out=alike)
         )
         break
     wanted = next_photographs(
-        found.evaluation.fixed_model, found.causes, found.noise_px, _VIEWS_AHEAD, number, room
+        diagnosis.evaluation.fixed_model,
+        diagnosis.causes,
+        diagnosis.noise_px,
+        _VIEWS_AHEAD,
+        number,
+        room,
     )
-    value, stderr = _value(found.evaluation.fixed_model, number), wanted.answers[0]
-    for cause in found.causes:
+    value, stderr = _value(diagnosis.evaluation.fixed_model, number), wanted.answers[0]
+    for cause in diagnosis.causes:
         if number in cause.parameters:
             value = cause.parameters[number]['value']
             stderr = max(stderr, cause.parameters[number]['stderr'])
     return _session_state(
         session,
-        _model(found.evaluation.fixed_model),
+        _model(diagnosis.evaluation.fixed_model),
         wanted,
         value,
         stderr,
-        tuple(cause.effect for cause in found.causes),
+        tuple(cause.effect for cause in diagnosis.causes),
         alike,
         stderr <= session.goal,
     )
@@ -322,9 +327,9 @@ class Guide:
         if seen.t - last[0].t < _STANDSTILL:
             return False
         most = _MAX_MOTION * self.session.lens.width
-        for one in last:
-            _, mine, theirs = np.intersect1d(seen.ids, one.ids, return_indices=True)
-            moved = np.abs(seen.uv[mine] - one.uv[theirs])
+        for view in last:
+            _, mine, theirs = np.intersect1d(seen.ids, view.ids, return_indices=True)
+            moved = np.abs(seen.uv[mine] - view.uv[theirs])
             if not moved.size or moved.max() > most:
                 return False
         return True

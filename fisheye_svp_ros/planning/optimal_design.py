@@ -225,10 +225,13 @@ class Design:
 
         Raises ParameterError for one that is not among the names.
         """
-        parts = [(one, one.partition('.')[0], one.rpartition('.')[2]) for one in self.names]
-        found = [i for i, names in enumerate(parts) if name in names]
-        if found:
-            return np.array(found)
+        parts = [
+            (full_name, full_name.partition('.')[0], full_name.rpartition('.')[2])
+            for full_name in self.names
+        ]
+        matches = [i for i, names in enumerate(parts) if name in names]
+        if matches:
+            return np.array(matches)
         raise ParameterError(
             f'{name!r} is not a parameter of this lens and its causes; known are '
             + ', '.join(self.names)
@@ -263,10 +266,10 @@ class Design:
 
     def _add_views(self, question: Criterion, among: Sequence[int], count: int) -> list[int]:
         """Return some of the views, each the best beside those before it."""
-        found: list[int] = []
+        chosen: list[int] = []
         for _ in range(count):
-            found.append(self._best_view(question, among, found))
-        return found
+            chosen.append(self._best_view(question, among, chosen))
+        return chosen
 
     def _best_view(self, question: Criterion, among: Sequence[int], taken: Sequence[int]) -> int:
         left = [i for i in among if i not in taken]
@@ -280,7 +283,7 @@ class Design:
 def richest_forms(linear: Linearization, names: Sequence[str]) -> list[Effect]:
     """Return the richest forms of effects of lens or target that are not in a fit."""
     there = {term.name for term in linear.state.terms}
-    found = []
+    effects = []
     for name in names:
         if name in there or CATALOGUE[name].budget_stage() not in ('lens', 'target'):
             continue
@@ -288,8 +291,8 @@ def richest_forms(linear: Linearization, names: Sequence[str]) -> list[Effect]:
             forms = CATALOGUE[name].candidates(linear.scene)
         except Untestable:
             continue
-        found.append(max(forms, key=lambda form: len(form.parameters)))
-    return found
+        effects.append(max(forms, key=lambda form: len(form.parameters)))
+    return effects
 
 
 def max_view_angle(lens: Lens, reached: float) -> float:
@@ -352,23 +355,26 @@ def candidate_shots(
 
 def _detectable(state: RigState, board: FlatBoard, shots: Shots, field: float) -> Mask:
     """Whether boards are in image and field as a whole, their points far enough apart (P,)."""
-    model, found = ForwardModel(state.lens, state.terms), np.ones(len(shots.distance), dtype=bool)
+    model, feasible = (
+        ForwardModel(state.lens, state.terms),
+        np.ones(len(shots.distance), dtype=bool),
+    )
     size, rim = np.array([state.lens.width, state.lens.height]), board.rim
     # Most boards do not fit by their corners, for which there is no need to look at all of them.
     for some in (board.corners, np.arange(len(rim))):
-        left = np.flatnonzero(found)
+        left = np.flatnonzero(feasible)
         if not left.size:
-            return found
+            return feasible
         camera = shots.camera.take(left)
         views = blank_views(board.landmark[some], rim[some], left.size, board=board.board[some])
         edge, outer = model.predict(camera, views), camera.into_body(views.points)
         seen = outer[..., 2] > np.cos(field) * np.linalg.norm(outer, axis=-1)
         with np.errstate(invalid='ignore'):
             inside = ((edge.uv > _EDGE) & (edge.uv < size - _EDGE)).all(axis=-1)
-        found[left] = (edge.valid & seen & inside).all(axis=1)
-    left = np.flatnonzero(found)
-    found[left] = _resolvable(model, board, shots.camera.take(left))
-    return found
+        feasible[left] = (edge.valid & seen & inside).all(axis=1)
+    left = np.flatnonzero(feasible)
+    feasible[left] = _resolvable(model, board, shots.camera.take(left))
+    return feasible
 
 
 def _resolvable(model: ForwardModel, board: FlatBoard, camera: Pose) -> Mask:

@@ -26,7 +26,7 @@ from fisheye_svp_ros.optics.curves import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens, curve_limit
 from fisheye_svp_ros.pose import Pose, rotation_from_vector, vector_from_rotation
 from fisheye_svp_ros.rectify.cameras import RectifiedCamera
-from fisheye_svp_ros.solve.lens_checks import Extrapolated, extrapolated_points
+from fisheye_svp_ros.solve.lens_checks import ExtrapolatedPoints, extrapolated_points
 
 RANGE = 2.0  # m, where the user names none
 MAX_RANGE = 1e6  # m, as far as any range
@@ -117,7 +117,7 @@ class Rectification:
         return Maps(image[0], image[1], mask)
 
     @cached_property
-    def extrapolated(self) -> Extrapolated | None:
+    def extrapolated(self) -> ExtrapolatedPoints | None:
         """Which of its pixels lie where nothing is known of the lens; None where none does."""
         u, v = (part[self.maps.mask].astype(float) for part in self.maps[:2])
         return extrapolated_points(self.lens, np.column_stack([u, v]))

@@ -216,7 +216,7 @@ def _step(finding: Finding) -> StepEntry:
         'corrected': finding.p_corrected,
         'held_out': finding.held_out,
         'held_out_stderr': finding.held_out_stderr,
-        'accepted': finding.accepted,
+        'accepted': finding.is_accepted,
         'why': finding_reason(finding),
     }
 

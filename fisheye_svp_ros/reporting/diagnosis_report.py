@@ -70,7 +70,7 @@ _PICTURE_OF = {
     'scatter_vs_frame': 'frame',
     'size': 'histogram',
 }
-_QUICK = ('field', 'theta', 'range')  # pictures of a quick answer, beside those of what remains
+_QUICK_PICTURES = ('field', 'theta', 'range')  # beside those of what remains
 _BAR = 220  # px of a share of 1
 _ROWS = 24
 
@@ -145,7 +145,7 @@ def _draw(diagnosis: Diagnosis, points: PointResiduals, folder: Path) -> Iterato
     quick = diagnosis.evaluation.problem.options.quick
     remaining = {_PICTURE_OF.get(structure.variable) for structure in diagnosis.remaining}
     for name, draw, arguments in residual_pictures(PlotData.from_diagnosis(diagnosis, points)):
-        if not quick or name in _QUICK or name in remaining:
+        if not quick or name in _QUICK_PICTURES or name in remaining:
             draw(folder / f'{name}.png', *arguments)
             yield folder / f'{name}.png'
     if quick:
@@ -220,7 +220,7 @@ def _evidence(diagnosis: Diagnosis) -> dict[str, Any]:
 
 def _step(step: Finding, withdrawn: Mapping[str, str]) -> dict[str, Any]:
     """Return a row of the evidence; withdrawn: why accepted effects were not confirmed."""
-    why = withdrawn.get(step.effect) if step.accepted else None
+    why = withdrawn.get(step.effect) if step.is_accepted else None
     reason = finding_reason(step)
     tried = step.statistic > 0
     held_out = ''
@@ -228,7 +228,7 @@ def _step(step: Finding, withdrawn: Mapping[str, str]) -> dict[str, Any]:
         held_out = f'{step.held_out:.1f} ± {step.held_out_stderr:.1f}'
     return {
         'effect': step.form,
-        'accepted': step.accepted and not why,
+        'accepted': step.is_accepted and not why,
         'why': f'{reason}; not confirmed: {why}' if why else reason,
         'rank': step.rank if tried else '',
         'explains': f'{step.statistic:.1f}' if tried else '',

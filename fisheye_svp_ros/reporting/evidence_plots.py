@@ -35,7 +35,7 @@ def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
         left.barh(
             [step.form[:40] for step in steps],
             [step.statistic for step in steps],
-            color=[AFTER if step.accepted else _REJECTED_COLOR for step in steps],
+            color=[AFTER if step.is_accepted else _REJECTED_COLOR for step in steps],
         )
         left.set(xlabel='score statistic', title='steps of the selection', xscale='log')
         if steps:  # bars begin at a power of ten, whose names alone have room below them

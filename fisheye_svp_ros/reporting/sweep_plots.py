@@ -36,7 +36,7 @@ _COLOURS = 'viridis'
 _HUES, _LINES = 4, ('-', '--')  # what can be told apart in one picture
 _COLUMNS = 4  # axes beside each other
 _TICKS, _LABELS = 12, 6
-_SPREAD = ('noise_px', 'localizer.rms_px', 'localizer.points')
+_SPREAD_COLUMNS = ('noise_px', 'localizer.rms_px', 'localizer.points')
 _CLOUD = 20_000  # points in a scatter plot
 _UNITS = {row.name: row.unit for row in rows(Scenario)}
 _NAMES = {
@@ -71,7 +71,7 @@ def is_drawn(column: str) -> bool:
     """Say whether a column is any use to `draw_table`."""
     metric = column.rpartition('.')[2]
     return (
-        column in (*SCALARS, *SCENARIO_COLUMNS, STAMP, *_SPREAD)
+        column in (*SCALARS, *SCENARIO_COLUMNS, STAMP, *_SPREAD_COLUMNS)
         or metric in DRAWN_METRICS
         or metric == 'views'
     )
@@ -91,7 +91,7 @@ def draw_table(table: DataFrame, folder: Path) -> list[Path]:
         files.append(folder / f'heat_map_{y}_{x}.png')
         others = [name for name in swept if name not in (x, y)]
         _draw_grids(table, metrics, x, y, others, files[-1])
-    if {*_SPREAD} <= {*table} and table['noise_px'].any():
+    if {*_SPREAD_COLUMNS} <= {*table} and table['noise_px'].any():
         files.append(folder / 'residuals_and_noise.png')
         others = [name for name in swept if name != 'noise_px']
         few = [name for name in others if table[name].nunique() <= 2 * _HUES]

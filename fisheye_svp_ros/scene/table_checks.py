@@ -19,7 +19,7 @@ _PLACE_TOLERANCE = 1e-3  # of a target's extent: more than places that are writt
 _MANY_POINTS, _MIN_POINTS = 1500, 24  # of a thinned table, and of a view that stays whole
 
 
-def too_exact(sigma: Array) -> Mask:
+def implausible_sigma(sigma: Array) -> Mask:
     """Return which standard deviations (N,), px, no detector has beside the others.
 
     So large a weight leaves nothing else to be seen.
@@ -31,7 +31,7 @@ def too_exact(sigma: Array) -> Mask:
 
 def check_sigma(table: Observations) -> Observations:
     """Return the table; raise ObservationError for a sigma that no detector has."""
-    bad = np.flatnonzero(too_exact(table.sigma))
+    bad = np.flatnonzero(implausible_sigma(table.sigma))
     if len(bad):
         raise ObservationError(
             f'{table.source}: sigma of frame {table.frame[bad[0]]}, landmark '

@@ -58,7 +58,7 @@ def _find_group(
     """Return the views among the rest (R,) that fit one camera; none where no few of them do."""
     limit = 2**0.5 * noise_px
     for seed in _seeds(rest, [order[rest] for order in orders]):
-        lens, rms = _fit(views.take(seed), image_size)
+        lens, rms = _fit_lens(views.take(seed), image_size)
         if lens is None or rms > _SEED_NOISES * limit:
             continue
         group = seed
@@ -69,7 +69,7 @@ def _find_group(
             if len(grown) <= len(group):
                 break
             group = grown
-            lens = _fit(views.take(group), image_size)[0] or lens
+            lens = _fit_lens(views.take(group), image_size)[0] or lens
         if len(group) > len(seed) or len(rest) == len(seed):
             return np.sort(group)
     return np.zeros(0, dtype=np.int64)
@@ -93,7 +93,7 @@ def _seeds(rest: Index, orders: Sequence[Array]) -> Iterator[Index]:
         yield np.array(seed)
 
 
-def _fit(views: Views, image_size: tuple[int, int]) -> tuple[Lens | None, float]:
+def _fit_lens(views: Views, image_size: tuple[int, int]) -> tuple[Lens | None, float]:
     """Return the lens of some views and what it leaves, px rms; None where none is found.
 
     The image may be a half of that of a pair: the center is looked for amid the points, too.

@@ -68,7 +68,7 @@ def is_known_in_part(lens: Lens) -> bool:
     return height * lens.focal < _MIN_COVERED_RADIUS * _nearest_edge(lens)
 
 
-class Extrapolated(NamedTuple):
+class ExtrapolatedPoints(NamedTuple):
     """What share of image points lies beyond the angle that a lens is known to.
 
     farthest: the angle of the outermost; known: that of the calibration; rad.
@@ -79,7 +79,7 @@ class Extrapolated(NamedTuple):
     known: float
 
 
-def extrapolated_points(lens: Lens, uv: Array) -> Extrapolated | None:
+def extrapolated_points(lens: Lens, uv: Array) -> ExtrapolatedPoints | None:
     """Return which of image points uv (N, 2), px, lie where the curve of a lens is a guess.
 
     None where none does, or where nobody says how far the lens was calibrated.
@@ -94,4 +94,4 @@ def extrapolated_points(lens: Lens, uv: Array) -> Extrapolated | None:
         return None
     edge, _ = lens.image_height.value_and_slope(np.asarray(lens.max_incidence))
     farthest = lens.image_height.angle(np.minimum(height[beyond].max(), edge))
-    return Extrapolated(float(beyond.mean()), float(farthest), known)
+    return ExtrapolatedPoints(float(beyond.mean()), float(farthest), known)

@@ -50,13 +50,13 @@ class WrongLandmark(NamedTuple):
     offset: Array
 
     @property
-    def displaced(self) -> bool:
+    def is_displaced(self) -> bool:
         """Whether another place explains its points."""
         return bool(np.isfinite(self.offset).all())
 
     def to_dict(self) -> dict[str, Any]:
         """Return what files hold; offset: m, None where no place explains the points."""
-        offset = self.offset.tolist() if self.displaced else None
+        offset = self.offset.tolist() if self.is_displaced else None
         return {'landmark': self.number, 'points': self.points, 'px': self.px, 'offset': offset}
 
 

@@ -29,7 +29,8 @@ _MIN_CURVATURE = 0.2  # sigmas by which one sigma of rotation departs from its t
 _MIN_TILT = 0.004  # rad, a standard error of rotation below which no geometry is weak
 _MAX_TILT = 0.5  # rad, the largest standard error of tilt that nodes are drawn by
 _NODES, _MANY_NODES = 10, 26  # around a minimum
-_MANY_FROM = 2.0  # curvature from which on there are many; so there are around each of two minima
+# Curvature from which on there are many; so there are around each of two minima.
+_MANY_CURVATURE = 2.0
 _INFLATION = 2.0  # spread of nodes over the standard error of tilt
 _FOURTH_SHARE = 0.7  # of the covariance by fourth moments in the one that is given
 _MAX_SQUARE = 30.0  # Mahalanobis squared beyond which fourth moments grow no further
@@ -54,7 +55,7 @@ def hold_weak_geometry(
     if weak.size:
         covariance = covariance.copy()
         double = localization.gap[weak] < _MAX_GAP
-        many = double | (curvature > _MANY_FROM)
+        many = double | (curvature > _MANY_CURVATURE)
         for two, nodes in ((True, _MANY_NODES), (False, _MANY_NODES), (False, _NODES)):
             group = weak[(double == two) & (many == (nodes == _MANY_NODES))]
             for start in range(0, len(group), _VIEWS_AT_ONCE):

@@ -159,7 +159,7 @@ class _Landmarks(NamedTuple):
             if _median(own) > _OWN_SHARE * _median(np.linalg.norm(mine, axis=-1)):
                 landmark = self._describe(int(i), agreement)
                 far = agreement.scale[i] > _MISMATCH_RATIO * OUTLIER_SIGMAS * agreement.typical
-                wrong += [landmark] if landmark.displaced or far else []
+                wrong += [landmark] if landmark.is_displaced or far else []
         share = len(wrong) / len(self.ids)
         return tuple(wrong) if share <= _MAX_WRONG_SHARE else ()
 

@@ -182,7 +182,7 @@ def with_covariance(lens: Lens, trusted: LensTrust) -> Lens:
     )
 
 
-class _Fit(NamedTuple):
+class _ShiftFit(NamedTuple):
     """Steps (K,) of parameters and their covariance (K, K), and the log evidence of a model."""
 
     step: Array
@@ -190,7 +190,7 @@ class _Fit(NamedTuple):
     evidence: float
 
 
-def _fit_targets(null: NullModel, count: int) -> list[_Fit]:
+def _fit_targets(null: NullModel, count: int) -> list[_ShiftFit]:
     """Return how parameters move for a target as it is said to be, and for ones that err more.
 
     The errors of the target are normal, with a share of what is large for each as their standard
@@ -215,11 +215,11 @@ def _fit_targets(null: NullModel, count: int) -> list[_Fit]:
         evidence = score @ inverse @ score - determinant if sign > 0 else -np.inf
         evidence += np.log(more[len(own) :]).sum()
         mine = inverse[:count, :count] / np.outer(scale, scale)
-        fits.append(_Fit((inverse @ score)[:count] / scale, mine, float(evidence) / 2))
+        fits.append(_ShiftFit((inverse @ score)[:count] / scale, mine, float(evidence) / 2))
     return fits
 
 
-def _fit_without_random_parts(null: NullModel, other: _Fit) -> _Fit:
+def _fit_without_random_parts(null: NullModel, other: _ShiftFit) -> _ShiftFit:
     """Return the fit of least squares, which does not move; other: with random parts as they are.
 
     Evidence by the restricted likelihood; a variance counts as a parameter (BIC): in data without
@@ -235,10 +235,10 @@ def _fit_without_random_parts(null: NullModel, other: _Fit) -> _Fit:
 
     cost = int(null.variances.alive.sum()) * np.log(null.full.rows) / 2
     gain = likelihood(null.factorization) - likelihood(bare) - cost
-    return _Fit(np.zeros_like(other.step), other.covariance, other.evidence - gain)
+    return _ShiftFit(np.zeros_like(other.step), other.covariance, other.evidence - gain)
 
 
-def _average_fits(fits: Sequence[_Fit]) -> tuple[Array, Array]:
+def _average_fits(fits: Sequence[_ShiftFit]) -> tuple[Array, Array]:
     """Return the mean step (K,) and its covariance (K, K), each model weighted by its evidence.
 
     Source: Hoeting et al., Bayesian model averaging: a tutorial, Statistical Science 14 (1999).

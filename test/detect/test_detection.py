@@ -32,7 +32,7 @@ from fisheye_svp_ros import cli
 from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners
 from fisheye_svp_ros.detect.detection import Detection, _Task, detect, examine
 from fisheye_svp_ros.detect.finders import DETECTORS, dictionary_of
-from fisheye_svp_ros.detect.patterns import _MARKERS, Found, parse_pattern
+from fisheye_svp_ros.detect.patterns import _MARKERS, LocatedPoints, parse_pattern
 from fisheye_svp_ros.detect.photographs import (
     Photograph,
     decode_image,
@@ -83,7 +83,7 @@ def test_corners_do_not_depend_on_where_the_search_saw_them(
     def seen(off: float) -> np.ndarray:
         monkeypatch.setattr(
             'fisheye_svp_ros.detect.points.DETECTORS',
-            {'saddle': ((), lambda *_: Found(np.arange(len(true)), true + off * rough))},
+            {'saddle': ((), lambda *_: LocatedPoints(np.arange(len(true)), true + off * rough))},
         )
         points = find_points(image, PATTERN, 'saddle')
         assert not isinstance(points, str)
@@ -312,7 +312,7 @@ class TestCorners:
         grid = true_corners(pose).reshape(PATTERN.rows, PATTERN.columns, 2)
         beyond = 2 * grid[:, -1:] - grid[:, -2:-1]
         off = np.concatenate([grid[:, 1:], beyond], axis=1).reshape(-1, 2)
-        found = Found(np.arange(len(off)), off)
+        found = LocatedPoints(np.arange(len(off)), off)
         monkeypatch.setattr(
             'fisheye_svp_ros.detect.points.DETECTORS',
             {'saddle': (('chessboard',), lambda *_: found)},

@@ -40,7 +40,7 @@ SOUND = LensFacts(
 def test_a_sound_lens_is_kept_with_the_bound() -> None:
     found = decide_lens(SOUND)
     assert found.say == 'keep' and found.bound == [SMALL] and found.confidence == 0.95
-    assert found.reason == LensReason.NOTHING_CONFIRMED
+    assert found.reason == LensReason.NO_CAUSE_CONFIRMED
 
 
 @pytest.mark.parametrize('causes', [[], ['target_shape']])
@@ -48,7 +48,7 @@ def test_a_lens_off_by_three_of_its_errors_is_to_be_calibrated_again(causes: lis
     """It was silently fitted anew, and called adequate."""
     off = SOUND._replace(offset=LensOffset(1.2, 3.0, 0.001, 1.5), causes=causes, file=BETTER)
     found = decide_lens(off)
-    assert (found.say, found.reason) == ('recalibrate', LensReason.OFF)
+    assert (found.say, found.reason) == ('recalibrate', LensReason.LENS_IS_OFF)
     assert found.figure == ('ray_error', 1.2, 'mrad')
     assert found.confidence == 1.0
 
@@ -144,7 +144,7 @@ def test_photographs_are_enough_or_not() -> None:
     few = facts._replace(frames=9)
     assert decide_photographs(few._replace(bad=['1.jpg'])).say == 'retake'
     alone = decide_photographs(few._replace(unlike=['1.jpg']))
-    assert alone.reason == PhotographsReason.NOT_PREDICTED
+    assert alone.reason == PhotographsReason.FRAMES_NOT_PREDICTED
     assert decide_photographs(facts._replace(frames=5)).say == 'more'
     assert decide_photographs(facts._replace(lens='undecided')).say == 'more'
     assert decide_photographs(facts._replace(unlike=['1', '2', '3', '4'])).say == 'more'

@@ -6,7 +6,7 @@ from helpers.water import AIR
 
 from fisheye_svp_ros.diagnosis import Action, NullModel, diagnose
 from fisheye_svp_ros.diagnosis.fitted_model import refit
-from fisheye_svp_ros.diagnosis.lens_evidence import _generalized_fit
+from fisheye_svp_ros.diagnosis.lens_evidence import _generalized_state
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
@@ -27,7 +27,7 @@ def test_a_sagging_board_does_not_move_the_center(seed):
     # The mean bend, which stays, is a cause of its own and not in this model.
     assert abs(fitted.lens.cy - AIR.cy) < 3 * error < 0.4
     # Nor is a lens that `calibrate` writes off the fit that it is compared with.
-    assert abs(_generalized_fit(null).lens.cy - fitted.lens.cy) < error
+    assert abs(_generalized_state(null).lens.cy - fitted.lens.cy) < error
 
 
 def test_a_board_that_sags_is_to_be_supported():

@@ -360,7 +360,7 @@ def compiling(hour: Hour, pattern: str) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr('fisheye_svp_ros.optics.engines.find_spec', lambda _: 'there')
         patch.setattr('fisheye_svp_ros.optics.engines.cache.is_compiled', lambda: False)
-        patch.setattr('fisheye_svp_ros.optics.engines.compilation._CODE', 'input()')
+        patch.setattr('fisheye_svp_ros.optics.engines.cache._CODE', 'input()')
         patch.setenv('FISHEYE_SVP_ENGINE', 'auto')
         hour.begin(*SOLVING).start(Localizer)
     hour.logs(pattern)

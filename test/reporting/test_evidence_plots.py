@@ -65,7 +65,7 @@ def test_no_tick_label_of_the_evidence_covers_another(
             figures=SimpleNamespace(base=fit, extended=fit),
             noise_px=0.1,
             trace=[
-                SimpleNamespace(form=f'effect {n}', statistic=value, accepted=True)
+                SimpleNamespace(form=f'effect {n}', statistic=value, is_accepted=True)
                 for n, value in enumerate(statistics)
             ],
         ),

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from fisheye_svp_ros.diagnosis import Finding, Reason
-from fisheye_svp_ros.reporting.wording.first_screen import provisional_headline, what_changed
+from fisheye_svp_ros.reporting.wording.first_screen import headline_changes, provisional_headline
 
 
 def answer(*names: str, candidates: tuple[Finding, ...] = ()) -> SimpleNamespace:
@@ -18,9 +18,9 @@ def test_the_first_cause_is_the_headline() -> None:
 
 
 def test_what_has_changed_since_is_said() -> None:
-    assert what_changed(('skew',), answer('skew')) == []
+    assert headline_changes(('skew',), answer('skew')) == []
     refuted = Finding(form='skew', reason=Reason.REFUTED_BY_FRAMES, p_value=0.0, p_corrected=0.0)
-    assert what_changed(('skew',), answer('aspect', candidates=(refuted,))) == [
+    assert headline_changes(('skew',), answer('aspect', candidates=(refuted,))) == [
         'Since the provisional answer: found: aspect; not confirmed: skew (held-out frames refute '
         'it).'
     ]

@@ -89,7 +89,7 @@ def test_every_reason_is_a_short_clause(
     ('reason', 'facts', 'text'),
     [
         (
-            LensReason.OFF,
+            LensReason.LENS_IS_OFF,
             LENS,
             'the lens as given is off by at least 1.2 mrad (1.5 px) at 1 m, 3.0 times the '
             'combined standard error',
@@ -118,7 +118,7 @@ def test_every_reason_is_a_short_clause(
             'the edge',
         ),
         (
-            LensReason.NOTHING_CONFIRMED,
+            LensReason.NO_CAUSE_CONFIRMED,
             LENS._replace(offset=LensOffset(0.3, 0.8, 0.6, 0.1)),
             'no cause in the lens is confirmed and its parameters agree with these data within '
             'their errors; effects that these data do not exclude cause at most 0.32 px '
@@ -141,17 +141,17 @@ def test_every_reason_is_a_short_clause(
             '1 of 26 scatters more than the others or is an outlier as a whole',
         ),
         (
-            PhotographsReason.NOT_PREDICTED,
+            PhotographsReason.FRAMES_NOT_PREDICTED,
             PHOTOGRAPHS,
             '1 of 26 is not predicted by the others',
         ),
         (
-            PhotographsReason.TOO_FEW,
+            PhotographsReason.TOO_FEW_FRAMES,
             PHOTOGRAPHS._replace(unit='view', frames=1),
             'one view is too few; take 8 or more',
         ),
         (
-            PhotographsReason.PREDICTED,
+            PhotographsReason.FRAMES_PREDICTED,
             PHOTOGRAPHS,
             '26 frames, held-out error 10.0 times what noise and scatter between frames leave; '
             'the target causes the rest',
@@ -169,7 +169,7 @@ def test_why_something_is_to_be_done(
 def test_a_lens_of_a_rig_is_told_by_its_camera() -> None:
     assert LENS.offset is not None
     left = LENS._replace(offset=LENS.offset._replace(camera='left'))
-    assert _reason(LensReason.OFF, left).startswith('the lens of left as given is off')
+    assert _reason(LensReason.LENS_IS_OFF, left).startswith('the lens of left as given is off')
 
 
 def test_views_are_planned_only_where_they_can_be() -> None:

@@ -12,7 +12,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.io.csv_files import read, write_observations
 from fisheye_svp_ros.library import functions as library
-from fisheye_svp_ros.scene.table_checks import too_exact
+from fisheye_svp_ros.scene.table_checks import implausible_sigma
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.measured_poses import usable_observations
@@ -35,9 +35,14 @@ def copied(frames):
 
 
 def test_only_a_sigma_far_below_the_others_is_too_exact():
-    assert too_exact(np.array([0.1, 0.1, 0.1, 1e-9, 9e-5])).tolist() == 3 * [False] + 2 * [True]
-    assert not too_exact(np.array([0.1, 5.0, 2e-3, np.nan])).any()
-    assert not too_exact(np.full(3, 1e-5)).any() and not too_exact(np.full(3, np.nan)).any()
+    assert implausible_sigma(np.array([0.1, 0.1, 0.1, 1e-9, 9e-5])).tolist() == 3 * [False] + 2 * [
+        True
+    ]
+    assert not implausible_sigma(np.array([0.1, 5.0, 2e-3, np.nan])).any()
+    assert (
+        not implausible_sigma(np.full(3, 1e-5)).any()
+        and not implausible_sigma(np.full(3, np.nan)).any()
+    )
 
 
 @pytest.mark.parametrize('sigma', [1e-9, 1e-5])

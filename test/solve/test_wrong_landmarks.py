@@ -82,7 +82,7 @@ def test_a_landmark_of_another_point_is_named_without_a_place():
     uv[mine] += 90.0 * np.where(np.arange(len(mine)) % 2, 1, -1)[:, None] * [1.0, 0.3]
     _, _, outliers = calibrate_without_outliers(replace(table, uv=uv), fit)
     (landmark,) = outliers.landmarks
-    assert landmark.number == 20 and not landmark.displaced and landmark.points == len(mine)
+    assert landmark.number == 20 and not landmark.is_displaced and landmark.points == len(mine)
     assert landmark.px == pytest.approx(94, abs=3)
 
 

@@ -221,8 +221,8 @@ def compare_cameras(selection: Selection) -> list[TwoCameras]:
     ]
     alone = is_unpaired(data)
     return [
-        replace(_compare(one, other, known), posed_alone=alone)
-        for one, other in combinations(cameras, 2)
+        replace(_compare(camera, other, known), posed_alone=alone)
+        for camera, other in combinations(cameras, 2)
     ]
 
 
@@ -263,9 +263,9 @@ def _single_camera(state: RigState, pose: Pose, lens: int, camera: int) -> RigSt
     return RigState(pose, identity(1), state.lenses[lens], camera_terms(state.terms, camera))
 
 
-def _compare(one: _Camera, other: _Camera, known: KnownTarget) -> TwoCameras:
+def _compare(camera: _Camera, other: _Camera, known: KnownTarget) -> TwoCameras:
     carried, poses = [], []
-    for mine, source in ((one, other), (other, one)):
+    for mine, source in ((camera, other), (other, camera)):
         data, state = mine.data, without_terms(mine.state, displaces_landmarks)
         if source.target is None:
             after = adjust(data, state, mine.free)
@@ -276,20 +276,20 @@ def _compare(one: _Camera, other: _Camera, known: KnownTarget) -> TwoCameras:
             carried.append(Transfer.compare(source.name, mine.name, without, there))
         poses.append((adjust(mine.data, mine.before, mine.free).pose, after.pose))
     return TwoCameras(
-        (one.name, other.name),
+        (camera.name, other.name),
         tuple(carried),
-        _maps(one, other, known),
-        _scatter((one.data, other.data), poses),
+        _maps(camera, other, known),
+        _scatter((camera.data, other.data), poses),
     )
 
 
-def _maps(one: _Camera, other: _Camera, known: KnownTarget) -> TargetMaps | None:
+def _maps(camera: _Camera, other: _Camera, known: KnownTarget) -> TargetMaps | None:
     """Compare what two cameras found of the target, by the landmarks that both saw."""
-    if one.target is None or other.target is None:
+    if camera.target is None or other.target is None:
         return None
     seen = [
         np.isin(known.landmark, mine.data.views.landmark[mine.data.views.used])
-        for mine in (one, other)
+        for mine in (camera, other)
     ]
     both = seen[0] & seen[1]
     if both.sum() < _MIN_COMMON_LANDMARKS:
@@ -298,7 +298,7 @@ def _maps(one: _Camera, other: _Camera, known: KnownTarget) -> TargetMaps | None
     off, along = (
         [
             np.concatenate([getattr(board, name).ravel() for board in shared.maps(moved[both])])
-            for moved in (one.target, other.target)
+            for moved in (camera.target, other.target)
         ]
         for name in ('height', 'slide')
     )
@@ -310,10 +310,10 @@ def _maps(one: _Camera, other: _Camera, known: KnownTarget) -> TargetMaps | None
     )
 
 
-def _correlation(one: Array, other: Array) -> float:
+def _correlation(mine: Array, other: Array) -> float:
     """Return how alike two displacements are, m; those of rounding are no displacements."""
-    size = np.sqrt((one**2).sum() * (other**2).sum())
-    return float((one * other).sum() / size) if size > _MIN_DISPLACEMENT**2 else 0.0
+    size = np.sqrt((mine**2).sum() * (other**2).sum())
+    return float((mine * other).sum() / size) if size > _MIN_DISPLACEMENT**2 else 0.0
 
 
 def _scatter(
@@ -326,8 +326,8 @@ def _scatter(
     if len(shared) < MIN_SHARED_FRAMES:
         return {}
     before, after = (
-        deviations(one.take(first).inverse().compose(other.take(second)))
-        for one, other in zip(*poses, strict=True)
+        deviations(pose.take(first).inverse().compose(other.take(second)))
+        for pose, other in zip(*poses, strict=True)
     )
     names = ('translation_m', 'rotation_rad')
     return {name: compare_errors(b, a) for name, b, a in zip(names, before, after, strict=True)}

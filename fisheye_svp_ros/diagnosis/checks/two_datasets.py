@@ -134,7 +134,7 @@ class TwoDatasets:
         return (
             []
             if self.tried[0] is None
-            else [name for name, one in self.tried[0].causes.items() if one.worsens]
+            else [name for name, transfer in self.tried[0].causes.items() if transfer.worsens]
         )
 
     @property
@@ -168,26 +168,28 @@ class TwoDatasets:
                 if transfer is not None
             ],
             'parameters': {
-                name: one._asdict() | {'apart': one.standardized_difference}
-                for name, one in self.parameters.items()
+                name: parameter._asdict() | {'apart': parameter.standardized_difference}
+                for name, parameter in self.parameters.items()
             },
         }
 
 
-def compare_datasets(one: DatasetModel, other: DatasetModel, source: str, to: str) -> TwoDatasets:
+def compare_datasets(
+    model: DatasetModel, other: DatasetModel, source: str, to: str
+) -> TwoDatasets:
     """Return what two data sets of one camera say of each other."""
     return TwoDatasets(
         to,
-        (_transfer_causes(one, other, source, to), _transfer_causes(other, one, to, source)),
-        _parameters(one, other),
+        (_transfer_causes(model, other, source, to), _transfer_causes(other, model, to, source)),
+        _parameters(model, other),
     )
 
 
 def _transfer_causes(
-    one: DatasetModel, other: DatasetModel, source: str, to: str
+    model: DatasetModel, other: DatasetModel, source: str, to: str
 ) -> TransferredCauses | None:
     """Try on another set what one found; None where it found nothing that moves with the lens."""
-    carried = [term for term in one.null.linear.state.terms if moves_with_lens(term)]
+    carried = [term for term in model.null.linear.state.terms if moves_with_lens(term)]
     if not carried:
         return None
     data, free = other.null.linear.data, other.null.linear.free
@@ -201,8 +203,8 @@ def _transfer_causes(
 
     without, there = predict(()), predict(carried)
     whole = (
-        predict((), replace(bare, lens=one.simulation.state.lens), ()),
-        predict(carried, replace(bare, lens=one.null.linear.state.lens), ()),
+        predict((), replace(bare, lens=model.simulation.state.lens), ()),
+        predict(carried, replace(bare, lens=model.null.linear.state.lens), ()),
     )
     causes = {
         cause.name: Transfer.compare(
@@ -214,21 +216,21 @@ def _transfer_causes(
         Transfer.compare(source, to, without, there),
         Transfer.compare(source, to, *whole),
         causes,
-        _transfer_target(one, other, source, to),
+        _transfer_target(model, other, source, to),
     )
 
 
 def _transfer_target(
-    one: DatasetModel, other: DatasetModel, source: str, to: str
+    model: DatasetModel, other: DatasetModel, source: str, to: str
 ) -> Transfer | None:
     """Try the target's corrections on the other set, if it shows landmarks of the same places."""
-    known, there = (KnownTarget.from_views(d.null.linear.data.views) for d in (one, other))
-    if not any(map(displaces_landmarks, one.null.linear.state.terms)) or not (
+    known, there = (KnownTarget.from_views(d.null.linear.data.views) for d in (model, other))
+    if not any(map(displaces_landmarks, model.null.linear.state.terms)) or not (
         np.array_equal(known.landmark, there.landmark)
         and np.abs(known.points - there.points).max() < _PLACE_TOLERANCE
     ):
         return None
-    fitted = FittedModel.of_state(one.null.linear, one.null.variances)
+    fitted = FittedModel.of_state(model.null.linear, model.null.variances)
     linear = other.null.linear
     state = without_terms(linear.state, displaces_landmarks)
     shift = less_similarity(known.points, fitted_target(fitted, known))
@@ -237,20 +239,20 @@ def _transfer_target(
     return Transfer.compare(source, to, without, carried)
 
 
-def _parameters(one: DatasetModel, other: DatasetModel) -> dict[str, SharedParameter]:
+def _parameters(model: DatasetModel, other: DatasetModel) -> dict[str, SharedParameter]:
     """Fit both sets with the causes of both and compare what is the lens's."""
-    both = [_with_lens_effects(a, b) for a, b in ((one, other), (other, one))]
-    found: dict[str, SharedParameter] = {}
-    first, second = (_estimates(d, state) for d, state in zip((one, other), both, strict=True))
+    both = [_with_lens_effects(a, b) for a, b in ((model, other), (other, model))]
+    shared: dict[str, SharedParameter] = {}
+    first, second = (_estimates(d, state) for d, state in zip((model, other), both, strict=True))
     for name, (value, stderr, unit) in first.items():
         if name in second and np.isfinite([stderr, second[name][1]]).all():
-            found[name] = SharedParameter(value, stderr, *second[name][:2], unit)
-    return found
+            shared[name] = SharedParameter(value, stderr, *second[name][:2], unit)
+    return shared
 
 
-def _with_lens_effects(one: DatasetModel, other: DatasetModel) -> RigState:
+def _with_lens_effects(model: DatasetModel, other: DatasetModel) -> RigState:
     """Return the state with the other's causes of the lens as well, starting from nothing."""
-    state = one.null.linear.state
+    state = model.null.linear.state
     known = {term.name: len(term.values) for term in state.terms}
     for term in other.null.linear.state.terms:
         # Of two forms of one effect the one with more parameters.
@@ -266,15 +268,15 @@ def _estimates(model: DatasetModel, state: RigState) -> dict[str, tuple[float, f
     null = NullModel.with_variances(data, state, free, variances)
     errors = standard_errors(null)
     rig = null.column_count - len(free) - sum(len(term.values) for term in null.terms)
-    found = {
+    estimates = {
         name: (state.parameters[name], float(errors[rig + i]), 'px' if name in INTRINSICS else '')
         for i, name in enumerate(free)
     }
     for term in filter(moves_with_lens, null.terms):
-        found |= {
+        estimates |= {
             f'{term.name}.{p.name}': (float(v), float(e), p.unit)
             for p, v, e in zip(
                 term.effect.parameters, term.values, errors[term.columns], strict=True
             )
         }
-    return found
+    return estimates

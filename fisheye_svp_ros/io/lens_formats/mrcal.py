@@ -40,8 +40,8 @@ _OF_CAHVORE = 12
 _MOST_TOKENS = 100_000
 _AXIS = 1e-9  # rad, of CAHVORE's axis off the image's
 _TERMS, _GRID, _TOLERANCE = 3, 400, 0.01  # radial terms, angles, px
-_SPLINED = 'LENSMODEL_SPLINED_STEREOGRAPHIC'
-_CONFIGURATION = re.compile(_SPLINED + r'_order=(\d+)_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+)$')
+_SPLINED_MODEL = 'LENSMODEL_SPLINED_STEREOGRAPHIC'
+_CONFIGURATION = re.compile(_SPLINED_MODEL + r'_order=(\d+)_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+)$')
 _MARGIN_NODES = 3  # nodes that lie outside the field, along an axis
 _NODES = (24, 36, 54, 80)  # along x that are tried
 _SAMPLES = 4  # along each axis for a node
@@ -74,7 +74,7 @@ def read(text: str, where: str) -> Foreign:
         raise LensError(f'{where}: intrinsics has {len(values)} values; {model} needs {needed}')
     if model == _STEREOGRAPHIC:
         return _read_stereographic(size, values, where)
-    if model.startswith(_SPLINED):
+    if model.startswith(_SPLINED_MODEL):
         lens = _read_splined(model, values, size, where)
         return Foreign('mrcal', {'camera': lens}, (), {})
     if model in _PERSPECTIVE:
@@ -141,7 +141,7 @@ def write(lens: Lens) -> str:
     # Of a lens with a shift that CAHVORE has not, the curve is written.
     shift = lens.viewpoint_shift if isinstance(lens.viewpoint_shift, Gennery) else None
     if shift is None and (lens.image_field is not None or worst > _TOLERANCE):
-        return _document(*_fit_splined(lens), (0.0, 0.0, 0.0), lens)
+        return _document(*_fit_splined_model(lens), (0.0, 0.0, 0.0), lens)
     e = [shift.e0, shift.e1, shift.e2] if shift is not None else [0.0] * 3
     intrinsics = [
         lens.fx,
@@ -213,7 +213,7 @@ def _read_splined(model: str, values: Sequence[float], size: Sequence[int], wher
     return lens
 
 
-def _fit_splined(lens: Lens) -> tuple[str, list[float]]:
+def _fit_splined_model(lens: Lens) -> tuple[str, list[float]]:
     """Return model and intrinsics of the nearest splined lens; raise LensError above 0.01 px."""
     worst = np.inf
     for columns in _NODES:
@@ -263,7 +263,7 @@ def _fit_nodes(lens: Lens, columns: int) -> tuple[str, ImageField, float]:
     values: Array = splu(normal.tocsc()).solve(design.T @ (uv - ideal))
     field = replace(empty, values=values.reshape(rows, columns, 2))
     worst = float(np.linalg.norm(field.apply(ideal) - uv, axis=-1).max())
-    return f'{_SPLINED}_order=3_Nx={columns}_Ny={rows}_fov_x_deg={degrees}', field, worst
+    return f'{_SPLINED_MODEL}_order=3_Nx={columns}_Ny={rows}_fov_x_deg={degrees}', field, worst
 
 
 def _spacing(columns: int, degrees: float) -> float:

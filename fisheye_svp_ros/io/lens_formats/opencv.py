@@ -82,8 +82,10 @@ def read(text: str, where: str) -> Foreign:
     named = {re.sub('[^a-z0-9]', '', str(name).lower()): value for name, value in document.items()}
 
     def lens(name: str, side: str) -> tuple[Lens, float]:
-        k = _matrix(_value(named, _sided(_MATRIX, side), where), ((3, 3),), where)
-        coefficients = _matrix(_value(named, _sided(_COEFFICIENTS, side), where), _COUNTS, where)
+        k = _matrix(_value(named, _names_of_side(_MATRIX, side), where), ((3, 3),), where)
+        coefficients = _matrix(
+            _value(named, _names_of_side(_COEFFICIENTS, side), where), _COUNTS, where
+        )
         distortion = _distortion(coefficients, named, where)
         return models.nearest_lens(
             name, _image_size(named, where), (k[0], k[4], k[2], k[5], k[1]), distortion, where
@@ -92,7 +94,7 @@ def read(text: str, where: str) -> Foreign:
     sides = [
         pair
         for pair in _SIDES
-        if all(any(name in named for name in _sided(_MATRIX, side)) for side in pair)
+        if all(any(name in named for name in _names_of_side(_MATRIX, side)) for side in pair)
     ]
     if sides:
         lenses = dict(zip(STEREO, map(lens, STEREO, sides[0]), strict=True))
@@ -108,7 +110,7 @@ def read(text: str, where: str) -> Foreign:
     return given._replace(notes=(_FISHEYE_NOTE,) * (assumed and _has_four(named)))
 
 
-def _sided(names: Sequence[str], side: str) -> list[str]:
+def _names_of_side(names: Sequence[str], side: str) -> list[str]:
     """Return the names of one camera's entry: `side` stands after or, as a word, before them."""
     before = [side + name for name in names] if side.isalpha() else []
     return [name + side for name in names] + before
@@ -118,14 +120,15 @@ def _only_side(named: Mapping[str, Any]) -> str:
     """Return what stands after the names of the only camera of a file: mostly nothing."""
     sides = ('', *(side for pair in _SIDES for side in pair))
     return next(
-        (side for side in sides if any(name in named for name in _sided(_MATRIX, side))), ''
+        (side for side in sides if any(name in named for name in _names_of_side(_MATRIX, side))),
+        '',
     )
 
 
 def _has_four(named: Mapping[str, Any]) -> bool:
     """Say whether the coefficients of any camera are four."""
     sides = ('', *(side for pair in _SIDES for side in pair))
-    given = (named.get(name) for side in sides for name in _sided(_COEFFICIENTS, side))
+    given = (named.get(name) for side in sides for name in _names_of_side(_COEFFICIENTS, side))
     lists = (value.get('data') if isinstance(value, dict) else value for value in given)
     return any(np.size(value) == _OF_FISHEYE for value in lists if isinstance(value, list))
 
@@ -142,7 +145,7 @@ def _image_size(named: Mapping[str, Any], where: str) -> list[float]:
     """Return width and height, px; raise LensError where they are not told."""
     for name in _SIZE:
         if name in named:
-            return fields.numbers({'size': _flat(named[name])}, 'size', 2, where)
+            return fields.numbers({'size': _matrix_numbers(named[name])}, 'size', 2, where)
     pair = [
         next((named[name] for name in names if name in named), None) for names in (_WIDTH, _HEIGHT)
     ]
@@ -178,7 +181,7 @@ def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[f
 
     OpenCV 5 writes arrays of one dimension by their `sizes`; lists are those of other programs.
     """
-    data = _flat(value)
+    data = _matrix_numbers(value)
     shape: tuple[Any, ...] | None = None
     if isinstance(value, dict):
         shape = value.get('rows'), value.get('cols')
@@ -194,7 +197,7 @@ def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[f
     return fields.numbers({'data': data}, 'data', int(shape[0] * shape[1]), where)
 
 
-def _flat(value: Any) -> Any:
+def _matrix_numbers(value: Any) -> Any:
     """Return the numbers of a list of lists, or of a matrix, in one list."""
     if isinstance(value, dict):
         value = value.get('data')

@@ -28,7 +28,7 @@ _SOURCES = (
     'optics/engines/entries.py',
     'optics/engines/marquardt.py',
 )
-_IDLE = 19  # niceness: whoever has work to do goes first
+_NICENESS = 19  # niceness: whoever has work to do goes first
 _CODE = 'from fisheye_svp_ros.optics.engines import cache; cache.compile_all()'
 
 
@@ -106,7 +106,7 @@ def compile_all() -> None:
     """Compile, unless another process does or has: then wait for it."""
     from fisheye_svp_ros.optics import engines
 
-    os.nice(_IDLE)
+    os.nice(_NICENESS)
     kept = folder()
     kept.mkdir(parents=True, exist_ok=True)
     with (kept / 'lock').open('w') as lock:

@@ -21,7 +21,7 @@ _REASONS = {
     Reason.PREDICTS_BETTER: 'significant and predicts better',
     Reason.BEYOND_BULK: 'further off than the bulk of landmarks',
     Reason.NO_CONVINCING_GAIN: 'does not predict better',
-    Reason.EXPLAINED_BY_OTHERS: 'removed: the other causes explain it',
+    Reason.EXPLAINED_BY_OTHER_CAUSES: 'removed: the other causes explain it',
     Reason.NO_LASTING_GAIN: 'removed: it does not predict better any more',
     Reason.REFUTED_BY_FRAMES: 'held-out frames refute it',
     Reason.REFUTED_BY_FILE: 'the held-out file refutes it',

@@ -29,7 +29,7 @@ from fisheye_svp_ros.solve.outliers import FRAME, VIEW
 
 _SUBJECTS = {LensFacts: 'lens', TargetFacts: 'target', PhotographsFacts: 'photographs'}
 _ONE_FRAME = 'one frame does not tell errors of the lens from those of the target'
-_WORDS = {
+_ACTIONS = {
     Action.USE_EXTENDED: 'solve with the extended lens file',
     Action.DIAGNOSE_AIR: 'diagnose the photographs in air first, then these with the extended '
     'lens of that run: the lens already has errors in air',
@@ -86,15 +86,16 @@ def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
     return {
         LensReason.FITTED_ERROR_RISES: 'the error on the fitted frames rises with the causes in '
         'the model, so nothing is recommended',
-        LensReason.OFF: _offset(facts),
+        LensReason.LENS_IS_OFF: _offset(facts),
         LensReason.ONE_FRAME: f'{_ONE_FRAME}; take {MIN_FRAMES} frames or more',
         LensReason.INTRINSICS_WRONG: 'the lens as given is wrong in '
         f'{", ".join(facts.wrong_intrinsics)}',
         LensReason.PREDICTS_BETTER: 'on the same corrected target it takes the held-out error '
-        f'from {pixels(file.given_px)} to {pixels(file.extended_px)} px{_unnamed_parts(facts)}',
+        f'from {pixels(file.given_px)} to {pixels(file.extended_px)} px'
+        f'{_unconfirmed_clause(facts)}',
         LensReason.RAYS_BETTER: 'the expected error of its rays is '
         f'{facts.rays[1]:.2g} mrad, of the lens as given {facts.rays[0]:.2g} mrad'
-        f'{_unnamed_parts(facts)}',
+        f'{_unconfirmed_clause(facts)}',
         LensReason.LENS_ALONE_PREDICTS_WORSE: f'held-out error {pixels(file.extended_px)} px with '
         f'the extended lens alone, {pixels(file.given_px)} px with the lens as given; only '
         'all causes together reduce it',
@@ -102,11 +103,11 @@ def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
         f'lens reduces the held-out error ({pixels(file.given_px)} → '
         f'{pixels(file.extended_px)} px): its probability is {100 * file.sure:.0f} %',
         LensReason.EFFECT_POSSIBLE: _possible_effects(facts),
-        LensReason.NOTHING_CONFIRMED: _nothing_confirmed(facts),
+        LensReason.NO_CAUSE_CONFIRMED: _no_cause_clause(facts),
     }
 
 
-def _unnamed_parts(facts: LensFacts) -> str:
+def _unconfirmed_clause(facts: LensFacts) -> str:
     """Return what the extended lens has without a confirmed cause, as a clause; '' for nothing."""
     if facts.written:
         parts = ' and '.join(name.replace('_', ' ') for name in facts.written)
@@ -142,11 +143,11 @@ def _possible_effects(facts: LensFacts) -> str:
         return ''
     return (
         f'{unconfirmed_effects(facts)}, '
-        f'which may cause up to {possible[0].edge_px:.2g} px {bound_place(possible[0])}'
+        f'which may cause up to {possible[0].edge_px:.2g} px {bound_location(possible[0])}'
     )
 
 
-def _nothing_confirmed(facts: LensFacts) -> str:
+def _no_cause_clause(facts: LensFacts) -> str:
     worst = max(facts.bounds, key=lambda bound: bound.edge_px, default=None)
     agrees = facts.offset is not None and facts.offset.is_chance
     fit = ' and its parameters agree with these data within their errors' if agrees else ''
@@ -154,12 +155,12 @@ def _nothing_confirmed(facts: LensFacts) -> str:
     if worst is not None:
         cost = (
             f'; effects that these data do not exclude cause at most {worst.edge_px:.2g} px '
-            f'({worst.edge_mrad:.2g} mrad) {bound_place(worst)}'
+            f'({worst.edge_mrad:.2g} mrad) {bound_location(worst)}'
         )
     return f'no cause in the lens is confirmed{fit}{cost}'
 
 
-def bound_place(bound: EffectBound) -> str:
+def bound_location(bound: EffectBound) -> str:
     """Return the angles and ranges that a bound holds for."""
     if bound.edge is None or bound.ranges is None:
         return 'at the edge'
@@ -221,12 +222,12 @@ def _photographs_reasons(facts: PhotographsFacts) -> dict[PhotographsReason, str
     rest = '; the target causes the rest' if facts.target_causes_rest else ''
     return {
         PhotographsReason.SOME_ARE_WRONG: f'{bad} of {count} {wrong} as a whole',
-        PhotographsReason.TOO_FEW: f'{few} too few; take {MIN_FRAMES} or more',
+        PhotographsReason.TOO_FEW_FRAMES: f'{few} too few; take {MIN_FRAMES} or more',
         PhotographsReason.LENS_UNDECIDED: f'the lens is undecided; {remedy}',
-        PhotographsReason.NOT_PREDICTED: f'{unlike} of {count} {"are" if unlike > 1 else "is"} '
-        'not predicted by the others',
-        PhotographsReason.PREDICTED: f'{count} {unit}s, held-out error {facts.ratio:.1f} times '
-        f'what noise and scatter between frames leave{rest}',
+        PhotographsReason.FRAMES_NOT_PREDICTED: f'{unlike} of {count} '
+        f'{"are" if unlike > 1 else "is"} not predicted by the others',
+        PhotographsReason.FRAMES_PREDICTED: f'{count} {unit}s, held-out error '
+        f'{facts.ratio:.1f} times what noise and scatter between frames leave{rest}',
     }
 
 
@@ -235,7 +236,7 @@ def advised_action(advice: Advice) -> str:
     cause, soon = advice.cause, ''
     if math.isfinite(advice.value):
         soon = f' and taken within {advice.value:.0f} s'
-    return _WORDS[advice.action].format(
+    return _ACTIONS[advice.action].format(
         value=advice.value,
         mm=1e3 * advice.value,
         soon=soon,

@@ -47,7 +47,7 @@ from fisheye_svp_ros.reporting.wording.causes import (
     with_odds,
 )
 from fisheye_svp_ros.reporting.wording.decisions import (
-    bound_place,
+    bound_location,
     decision_reason,
     unconfirmed_effects,
 )
@@ -305,7 +305,7 @@ def _bound_text(decision: Decision) -> str:
             f'{bound.effect} up to {factor * bound.value:.2g} {unit}'.rstrip()
             + f' ({bound.edge_px:.2g} px, {bound.edge_mrad:.2g} mrad at the edge)'
         )
-    place = bound_place(decision.bound[0]) if decision.bound else ''
+    place = bound_location(decision.bound[0]) if decision.bound else ''
     return '; '.join(words) + (f'; {place}' if place.endswith(')') else '')
 
 
@@ -482,7 +482,7 @@ def provisional_headline(names: Sequence[str]) -> str:
     return f'Provisional: {words}' + (f' (also {", ".join(others)})' if others else '')
 
 
-def what_changed(names: Sequence[str], d: Diagnosis) -> list[str]:
+def headline_changes(names: Sequence[str], d: Diagnosis) -> list[str]:
     """Return sentences: which causes were found since, and which are none after all."""
     final = [cause.effect for cause in d.causes]
     why = {step.effect: f' ({finding_reason(step)})' for step in (*d.trace, *d.candidates)}

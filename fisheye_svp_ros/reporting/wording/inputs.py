@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fisheye_svp_ros.solve.lens_checks import Extrapolated
+from fisheye_svp_ros.solve.lens_checks import ExtrapolatedPoints
 
 _MAX_NAMES = 5
 
@@ -116,14 +116,14 @@ def compiling_first() -> str:
     )
 
 
-def compiled(state: str) -> str:
-    """Say that it has, or why not; state: of `optics.engines.compilation.Compilation`."""
+def compilation_text(state: str) -> str:
+    """Say that it has, or why not; state: of `optics.engines.cache.Compilation`."""
     if state == 'compiled':
         return 'solving with Numba from now on'
     return f'solving with NumPy: Numba has not compiled ({state})'
 
 
-def points_extrapolated(what: str, beyond: Extrapolated) -> str:
+def points_extrapolated(what: str, beyond: ExtrapolatedPoints) -> str:
     """Tell of points, or pixels, where nothing is known of the lens."""
     return (
         f'{what}: {100 * beyond.share:.2g} % lie up to '

@@ -60,7 +60,7 @@ def map_notes(
 
 def wrong_landmark_notes(landmarks: Sequence[WrongLandmark]) -> Iterator[str]:
     """Yield what to say of wrong landmarks: which, how far off, and what to do."""
-    moved = [landmark for landmark in landmarks if landmark.displaced]
+    moved = [landmark for landmark in landmarks if landmark.is_displaced]
     if moved:
         sizes = [float((landmark.offset**2).sum()) ** 0.5 for landmark in moved]
         names = [
@@ -69,18 +69,18 @@ def wrong_landmark_notes(landmarks: Sequence[WrongLandmark]) -> Iterator[str]:
         ]
         many = len(moved) > 1
         yield (
-            f'landmark{"s" if many else ""} not where x, y, z say: {_listed(names)}; rejected; '
-            f'measure {"them" if many else "it"} again'
+            f'landmark{"s" if many else ""} not where x, y, z say: {_enumerate_names(names)}; '
+            f'rejected; measure {"them" if many else "it"} again'
         )
     for landmark in landmarks:
-        if not landmark.displaced:
+        if not landmark.is_displaced:
             yield (
                 f'landmark {landmark.number}: its {landmark.points} points are {landmark.px:.3g} '
                 'px off and no other place explains them; rejected; check its number'
             )
 
 
-def _listed(names: Sequence[str]) -> str:
+def _enumerate_names(names: Sequence[str]) -> str:
     if len(names) > _MAX_NAMES:
         return f'{", ".join(names[:_MAX_NAMES])} and {len(names) - _MAX_NAMES} more'
     return ' and '.join(filter(None, (', '.join(names[:-1]), names[-1])))
