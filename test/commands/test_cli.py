@@ -524,9 +524,8 @@ class TestCalibrate:
             capsys, *sized, '--medium', '9', '--port', 'flat:-1mm'
         )
         assert "no parameter 'k1'" in refused(capsys, *sized, '--free', 'f,k1')
-        assert 's0 is confounded' in refused(capsys, *sized, '--free', 'f,s0')
         out = tmp_path / 'lens.yaml'
-        refused(capsys, *sized, '--free', 'f,s0', '-o', out)
+        assert 's0 is confounded' in refused(capsys, *sized, '--free', 'f,s0', '-o', out)
         assert not out.exists()
 
     def test_a_diagnosis_is_told_of_a_dome_in_air_alone(self, scene, capsys, tmp_path):

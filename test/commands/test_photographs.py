@@ -108,6 +108,23 @@ def test_detect_then_calibrate(
     assert lens.parameters['e0'] == pytest.approx(0.003, abs=5e-4)
 
 
+def test_a_table_of_detected_points_replaces_the_photographs(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for command in (
+        f'detect {folder} --board {BOARD} -o train.csv',
+        'calibrate train.csv --model kannala_brandt --image-size 424x400 -o lens.yaml',
+        'diagnose train.csv --lens lens.yaml --quick -o diagnosis',
+        'localize train.csv --lens diagnosis/extended_lens.yaml -o poses',
+    ):
+        assert cli.main(command.split()) == 0
+    found = json.loads(Path('diagnosis/diagnosis.json').read_text())
+    assert [cause['effect'] for cause in found['causes']] == ['viewpoint_shift']
+    rms = json.loads(Path('poses/localize.json').read_text())['rms_px']
+    assert 3 * rms < load_lens(Path('lens.yaml')).calibration['rms_px'] < 0.1
+
+
 def test_files_given_one_by_one_keep_their_names(tmp_path: Path) -> None:
     """As a shell gives them for *.png."""
     where, overlays = poses(2, 8), tmp_path / 'overlays'
