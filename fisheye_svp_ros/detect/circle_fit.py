@@ -185,63 +185,62 @@ class _Problem(WindowProblem):
         return np.asarray((np.abs(values[:, 5]) > 3) | (np.linalg.det(_matrix(values)) <= 0))
 
     def model(self, values: Array, index: Index) -> tuple[Array, Array]:
-        offset = self.cut.offset.T - values[:, None, :2]
+        offset = self.cut.offset[:, None] - values[:, :2].T[..., None]
         place, by_place = self._unbent(offset, index)
         blur = np.exp(values[:, 5:6])
         distance, by_distance = _distance(place, values[:, 2:5])
         distance = distance / blur
         shape = erf(distance / np.sqrt(2))
-        level, contrast = values[:, 6:7], values[:, 7:8]
-        light = 1 + (offset @ values[:, 8:, None])[..., 0]
+        level, contrast, gradient = values[:, 6:7], values[:, 7:8], values[:, 8:].T[..., None]
+        light = 1 + (gradient * offset).sum(axis=0)
         face = level + contrast * shape
         rise = contrast * light * _ROOT * np.exp(-0.5 * distance * distance)
-        slope = by_distance * (rise / blur)[..., None]
-        jacobian = np.empty((*shape.shape, _UNKNOWNS))
-        jacobian[..., :2] = (
-            -(slope[..., None, :2] @ by_place)[..., 0, :] - face[..., None] * values[:, None, 8:]
-        )
-        jacobian[..., 2:5] = slope[..., 2:]
-        jacobian[..., 5] = -rise * distance
-        jacobian[..., 6], jacobian[..., 7] = light, shape * light
-        jacobian[..., 8:] = face[..., None] * offset
-        return face * light, jacobian
+        slope = by_distance * (rise / blur)
+        jacobian = np.empty((_UNKNOWNS, *shape.shape))
+        jacobian[:2] = -(slope[0] * by_place[0] + slope[1] * by_place[1]) - face * gradient
+        jacobian[2:5] = slope[2:]
+        jacobian[5] = -rise * distance
+        jacobian[6], jacobian[7] = light, shape * light
+        jacobian[8:] = face * offset
+        return face * light, np.moveaxis(jacobian, 0, -1)
 
     def _unbent(self, offset: Array, index: Index) -> tuple[Array, Array]:
-        """Return offsets (A, P, 2), px, as they were without the bend, and derivatives by them."""
-        bend, onto = self._bend[index], np.linalg.inv(self._axes[index])
-        x, y = np.moveaxis(offset @ onto, -1, 0)
-        bends = np.stack([x * x / 2, x * y, y * y / 2], axis=-1) @ bend
-        by_x = np.stack([x, y], axis=-1) @ bend[:, :2]
-        by_y = np.stack([x, y], axis=-1) @ bend[:, 1:]
-        # Rows are the place's coordinates, columns the offset's.
-        change = np.stack([by_x, by_y], axis=-1) @ np.swapaxes(onto, -1, -2)[:, None]
-        return offset - bends, np.eye(2) - change
+        """Return offsets (2, A, P), px, as they were without the bend, and derivatives.
+
+        These (2, 2, A, P) are of the place's coordinates, in rows, by the offset's, in columns.
+        Planes of coordinates: a product of matrices for every pixel takes several times as long.
+        """
+        (uu, uv), (vu, vv) = np.moveaxis(np.linalg.inv(self._axes[index]), 0, -1)[..., None]
+        x, y = offset[0] * uu + offset[1] * vu, offset[0] * uv + offset[1] * vv
+        xx, xy, yy = self._bend[index].transpose(1, 2, 0)[..., None]
+        by_x, by_y = xx * x + xy * y, xy * x + yy * y
+        change = np.stack([by_x * uu + by_y * uv, by_x * vu + by_y * vv], axis=1)
+        return offset - (by_x * x + by_y * y) / 2, np.eye(2)[..., None, None] - change
 
 
 def _distance(place: Array, matrix: Array) -> tuple[Array, Array]:
-    """Return distances (A, P), px, to first order, of places (A, P, 2) from ellipses (A, 3).
+    """Return distances (A, P), px, to first order, of places (2, A, P) from ellipses (A, 3).
 
-    And derivatives (A, P, 5) by the place and by the ellipse's matrix: xx, xy, yy.
+    And derivatives (5, A, P) by the place and by the ellipse's matrix: xx, xy, yy.
     """
-    turn = matrix[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-    x = place @ turn  # on the unit circle at the edge
-    y = x @ turn
-    far = np.sqrt((x * x).sum(axis=-1) + 1e-12)
-    steep = np.sqrt((y * y).sum(axis=-1) + 1e-12)  # far over the slope of far
+    xx, xy, yy = matrix.T[..., None]
+
+    def turned(at: Array) -> Array:
+        return np.stack([at[0] * xx + at[1] * xy, at[0] * xy + at[1] * yy])
+
+    x = turned(place)  # on the unit circle at the edge
+    y = turned(x)
+    far = np.sqrt((x * x).sum(axis=0) + 1e-12)
+    steep = np.sqrt((y * y).sum(axis=0) + 1e-12)  # far over the slope of far
     by_far, by_steep = (2 * far - 1) / (steep * far), far * (1 - far) / steep**3
-    z = y @ turn
-    derivatives = np.empty((*far.shape, 5))
-    derivatives[..., :2] = by_far[..., None] * y + by_steep[..., None] * (z @ turn)
+    z = turned(y)
+    derivatives = np.empty((5, *far.shape))
+    derivatives[:2] = by_far * y + by_steep * turned(z)
     for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
         both = 0.5 if i == j else 1.0
-        by_x = x[..., i] * place[..., j] + x[..., j] * place[..., i]
-        by_y = (
-            y[..., i] * x[..., j]
-            + y[..., j] * x[..., i]
-            + z[..., i] * place[..., j]
-            + z[..., j] * place[..., i]
-        )
-        derivatives[..., 2 + k] = both * (by_far * by_x + by_steep * by_y)
+        by_x = x[i] * place[j] + x[j] * place[i]
+        by_y = y[i] * x[j] + y[j] * x[i] + z[i] * place[j] + z[j] * place[i]
+        derivatives[2 + k] = both * (by_far * by_x + by_steep * by_y)
     return far * (far - 1) / steep, derivatives
 
 
