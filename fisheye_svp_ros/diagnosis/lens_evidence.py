@@ -66,7 +66,8 @@ def compare_lens_files(evaluation: Evaluation) -> FileFigure:
     """Predict frames left out one by one with the lens as given and the extended one.
 
     The target and the offsets of its landmarks are those that the other frames predict with the
-    extended lens, for both lenses; that favours the extended one.
+    extended lens, for both lenses; that favors the extended one.  An image field that is written
+    is of the extended lens alone.
     """
     if evaluation.medium is not None:  # the lens as given is one in air
         gain = evaluation.gains['named']
@@ -87,7 +88,8 @@ def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
     at = null.columns_and_residual(shifts.columns)
     refit_rig = _rig_response(null, at[:-1])
     residual = np.zeros((*linear.residual.shape, 2))
-    rows = null.leave_one_out(at).rows
+    _, rows, fields = null.leave_one_out(at)
+    has_field = evaluation.written_field is not None and bool(evaluation.written_field.fields)
     for frame, information in enumerate(null.information_without_frames(at)):
         change, added, combination = shifts.refit(null, information)
         new = np.append(now + change - given, np.zeros(len(shifts.columns)))
@@ -95,6 +97,8 @@ def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
         off[: len(refit_rig)] -= refit_rig @ off
         residual[frame] = (rows[frame] @ combination)[:, None]
         residual[frame, :, 0] += null.fixed.border[frame][:, at[:-1]] @ off
+        if has_field:
+            residual[frame, :, 0] += fields[frame] @ combination
     even = ratio[..., None]
     left = project_out(residual * even, linear.frame_columns * even) / even
     return sum_squares(linear, left[..., 0]), sum_squares(linear, left[..., 1])

@@ -245,15 +245,19 @@ class LeaveOneOut(NamedTuple):
 
     information (G, X, X): of the border, that the group brings, in units of 1 / noise variance;
     rows (G, M, X): what is left of the border once the others have predicted units' offsets and
-    shared columns, and the group has fitted its own fixed columns.
+    shared columns, and the group has fitted its own fixed columns; fields (G, M, X): what the
+    others predict by the columns of all groups alone (`RandomColumns.shared`).
     """
 
     information: Array
     rows: Array
+    fields: Array
 
     def select(self, at: Index) -> LeaveOneOut:
         """Return the same of some of the border (m,)."""
-        return LeaveOneOut(self.information[:, at[:, None], at], self.rows[..., at])
+        return LeaveOneOut(
+            self.information[:, at[:, None], at], self.rows[..., at], self.fields[..., at]
+        )
 
 
 def leave_groups_out(
@@ -269,12 +273,13 @@ def leave_groups_out(
     e, r = (np.concatenate([root, root @ f.border], axis=1) for root in (e, r))
     group, unit, shared = eq.split(e.reshape(*f.coupled.shape[:2], r.shape[1]), r)
     roots = group, combine_offsets(random, unit, shared, eq.units), shared
-    found = LeaveOneOut(np.empty((len(border), *f.information.shape)), np.zeros_like(border))
+    found = LeaveOneOut(
+        np.empty((len(border), *f.information.shape)), np.zeros_like(border), np.zeros_like(border)
+    )
 
     def leave_out(group: int) -> None:
-        rows = found.rows[group]
-        remaining = _leave_out(f, roots, random, group, group_fixed[group], border[group], rows)
-        np.matmul(remaining.T, rows, out=found.information[group])
+        remaining = _leave_out(f, roots, random, group, group_fixed[group], border[group], found)
+        np.matmul(remaining.T, found.rows[group], out=found.information[group])
 
     map_in_threads(leave_out, range(len(border)), border.size * len(f.factor))
     return found
@@ -287,12 +292,12 @@ def _leave_out(
     group: int,
     fixed: Array,
     border: Array,
-    rows: Array,
+    left_out: LeaveOneOut,
 ) -> Array:
     """Write what the others leave of a group's rows (M, X); return it before inv(P_gg), as wide.
 
     roots: of the covariance and the predictions given the border: by group, by unit with what
-    fields add to it, shared.
+    fields add to it, shared; left_out: where rows and fields of the group are written.
     """
     used = np.flatnonzero(np.abs(fixed).sum(axis=1) + np.abs(border).sum(axis=1))
     height, found = len(fixed), np.zeros_like(border)
@@ -301,7 +306,8 @@ def _leave_out(
     )
     by_group, by_unit, by_all = roots
     shared = random.shared[group * height + used]
-    both = own @ by_group[group] + shared @ by_all[: shared.shape[1]]
+    fields = shared @ by_all[: shared.shape[1]]
+    both = own @ by_group[group] + fields
     unit = random.unit[group]
     known = np.flatnonzero(unit >= 0)
     moved = np.zeros((*random.offset.shape[1:3], both.shape[1]))
@@ -322,7 +328,11 @@ def _leave_out(
     (basis,) = group_basis(fixed[None, used])
     remaining -= basis @ (basis.T @ remaining)
     p += basis @ basis.T
-    rows[used], found[used] = np.linalg.solve(p, remaining), remaining
+    left, found[used] = np.linalg.solve(p, remaining), remaining
+    left_out.rows[group, used] = left
+    if shared.shape[1]:  # what the group itself adds to the prediction by all is taken away
+        by_root, by_border = np.split(fields, [len(f.factor)], axis=1)
+        left_out.fields[group, used] = by_border - by_root @ (root.T @ left)
     return found
 
 

@@ -64,6 +64,17 @@ def test_a_warp_is_written_and_brings_the_rays_nearer_to_the_truth(
     assert 'image field' in verdict_sentences(found)[1]
 
 
+@pytest.mark.parametrize(('seed', 'length'), [(0, 380.0), (1, 900.0)])
+def test_a_field_that_is_written_counts_for_the_lens_that_has_it(seed: int, length: float) -> None:
+    """The lens as given was lent the field: no gain, however large the warp."""
+    found = diagnosed(0.3, seed, length)
+    field = found.evaluation.written_field
+    assert field is not None and field.fields
+    assert found.file.low > 0 and found.offers_extended
+    # The lens as given took up some of the warp.
+    assert found.file.extended_px < 0.9 * found.file.given_px < field.before
+
+
 def true_directions(uv: np.ndarray, length: float) -> np.ndarray:
     """Return directions that the true, warped lens sees at image points."""
     ideal = uv

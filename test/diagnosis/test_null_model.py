@@ -377,6 +377,8 @@ def test_a_frame_left_out_is_as_if_it_had_never_been(by_group):
     left = linear.residual[3] - moved - random.shared_columns[3 * height : 4 * height] @ shared
     left -= pose[3] @ np.linalg.lstsq(pose[3], left, rcond=1e-9)[0]
     np.testing.assert_allclose(found.rows[3] @ way, left, atol=1e-5 * np.abs(left).max())
+    field = random.shared[3 * height : 4 * height] @ shared[: random.shared.shape[1]]
+    np.testing.assert_allclose(found.fields[3] @ way, field, atol=1e-5 * np.abs(field).max())
 
 
 def test_variances_that_were_put_in_come_out():
