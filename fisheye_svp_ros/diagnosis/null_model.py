@@ -46,6 +46,7 @@ from fisheye_svp_ros.mixed_model import (
     leave_groups_out,
     make_equations,
     no_variances,
+    remove_contradicted,
 )
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, is_shared
 
@@ -126,7 +127,12 @@ class NullModel:
         before: variances to start from; left_out: effects; finest: with the finest image field.
         """
         bare = cls._linearize(data, state, free, left_out, finest)
-        return bare._with_priors(find_variances(bare._all_free(), before))
+        all_free = bare._all_free()
+        variances = find_variances(all_free, before)
+        own = bare.equations_of(bare.included_columns)
+        return bare._with_priors(
+            remove_contradicted(all_free.select(variances.alive), own, variances)
+        )
 
     @classmethod
     def with_variances(

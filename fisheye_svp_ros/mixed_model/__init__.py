@@ -36,6 +36,7 @@ from fisheye_svp_ros.mixed_model.reml import (
     find_variances,
     initial_variances,
     is_called_for,
+    remove_contradicted,
     unit_labels,
 )
 from fisheye_svp_ros.mixed_model.score_tests import (
@@ -96,6 +97,7 @@ __all__ = [
     'predict_rows',
     'project_out',
     'pseudo_inverse',
+    'remove_contradicted',
     'satterthwaite_freedom',
     'score_columns',
     'score_components',

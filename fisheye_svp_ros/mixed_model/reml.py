@@ -219,6 +219,24 @@ def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
     return _remove_chance(eq.select(now.alive), now)
 
 
+def remove_contradicted(eq: Equations, fewer: Equations, now: Variances) -> Variances:
+    """Switch off components that a model with fewer fixed columns is likelier without.
+
+    eq: equations that `now` was estimated with; fewer: those of what is in the model alone.  Where
+    all that may be fixed leaves few numbers to a component of few groups, its variance can be
+    anything; what is not in the model can only widen it there.
+    """
+    while True:
+        kinds = np.intersect1d(_uncertain_components(now), np.flatnonzero(~eq.components.of_units))
+        if not len(kinds):
+            return now
+        ratios = _deviance_ratios(_solve_whole(fewer, now), kinds)
+        kind = min(ratios, key=ratios.__getitem__)
+        if ratios[kind] >= 0:
+            return now
+        now, eq = estimate_variances(eq, now.without_component(kind), _WARM_STEPS)
+
+
 def is_called_for(eq: Equations, now: Variances, kind: int) -> bool:
     """Return whether the data call for one more component beside those that are there."""
     return bool(score_components(eq, now, [kind], _ADDITION_P)[kind] < _ADDITION_P)

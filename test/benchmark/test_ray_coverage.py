@@ -13,6 +13,13 @@ def test_the_extended_lens_of_a_trial_is_nearer_to_the_truth() -> None:
     assert (one.true[0] < one.plain).all() and one.ratios[2] < 0.9 < one.ratios[0]
 
 
+def test_six_frames_have_no_focal_lengths_of_their_own() -> None:
+    """Stated were 5 to 17 mrad of both lenses, 10 to 36 times the true errors of the second."""
+    one = trial(3)
+    assert one.few and one.warped and one.offered
+    assert (one.value < 2 * one.true).all() and not one.outside[0].any()
+
+
 def test_the_page_counts_what_is_outside_and_what_is_worse() -> None:
     size = np.full((2, 3), 0.2)
     better = Outcome(
