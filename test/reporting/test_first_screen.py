@@ -99,6 +99,25 @@ def test_a_size_within_its_error_is_called_so(found: Diagnosis) -> None:
     assert size(found, _tilt(0.005, 0.002)) == 'x = 0.29 ± 0.11 deg'
 
 
+def test_a_confounded_set_without_a_size_says_what_is_open(found: Diagnosis) -> None:
+    """Once "sensor_tilt (89 %) or dome_port (11 %) (likely, more than 99 %: size within ...)"."""
+    tilt = replace(
+        _tilt(-0.0005, 0.002),
+        indistinguishable_from=['dome_port'],
+        odds={'sensor_tilt': 0.89, 'dome_port': 0.11},
+    )
+    alike = replace(found, causes=[tilt])
+    table = (
+        'sensor_tilt (89 %) or dome_port (11 %) (likely, more than 99 %: one of them is there, '
+        'how large each is remains open: x = -0.03 ± 0.11 deg)'
+    )
+    assert first_screen(alike, 'table').causes == table
+    assert headline(alike).startswith(
+        'The sensor is tilted, 89 % sure, or it is dome_port (11 %): one of them is there '
+        '(likely, more than 99 %), how large each is remains open. '
+    )
+
+
 def test_the_headline_says_that_the_target_is_imperfect_too(found: Diagnosis) -> None:
     """The decision was to measure the target again, and the headline spoke of the lens alone."""
     offsets = Figure('local_offsets', 0.38, 'px')

@@ -72,6 +72,8 @@ COMPONENTS = {
     'frame_similar': 'landmarks in similar views',
     'noise': 'noise of image points',
 }
+# Of a confounded set: with another one in its place, each may be nothing.
+ONE_IS_THERE, SIZE_OPEN = 'one of them is there', 'how large each is remains open'
 _MAX_LANDMARKS = 6  # landmarks named in a row
 
 
@@ -139,8 +141,11 @@ def size(diagnosis: Diagnosis, cause: Cause) -> str:
     text = ', '.join(f'{name} = {quantity(shown[name])}' for name in shown if name in largest)
     text += f' and {len(shown) - len(largest)} more' if len(shown) > len(largest) else ''
     errors = [entry['stderr'] for entry in shown.values()]
-    within = any(errors) and all(_significance(entry) < 1 for entry in shown.values())
-    return f'size within its error: {text}' if within else text
+    if not any(errors) or any(_significance(entry) >= 1 for entry in shown.values()):
+        return text
+    if cause.indistinguishable_from:
+        return f'{ONE_IS_THERE}, {SIZE_OPEN}: {text}'
+    return f'size within its error: {text}'
 
 
 def most_significant(parameters: Mapping[str, Mapping[str, Any]], least: float) -> str:

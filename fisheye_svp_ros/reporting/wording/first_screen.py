@@ -36,6 +36,8 @@ from fisheye_svp_ros.reporting.wording.adequacy import (
 from fisheye_svp_ros.reporting.wording.causes import (
     COMPONENTS,
     HUMAN_UNITS,
+    ONE_IS_THERE,
+    SIZE_OPEN,
     belief,
     chance,
     describe_effect,
@@ -434,8 +436,7 @@ def _sentence(d: Diagnosis, cause: Cause) -> str:
     if is_assumed(d, cause):
         doubt = ' (assumed, not significant)' if cause.p_value > NAMED_P else ''
     else:
-        confirmed = cause.status is Status.CONFIRMED
-        doubt = '' if confirmed else f' ({belief(cause.status, cause.probability)})'
+        doubt = _doubt(cause)
     likeliest = max(cause.odds, key=lambda name: cause.odds[name], default=cause.effect)
     if likeliest != cause.effect:
         words = COMPONENTS.get(likeliest) or describe_effect(likeliest)
@@ -447,8 +448,18 @@ def _sentence(d: Diagnosis, cause: Cause) -> str:
     if cause.odds.get(cause.effect, 1.0) < CONFIRMED_PROBABILITY:
         others = ' or '.join(with_odds(cause, name) for name in cause.indistinguishable_from)
         sure = chance(cause.odds[cause.effect])
-        doubt += f', {sure} sure, or it is {others}'
+        doubt = f', {sure} sure, or it is {others}{doubt}'
     return _statement(d, cause) + doubt
+
+
+def _doubt(cause: Cause) -> str:
+    """Return how probable a cause is that is not confirmed; of a confounded set, what is open."""
+    if cause.status is Status.CONFIRMED:
+        return ''
+    words = belief(cause.status, cause.probability)
+    if cause.is_within_error and cause.indistinguishable_from:
+        return f': {ONE_IS_THERE} ({words}), {SIZE_OPEN}'
+    return f' ({words})'
 
 
 def _statement(d: Diagnosis, cause: Cause) -> str:
