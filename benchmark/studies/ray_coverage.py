@@ -64,6 +64,12 @@ class Outcome(NamedTuple):
         """Which true errors (2, 2, R) lie below and which above their intervals."""
         return np.stack([self.true < self.low, self.true > self.high], axis=1)
 
+    @property
+    def gain(self) -> float:
+        """The error of the lens as calibrated over that of the extended one, all ranges."""
+        given, extended = np.sqrt((self.true**2).mean(axis=1))
+        return float(given / extended)
+
 
 def trial(number: int) -> Outcome:
     """Calibrate and diagnose one set: of four, two have few frames and two a warp."""
@@ -156,12 +162,14 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
         'all': list(outcomes),
         'those offered': [one for one in outcomes if one.offered],
     }.items():
-        rms = np.sqrt([(one.true**2).mean(axis=1) for one in some]).reshape(-1, 2)
         lines += [
             '',
             f'More than 10 % worse than the lens as calibrated, of {name}: '
-            f'{int((rms[:, 1] > 1.1 * rms[:, 0]).sum())} of {len(some)}.',
+            f'{sum(one.gain < 1 / 1.1 for one in some)} of {len(some)}.',
         ]
+    twice = [one for one in outcomes if one.gain >= 2]
+    missed = sum(not one.offered for one in twice)
+    lines += ['', f'Not offered, of those at least twice as good: {missed} of {len(twice)}.']
     return '\n'.join([*lines, '', *_boards_table(outcomes), ''])
 
 

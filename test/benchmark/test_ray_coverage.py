@@ -41,4 +41,7 @@ def test_the_page_counts_what_is_outside_and_what_is_worse() -> None:
     )
     assert 'of all: 1 of 2.' in '\n'.join(lines)
     assert 'of those offered: 0 of 1.' in '\n'.join(lines)
+    missed = better._replace(offered=False)
+    page = report([better, missed, worse], 'command')
+    assert 'Not offered, of those at least twice as good: 1 of 2.' in page
     assert '| landmarks off | 5 to 8 | 2 | 0.50 | 0.50 to 0.50 |' in lines
