@@ -61,7 +61,7 @@ CLAIMS = (
     Claim(
         'Stated ray errors hold',
         'ray_coverage',
-        r'\| all \| \d+ \| \d+ % \| (\d+) % \|.*?\| \d+ % \| (\d+) % \| \d+ % \| 0\.\d+ \| 0',
+        r'\| all \| \d+ \| \d+ % \| (\d+) % \|.*?\| \d+ % \| (\d+) % \| \d+ % \| \d\.\d+ \| \d\.',
         '{0} % (given lens) and {1} % (extended) within their 95 % intervals',
         'the truth',
         'make study NAME=ray_coverage',
