@@ -97,7 +97,8 @@ class Variances:
 
     def with_equal_weights(self, of_units: Mask) -> Variances:
         """Return the same without a scale for each unit: offsets are as large in the mean."""
-        more = np.where(of_units & self.alive, np.mean(1 / self.weight), 1.0)
+        mean = np.mean(1 / self.weight) if len(self.weight) else 1.0
+        more = np.where(of_units & self.alive, mean, 1.0)
         return replace(self, lam=self.lam / more, weight=np.ones_like(self.weight))
 
     def without_component(self, kind: int) -> Variances:

@@ -50,7 +50,9 @@ _INITIAL_SHARE = 0.02  # of the noise
 _REMOVAL_P = 0.05
 _UNCERTAIN_LOG = 0.3  # standard error of log tau^2 above which a component may be chance
 _WARM_STEPS = 6  # from the variances of a similar state
-_UNDECIDED_RATIOS = (2.7, 25.0)  # likelihood ratios between which the other variances follow
+# Likelihood ratios between which the other variances follow; beyond the last they take up no such
+# part that a component would be removed.
+_UNDECIDED_RATIOS, _REMOVABLE_RATIO = (2.7, 25.0), 10.0
 
 
 def initial_variances(eq: Equations, share: float = 0.03) -> Variances:
@@ -269,7 +271,8 @@ def _remove_chance(eq: Equations, now: Variances) -> Variances:
         whole = _solve_whole(eq, now)
         ratios = _deviance_ratios(whole, uncertain)
         if _boundary_p_value(min(ratios.values())) <= _REMOVAL_P:
-            ratios = _follow_variances(eq, now, whole, ratios)
+            doubtful = {kind: ratio for kind, ratio in ratios.items() if ratio < _REMOVABLE_RATIO}
+            ratios |= _follow_variances(eq, now, whole, doubtful)
         kind = min(ratios, key=ratios.__getitem__)
         if _boundary_p_value(ratios[kind]) <= _REMOVAL_P:
             break
@@ -312,16 +315,26 @@ def _follow_variances(
 ) -> dict[int, float]:
     """Return likelihood ratios once the other variances have taken up what they can.
 
-    They only ever take up a part of it, so that only undecided ones are asked for.
+    They only ever take up a part of it, so that only undecided ones are asked for.  The variances
+    need not be the best of these equations: with all components they take the same step.
     """
 
-    def follow(kind: int) -> float:
-        after = _step_without(eq, now, whole, kind)
-        f = factor_equations(eq.select(after.alive), after.lam, after.weight)
-        return solve_equations(f).deviance - whole.solution.deviance
+    def deviance(after: Variances) -> float:
+        after = replace(after, weight=now.weight)  # or likelihoods of different data are compared
+        return solve_equations(
+            factor_equations(eq.select(after.alive), after.lam, after.weight)
+        ).deviance
 
     low, high = _UNDECIDED_RATIOS
     undecided = [kind for kind, ratio in ratios.items() if low < ratio < high]
+    if not undecided:
+        return ratios
+    before = whole.solution.deviance
+    best = min(before, deviance(update_variances(whole.factored, whole.solution, now)))
+
+    def follow(kind: int) -> float:
+        return min(before + ratios[kind], deviance(_step_without(eq, now, whole, kind))) - best
+
     followed = map_in_threads(follow, undecided, len(undecided) * whole.factored.products)
     return ratios | dict(zip(undecided, followed, strict=True))
 

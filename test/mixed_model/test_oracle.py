@@ -9,6 +9,7 @@ from scipy import sparse
 from fisheye_svp_ros.mixed_model import (
     Components,
     RandomColumns,
+    component_p_values,
     estimate_variances,
     factor_equations,
     initial_variances,
@@ -191,3 +192,15 @@ def test_a_component_that_begins_at_next_to_nothing_grows(kind):
 
 def test_nothing_has_no_rank():
     assert pseudo_inverse(np.zeros((0, 0))).shape == (0, 0)
+
+
+@pytest.mark.parametrize('factor', [0.1, 8.0])
+@pytest.mark.parametrize('seed', [1, 3, 5])
+def test_variances_that_are_not_the_best_hide_no_component(seed, factor):
+    """What other variances gain by a step, they gain with the component as well."""
+    _, eq, _ = equations_of(*growth_curves(seed))
+    best = converged(eq)
+    far = replace(best, lam=best.lam * [factor, 1.0])
+    p, expected = (component_p_values(eq, now)[1] for now in (far, best))
+    assert expected < 0.001
+    assert p < 3 * expected
