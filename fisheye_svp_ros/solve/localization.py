@@ -8,6 +8,7 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics import engines
+from fisheye_svp_ros.optics.engines.marquardt import MAX_ITERATIONS
 from fisheye_svp_ros.optics.engines.results import PLANARITY
 from fisheye_svp_ros.optics.engines.results import Localization as Localization
 from fisheye_svp_ros.pose import Pose
@@ -22,6 +23,7 @@ from fisheye_svp_ros.solve.least_squares import (
 )
 
 MIN_POINTS, FEW_POINTS = 4, 6
+_STARTING_STEPS = 4  # from rough poses to ones that a joint solution can begin with
 _MOTIONS = 3  # times that velocities and poses follow from each other
 _MIN_SEPARATION = 0.01  # squared Mahalanobis distance of two minima
 _UNDETERMINED_EIGENVALUE = 1e-13  # of the information, relative; rounding leaves about 1e-15
@@ -49,6 +51,28 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
             break
         solution = _localize(still, views._replace(uv=views.uv - moved), solution.pose)
     return solution
+
+
+def nearly_localize(model: ForwardModel, views: Views) -> tuple[Pose, Mask]:
+    """Return poses (S,) that a joint solution can begin with, and which of them are determined.
+
+    As `localize`, but only a few steps from rough poses and their mirror images, all at once.
+    Raises GeometryError, naming the frame, for fewer than MIN_POINTS usable points.
+    """
+    model = model.seeing(views)
+    few = (views.weight > 0).sum(axis=1) < FEW_POINTS
+    if few.any() or model.without_motion() is not model:
+        solved = localize(model, views)
+        return solved.pose, solved.converged
+    rough, count = start_poses(model, views), len(views.frame)
+    flat, centre, normal = _flat_targets(views)
+    start, rows = rough.take(np.append(np.arange(count), flat)), np.append(np.arange(count), flat)
+    start.put(np.arange(count, len(rows)), _mirror_image(rough.take(flat), centre, normal))
+    solved, _ = _solve_from(model, views.take(rows), start, _STARTING_STEPS)
+    cost = np.where(solved.converged, solved.cost, np.inf)
+    best, mirrored = np.arange(count), np.arange(count, len(rows))
+    best[flat] = np.where(cost[mirrored] < cost[flat], mirrored, flat)
+    return solved.pose.take(best), solved.converged[best]
 
 
 def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localization:
@@ -103,13 +127,18 @@ def _improve(
     localization.gap[rows] = np.maximum(costs[second] - base, 0.0)
 
 
-def _solve_from(model: ForwardModel, views: Views, start: Pose) -> tuple[Localization, bool]:
-    """Solve from these starts alone; return also whether any target may be flat."""
+def _solve_from(
+    model: ForwardModel, views: Views, start: Pose, steps: int | None = None
+) -> tuple[Localization, bool]:
+    """Solve from these starts alone; return also whether any target may be flat.
+
+    steps: after which the reference is near enough; None: it converges.
+    """
     quick = None
     if model.is_lens_only:
         quick = engines.localize(model.lens, views.solver_inputs, views.row, MIN_POINTS, start)
     if quick is None:
-        return _by_reference(model, views, start), True
+        return _by_reference(model, views, start, steps), True
     found, remaining, flat = quick
     if remaining:
         rest = np.flatnonzero(~found.converged)
@@ -117,12 +146,15 @@ def _solve_from(model: ForwardModel, views: Views, start: Pose) -> tuple[Localiz
     return found, flat > 0
 
 
-def _by_reference(model: ForwardModel, views: Views, start: Pose) -> Localization:
+def _by_reference(
+    model: ForwardModel, views: Views, start: Pose, steps: int | None = None
+) -> Localization:
     check_views(views, MIN_POINTS)
-    solved = levenberg_marquardt(_Localization(model, views), tuple(start))
+    most = MAX_ITERATIONS if steps is None else steps
+    solved = levenberg_marquardt(_Localization(model, views), tuple(start), most)
     pose = Pose(*solved.state)
     covariance, fixed = _covariance(solved.normal[0])
-    fixed &= solved.converged
+    fixed &= solved.converged | (solved.iterations == steps)
     covariance[~fixed] = np.nan
     return Localization.of_one_minimum(
         pose, covariance, residuals(model, pose, views), solved.cost, fixed, solved.iterations

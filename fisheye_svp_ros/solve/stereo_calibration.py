@@ -20,7 +20,12 @@ from fisheye_svp_ros.solve.least_squares import (
     arrow_step,
     levenberg_marquardt,
 )
-from fisheye_svp_ros.solve.localization import MIN_POINTS, localize, pose_equations, residuals
+from fisheye_svp_ros.solve.localization import (
+    MIN_POINTS,
+    nearly_localize,
+    pose_equations,
+    residuals,
+)
 
 _MEAN_ROUNDS = 6
 
@@ -183,7 +188,7 @@ def _starts(
 def _localize_sides(
     models: tuple[ForwardModel, ForwardModel], sides: tuple[Views, Views]
 ) -> list[tuple[Pose, Mask]]:
-    """Localize the views of both cameras, together where these have one lens."""
+    """Nearly localize the views of both cameras, together where these have one lens."""
     left, right = models
     if left is not right and not (
         left.is_lens_only and right.is_lens_only and left.lens == right.lens
@@ -195,14 +200,14 @@ def _localize_sides(
 
 
 def _localize_posable(model: ForwardModel, views: Views) -> tuple[Pose, Mask]:
-    """Localize the views (S,) that have enough points; return also which of them have a pose."""
+    """Nearly localize views (S,) that have enough points; return also which have a pose."""
     inside = model.back_project(views.uv).valid & (views.weight > 0)
     posed: Mask = inside.sum(axis=1) >= MIN_POINTS
     pose = identity(len(views.frame))
     if posed.any():
-        solved = localize(model, views.take(posed))
-        pose.put(posed, solved.pose)
-        posed[posed] = solved.converged
+        near, determined = nearly_localize(model, views.take(posed))
+        pose.put(posed, near)
+        posed[posed] = determined
     return pose, posed
 
 
