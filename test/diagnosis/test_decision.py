@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.diagnoses import TARGET
 
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.conclusion import Action, _largest_error, _measure_landmarks
@@ -19,7 +20,6 @@ from fisheye_svp_ros.diagnosis.decision import (
     PhotographsFacts,
     PhotographsReason,
     TargetError,
-    TargetFacts,
     TargetReason,
     decide_lens,
     decide_photographs,
@@ -103,19 +103,6 @@ def test_an_error_that_rises_on_the_fitted_frames_recommends_nothing() -> None:
     )
     found = decide_lens(facts)
     assert found.say == 'undecided' and found.confidence == 0.0
-
-
-TARGET = TargetFacts(
-    largest=TargetError('target_shape', 0.81e-3, board=0),
-    gain=(0.82, 0.76, 1.0),
-    named_px=0.137,
-    local_px=0.05,
-    local_m=4e-5,
-    local_p=1e-6,
-    noise_px=0.043,
-    contradicted=False,
-    frames=12,
-)
 
 
 def test_the_target_is_judged_apart() -> None:

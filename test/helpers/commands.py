@@ -6,10 +6,13 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
 from fisheye_svp_ros import cli
+from fisheye_svp_ros.io.lens_files import save_lens
+from fisheye_svp_ros.optics.lens import Lens
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
@@ -20,6 +23,13 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     said = [line for line in lines if not line.endswith('%)')]  # without progress
     assert len(said) == 1
     return said[0]
+
+
+def convert_lens(lens: Lens, folder: Path, name: str, form: str) -> None:
+    """Have `lens` write a lens into a file of another tool, and lens.yaml beside it."""
+    save_lens(lens, folder / 'lens.yaml')
+    files = [str(folder / 'lens.yaml'), '-o', str(folder / name)]
+    assert cli.main(['lens', *files, '--format', form]) == 0
 
 
 @contextmanager

@@ -1,8 +1,22 @@
-"""Diagnoses with other figures than those that were found."""
+"""Diagnoses with other figures than those that were found; facts that decisions rest on."""
 
 from dataclasses import replace
 
+from fisheye_svp_ros.diagnosis.decision import TargetError, TargetFacts
 from fisheye_svp_ros.diagnosis.evaluation import Figures
+
+# A bent board, whose correction is well determined.
+TARGET = TargetFacts(
+    largest=TargetError('target_shape', 0.81e-3, board=0),
+    gain=(0.82, 0.76, 1.0),
+    named_px=0.137,
+    local_px=0.05,
+    local_m=4e-5,
+    local_p=1e-6,
+    noise_px=0.043,
+    contradicted=False,
+    frames=12,
+)
 
 
 def with_changes(found, **changes):

@@ -16,6 +16,15 @@ from rclpy.node import Node  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402  # isort: skip
+from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402  # isort: skip
+from sensor_msgs.msg import PointCloud2  # noqa: E402  # isort: skip
+
+from fisheye_svp_ros.io.decoding import stamp_of  # noqa: E402
+from fisheye_svp_ros.io.landmark_files import environment  # noqa: E402
+from fisheye_svp_ros.nodes import messages  # noqa: E402
+from fisheye_svp_ros.nodes.localizer import Localizer  # noqa: E402
+
 RELIABLE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -76,6 +85,32 @@ class Graph:
             node.destroy_node()
         self.executor.shutdown()
         rclpy.try_shutdown()
+
+
+class FedLocalizer:
+    """A localizer that gets the landmarks of Kita's environment, and image points set by set."""
+
+    def __init__(self, g: Graph) -> None:
+        self.graph = g
+        self.results = g.hear(DiagnosticArray, 'localizer/result')
+        self.poses = g.hear(PoseWithCovarianceStamped, 'localizer/pose')
+        self.reports = g.hear(DiagnosticArray, '/diagnostics')
+        self.node = g.start(Localizer)
+        self.landmarks = g.tell(PointCloud2, 'landmarks', LATCHED)
+        self.points = g.tell(PointCloud2, 'image_points')
+        g.until(lambda: self.node._result.get_subscription_count() > 0)
+        self.landmarks.publish(messages.landmarks_message(environment('whole', 2.0), 0, 'map'))
+
+    def feed(self, stamp: int, landmark: Any, uv: Any, frame: str) -> None:
+        """Publish a set of image points."""
+        self.points.publish(messages.image_points_message(landmark, uv, stamp, frame))
+
+    def status(self, stamp: int) -> Any:
+        """Return the result of a set, once it is there."""
+        result = self.graph.until(
+            lambda: next((m for m in self.results if stamp_of(m) == stamp), None)
+        )
+        return result.status[0]
 
 
 def set_parameter(node: Any, name: str, value: Any) -> Any:

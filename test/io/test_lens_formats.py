@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from helpers.commands import convert_lens
 from helpers.data import DATA, NO_DATA
 from helpers.lenses import FRONT, SHORT
 
@@ -536,20 +537,7 @@ def test_curves_that_a_form_cannot_say() -> None:
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    save_lens(SHORT, tmp_path / 'lens.yaml')
-    assert (
-        cli.main(
-            [
-                'lens',
-                str(tmp_path / 'lens.yaml'),
-                '-o',
-                str(tmp_path / 'ros.yaml'),
-                '--format',
-                'ros',
-            ]
-        )
-        == 0
-    )
+    convert_lens(SHORT, tmp_path, 'ros.yaml', 'ros')
     said = capsys.readouterr().out
     assert 'left out: the viewpoint shift\n' in said
     assert '0.1 m' in said
@@ -571,20 +559,7 @@ def test_command_says_how_much_is_lost_with_corrections(
         corrections={'sensor_tilt': {'parameters': {'about_x': 0.002, 'about_y': 0.0}}},
         target={'landmarks': [[0, 0, 0.0, 0.0, 0.0]]},
     )
-    save_lens(tilted, tmp_path / 'lens.yaml')
-    assert (
-        cli.main(
-            [
-                'lens',
-                str(tmp_path / 'lens.yaml'),
-                '-o',
-                str(tmp_path / 'kalibr.yaml'),
-                '--format',
-                'kalibr',
-            ]
-        )
-        == 0
-    )
+    convert_lens(tilted, tmp_path, 'kalibr.yaml', 'kalibr')
     said = capsys.readouterr().out
     assert 'left out: sensor_tilt\n' in said
     off = f'{400 * 0.002 * np.radians(40) ** 2:.3f}'

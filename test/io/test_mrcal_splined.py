@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.commands import convert_lens
 from helpers.lenses import FRONT, SHORT
 
-from fisheye_svp_ros import cli
 from fisheye_svp_ros.effects.forward import back_project_corrected, project_corrected
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
@@ -119,38 +119,13 @@ def test_a_broken_splined_model_is_refused(old: str, new: str, said: str, tmp_pa
 def test_command_shows_an_image_field_and_what_a_form_loses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    save_lens(with_smooth_field(FRONT), tmp_path / 'lens.yaml')
-    assert (
-        cli.main(
-            [
-                'lens',
-                str(tmp_path / 'lens.yaml'),
-                '-o',
-                str(tmp_path / 'ros.yaml'),
-                '--format',
-                'ros',
-            ]
-        )
-        == 0
-    )
+    convert_lens(with_smooth_field(FRONT), tmp_path, 'ros.yaml', 'ros')
     said = capsys.readouterr().out
     assert re.search(
         r'^  image_field +0\.4\d* px rms, splines of 18 x 17 nodes$', said, re.MULTILINE
     )
     assert 'left out: image_field\n' in said
-    assert (
-        cli.main(
-            [
-                'lens',
-                str(tmp_path / 'lens.yaml'),
-                '-o',
-                str(tmp_path / 'x.cameramodel'),
-                '--format',
-                'mrcal',
-            ]
-        )
-        == 0
-    )
+    convert_lens(with_smooth_field(FRONT), tmp_path, 'x.cameramodel', 'mrcal')
     assert 'left out' not in capsys.readouterr().out
 
 
@@ -167,19 +142,6 @@ def test_command_shows_an_image_field_and_what_a_form_loses(
 def test_only_what_mrcal_does_not_hold_is_left_out(
     lens: Lens, said: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    save_lens(lens, tmp_path / 'lens.yaml')
-    assert (
-        cli.main(
-            [
-                'lens',
-                str(tmp_path / 'lens.yaml'),
-                '-o',
-                str(tmp_path / 'x.cameramodel'),
-                '--format',
-                'mrcal',
-            ]
-        )
-        == 0
-    )
+    convert_lens(lens, tmp_path, 'x.cameramodel', 'mrcal')
     lines = [line for line in capsys.readouterr().out.splitlines() if 'left out' in line]
     assert lines == ([said] if said else [])

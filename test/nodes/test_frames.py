@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
-from helpers.graph import LATCHED, Graph
+from helpers.graph import LATCHED, FedLocalizer, Graph
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # isort: skip
+from geometry_msgs.msg import PoseStamped  # isort: skip
 from geometry_msgs.msg import TransformStamped  # isort: skip
 from sensor_msgs.msg import CameraInfo, PointCloud2  # isort: skip
 
-from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
+from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.optics.curves import kannala_brandt_equivalent
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
@@ -30,29 +28,11 @@ SEEN = simulate_scenario(Scenario(shift_scale=0.0)).observations
 SOLVING = ('lens:=fish214', 'svp:=true')
 
 
-class Framed:
+class Framed(FedLocalizer):
     """A localizer, and inputs of different frames."""
 
-    def __init__(self, g: Graph) -> None:
-        self.graph = g
-        self.results = g.hear(DiagnosticArray, 'localizer/result')
-        self.poses = g.hear(PoseWithCovarianceStamped, 'localizer/pose')
-        self.reports = g.hear(DiagnosticArray, '/diagnostics')
-        self.node = g.start(Localizer)
-        self.landmarks = g.tell(PointCloud2, 'landmarks', LATCHED)
-        self.points = g.tell(PointCloud2, 'image_points')
-        g.until(lambda: self.node._result.get_subscription_count() > 0)
-        self.landmarks.publish(messages.landmarks_message(environment('whole', 2.0), 0, 'map'))
-
     def tell(self, stamp: int, frame: str) -> None:
-        message = messages.image_points_message(SEEN.landmark, SEEN.uv, stamp, frame)
-        self.points.publish(message)
-
-    def status(self, stamp: int) -> Any:
-        found = self.graph.until(
-            lambda: next((m for m in self.results if stamp_of(m) == stamp), None)
-        )
-        return found.status[0]
+        self.feed(stamp, SEEN.landmark, SEEN.uv, frame)
 
 
 @pytest.mark.parametrize('frame', ['odom', 'map', '/map', ''])

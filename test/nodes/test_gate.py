@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.graph import LATCHED, Graph, set_parameter
+from helpers.graph import LATCHED, FedLocalizer, Graph, set_parameter
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
-from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped  # isort: skip
+from geometry_msgs.msg import TransformStamped  # isort: skip
 from sensor_msgs.msg import PointCloud2  # isort: skip
 
 from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
@@ -20,7 +20,6 @@ from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.recording import note_of_set
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.solver import exchange_reason
 from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
@@ -41,27 +40,12 @@ def longer(factor: float) -> np.ndarray:
     return center + factor * (SEEN.uv - center)
 
 
-class Driven:
+class Driven(FedLocalizer):
     """A localizer that a robot drives by."""
 
-    def __init__(self, g: Graph) -> None:
-        self.graph = g
-        self.results = g.hear(DiagnosticArray, 'localizer/result')
-        self.poses = g.hear(PoseWithCovarianceStamped, 'localizer/pose')
-        self.reports = g.hear(DiagnosticArray, '/diagnostics')
-        self.node = g.start(Localizer)
-        self.landmarks = g.tell(PointCloud2, 'landmarks', LATCHED)
-        self.points = g.tell(PointCloud2, 'image_points')
-        g.until(lambda: self.node._result.get_subscription_count() > 0)
-        self.landmarks.publish(messages.landmarks_message(environment('whole', 2.0), 0, 'map'))
-
     def tell(self, stamp: int, uv: Any) -> Any:
-        message = messages.image_points_message(SEEN.landmark, uv, stamp, 'camera')
-        self.points.publish(message)
-        found = self.graph.until(
-            lambda: next((m for m in self.results if stamp_of(m) == stamp), None)
-        )
-        return found.status[0]
+        self.feed(stamp, SEEN.landmark, uv, 'camera')
+        return self.status(stamp)
 
 
 def test_the_warning_of_a_result_is_on_diagnostics_and_in_the_log(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from helpers.diagnoses import TARGET
 
 from fisheye_svp_ros.diagnosis import (
     Action,
@@ -43,17 +44,6 @@ LENS = LensFacts(
     bounds=[EffectBound('viewpoint_shift', 0.0092, 'm', 2.6, 0.32, 0.58)],
     noise_px=0.05,
     falling=True,
-    frames=12,
-)
-TARGET = TargetFacts(
-    largest=TargetError('target_shape', 0.81e-3, board=0),
-    gain=(0.82, 0.76, 1.0),
-    named_px=0.137,
-    local_px=0.05,
-    local_m=4e-5,
-    local_p=1e-6,
-    noise_px=0.043,
-    contradicted=False,
     frames=12,
 )
 PHOTOGRAPHS = PhotographsFacts(26, ['1.jpg'], ['1.jpg'], 0.9, 0.09, 'keep', is_target_off=True)
