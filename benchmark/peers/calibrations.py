@@ -14,8 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmark.peers.scoring import Project
-from benchmark.peers.sets import Grid, Set, one_board_a_frame
+from benchmark.peers.sets import Grid, Project, Set, one_board_a_frame
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.scene.observations import Observations
 

@@ -38,12 +38,13 @@ from benchmark.peers.halves import (  # noqa: E402
     simulated_errors,
 )
 from benchmark.peers.python_calibrations import PYTHON_PEERS  # noqa: E402
-from benchmark.peers.scoring import residuals, rms  # noqa: E402
 from benchmark.peers.sets import (  # noqa: E402
     BOARDS,
     Set,
     grid_of,
     photograph_set,
+    residuals,
+    rms,
     table_set,
 )
 from fisheye_svp_ros.arrays import Array, Mask  # noqa: E402

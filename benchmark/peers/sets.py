@@ -1,11 +1,13 @@
-"""The sets of a comparison: tables to fit and to hold out, and boards as regular grids."""
+"""The sets of a comparison, boards as regular grids, and how held-out points are scored."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.detection import detect
@@ -13,11 +15,14 @@ from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import find_photographs
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.readers import read_observations
+from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 
 BOARDS = 1000  # more than boards in a frame
 _ROUGHNESS = 0.02  # of the spacing: how far a point of a grid may be from its place
 _HELD_OUT = 3  # of so many photographs one is held out
+_LOST = 1e3  # px: what a point counts that a model cannot project
+Project = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
@@ -121,3 +126,33 @@ def _steps(points: Array, source: str) -> tuple[Index, float]:
         raise ObservationError(f'{source}: the landmarks of a board are no regular grid')
     axes = np.linalg.lstsq(ones, points)[0][:2]
     return steps - steps.min(axis=0), float(np.linalg.norm(axes, axis=1).mean())
+
+
+def residuals(project: Project, frame: Index, xyz: Array, uv: Array, pose: Pose) -> Array:
+    """Return distances (N,), px, of held-out points, once a pose is fitted to each view.
+
+    All else is as it was fitted before.
+    project: points (M, 3), m, in the camera to image points (M, 2), px; xyz (N, 3): the target as
+    the model has it; pose: of the camera, one a frame in ascending order, to start from.
+    """
+    apart = np.empty(len(frame))
+    for i, number in enumerate(np.unique(frame)):
+        mine = frame == number
+        apart[mine] = np.linalg.norm(_fitted(project, xyz[mine], uv[mine], pose.take(i)), axis=1)
+    return apart
+
+
+def _fitted(project: Project, xyz: Array, uv: Array, pose: Pose) -> Array:
+    size = np.repeat([np.median(np.linalg.norm(pose.into_body(xyz), axis=1)), 1.0], 3)
+
+    def misfit(change: Array) -> Array:
+        seen = project(pose.retract(size * change).into_body(xyz))
+        return np.nan_to_num(uv - seen, nan=_LOST, posinf=_LOST, neginf=-_LOST).ravel()
+
+    found = least_squares(misfit, np.zeros(6), method='lm', x_scale=1e-2)
+    return np.asarray(found.fun).reshape(-1, 2)
+
+
+def rms(apart: Array) -> float:
+    """Return the root mean square of distances (N,)."""
+    return float(np.sqrt((apart**2).mean()))

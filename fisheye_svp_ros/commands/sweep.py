@@ -89,7 +89,8 @@ def run(args: argparse.Namespace) -> None:
         raise ParameterError(
             f'{path}: {len(plan.sweep)} scenarios ({lengths}); add --large to run them all'
         )
-    parts = TableParts(args.output / _PARTS, column_types(plan))
+    types = column_types(plan)
+    parts = TableParts(args.output / _PARTS, types)
     mine = fingerprint(plan)
     summary = args.output / _SUMMARY
     if (
@@ -107,7 +108,8 @@ def run(args: argparse.Namespace) -> None:
                 'compute them again with --resume'
             )
         with write_together():
-            metrics = parts.join(args.output / 'sweep', _metrics(plan), part_check(plan))
+            names = [name for name, kind in types.items() if kind is float and '.' in name]
+            metrics = parts.join(args.output / 'sweep', names, part_check(plan))
             _report(path, args.output, plan, mine, metrics)
         note_formats()
     shutil.rmtree(parts.folder, ignore_errors=True)
@@ -175,10 +177,6 @@ def _written(
         for numbers in remaining:
             write(numbers)
             yield numbers
-
-
-def _metrics(plan: Plan) -> list[str]:
-    return [name for name, kind in column_types(plan).items() if kind is float and '.' in name]
 
 
 def _report(path: Path, folder: Path, plan: Plan, mine: str, metrics: DataFrame) -> None:

@@ -83,7 +83,11 @@ def read_grid(
     if not len(ids):
         return nothing
     pairs, offset = _pair_tags(corners, size.gap)
-    ways = _ways(size) if layout is None else [_way(layout, size)]
+    ways = (
+        _ways(size)
+        if layout is None
+        else [(layout.turn, layout.from_top, layout.first % size.columns)]
+    )
     agreement = [_agree(ids, pairs, offset, way, size) for way in ways]
     count = np.array([agree.sum() for agree in agreement])
     best = [ways[i] for i in np.flatnonzero(count == count.max())]
@@ -151,10 +155,6 @@ Way = tuple[int, bool, int]  # quarter turns, rows from the top, first id modulo
 def _ways(size: GridSize) -> list[Way]:
     turns = range(4) if size.tags > 1 else (0,)  # of a single tag any turn is as good
     return [*product(turns, (False, True)[: min(size.rows, 2)], range(size.columns))]
-
-
-def _way(layout: TagLayout, size: GridSize) -> Way:
-    return layout.turn, layout.from_top, layout.first % size.columns
 
 
 def _agree(ids: Index, pairs: Index, offset: Array, way: Way, size: GridSize) -> Mask:

@@ -106,31 +106,29 @@ def bounded_map(
 
 
 class BoundedCalls:
-    """A function in a process of its own, one call at a time, each bounded in time."""
+    """A function in a process of its own, one call at a time, each bounded in time.
+
+    busy: a call is under way, or the process is not ready yet.
+    """
 
     def __init__(self, function: Callable[[Any], Any], first: Any) -> None:
         """Start the process; function: importable; first: small, for a call that warms it up."""
         self._function, self._first = function, first
         self._replace()
 
-    @property
-    def busy(self) -> bool:
-        """Whether a call is under way, or the process is not ready yet."""
-        return self._busy
-
     def start(self, item: Any, seconds: float) -> None:
         """Start a call, which may take so long; none may be under way."""
         self._worker.assign_item(self._worker.number + 1, item, seconds)
-        self._busy = True
+        self.busy = True
 
     def result(self) -> Any:
         """Return the result of a call, or TimedOut; None while there is nothing new."""
         worker, result = self._worker, None
-        if not self._busy:
+        if not self.busy:
             return None
         try:
             if worker.pipe.poll():
-                result, self._busy = worker.pipe.recv(), False
+                result, self.busy = worker.pipe.recv(), False
         except (EOFError, OSError):
             result = TimedOut(False)
         if result is None and time.monotonic() > worker.deadline:
@@ -148,7 +146,7 @@ class BoundedCalls:
     def _replace(self) -> None:
         self._worker = _Worker(self._function)
         self._worker.assign_item(0, self._first, _START)
-        self._busy = True
+        self.busy = True
 
 
 def _end_with(parent: int) -> None:

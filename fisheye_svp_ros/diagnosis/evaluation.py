@@ -207,7 +207,7 @@ class Evaluation:
         elif without:
             state = fit_without_causes(self.null, without, self.free)
         else:
-            state = selection.state
+            state = selection.null.linear.state
         state = valid_state(state, test.data, self.null.linear.data, test.another_target)
         if offsets is not None and test.another_target:
             offsets = offsets.of_image
@@ -388,7 +388,7 @@ class Evaluation:
             return causes
         gain = self._gain(self._given_prediction, self._base_prediction)
         remaining = 1 - self.medium.share
-        fitted = replace(self.medium, state=self.selection.state)
+        fitted = replace(self.medium, state=self.null.linear.state)
         errors = dict(zip(shared_names(self.null.linear), self.errors.tolist(), strict=True))
         return [
             medium_cause(fitted, errors, self._base_prediction.rms, gain.value),

@@ -136,11 +136,6 @@ class Finding:
         """Whether it was taken into the model."""
         return self.reason in (Reason.PREDICTS_BETTER, Reason.BEYOND_BULK)
 
-    @property
-    def is_removal(self) -> bool:
-        """Whether it was given up in the selection after it had been taken in."""
-        return self.reason.is_removal
-
 
 class Evidence(Protocol):
     """What is known of an effect in the model when it is to be confirmed; the methods take time.

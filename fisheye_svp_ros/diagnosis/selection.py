@@ -82,11 +82,6 @@ class Selection:
     refuted: tuple[str, ...] = ()
 
     @property
-    def state(self) -> RigState:
-        """The state with its causes."""
-        return self.null.linear.state
-
-    @property
     def causes(self) -> list[ModelTerm]:
         """What was found: effects, their columns among what is shared, values."""
         return [term for term in self.null.terms if term.effect not in self.problem.given_effects]
@@ -167,7 +162,7 @@ def _change_effects(problem: Problem, search: _Search, null: NullModel, most: in
     included, steps = eliminate_effects(tests, _known_effects(problem), options.quick)
     gone = [step.effect for step in steps]
     # What was given up is not asked for again.
-    refused = {step.effect for step in (*search.trace, *steps) if step.is_removal}
+    refused = {step.effect for step in (*search.trace, *steps) if step.reason.is_removal}
     forms, tried = add_effects(tests, included, most, refused, options.quick)
     search = replace(search, trace=(*search.trace, *steps, *tried))
     if gone or forms:

@@ -200,7 +200,9 @@ def localize_rig(
     GeometryError where no frame can be posed.
     """
     table, known = _inputs(observations, lenses)
-    names, places = _cameras(rig)
+    names, places = (
+        (rig.cameras, rig.rig) if isinstance(rig, RigCalibration) else load_cameras(rig)
+    )
     return rig_localization.localize_rig(table, known, names, places)
 
 
@@ -212,7 +214,3 @@ def _inputs(
     known = {name: load_lens(lens) for name, lens in lenses.items()}
     check_images(observations, known)
     return table, rig_lenses(table, known)
-
-
-def _cameras(rig: RigCalibration | str | Path) -> tuple[tuple[str, ...], Pose]:
-    return (rig.cameras, rig.rig) if isinstance(rig, RigCalibration) else load_cameras(rig)

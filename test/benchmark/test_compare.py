@@ -21,8 +21,7 @@ from benchmark.peers.halves import (
     whole,
 )
 from benchmark.peers.python_calibrations import PYTHON_PEERS
-from benchmark.peers.scoring import residuals, rms
-from benchmark.peers.sets import BOARDS, Set, grid_of, one_board_a_frame
+from benchmark.peers.sets import BOARDS, Set, grid_of, one_board_a_frame, residuals, rms
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.curves import KannalaBrandt

@@ -232,14 +232,15 @@ def _fit_camera(selection: Selection, camera: int, known: KnownTarget) -> _Camer
     data, mine = null.linear.data, null.linear.data.camera_of == camera
     own = data.select(mine)
     own = replace(own, camera_of=np.zeros_like(own.camera_of), poses=None)
-    pose = selection.state.view_poses(data).take(np.flatnonzero(mine))
-    at = camera if selection.state.others else 0
-    names = tuple(selection.state.lens_names(selection.problem.free)[at])
-    state = _single_camera(selection.state, pose, at, camera)
+    whole = null.linear.state
+    pose = whole.view_poses(data).take(np.flatnonzero(mine))
+    at = camera if whole.others else 0
+    names = tuple(whole.lens_names(selection.problem.free)[at])
+    state = _single_camera(whole, pose, at, camera)
     target = None
     # Whether anything was found that stays with the target.
     stages = {STAGE_OF[name] for name in np.array(NAMES)[null.variances.alive]}
-    if 'target' in stages or any(map(displaces_landmarks, selection.state.terms)):
+    if 'target' in stages or any(map(displaces_landmarks, whole.terms)):
         seen = np.unique(own.views.landmark[own.views.used])
         variances = replace(
             null.variances,
