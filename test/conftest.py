@@ -45,6 +45,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         remove_orphans(_SEGMENTS)
 
 
+@pytest.hookimpl(tryfirst=True)  # pytest-xdist reads the groups in the same hook
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Keep in one process what needs the compiled engine, or one sweep to compare with: made once.
 

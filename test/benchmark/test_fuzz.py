@@ -47,7 +47,7 @@ def test_a_short_run_over_all_surfaces_finds_no_fault() -> None:
             '-m',
             'benchmark.hardening.fuzz',
             '--inputs',
-            '2500',
+            '1200',
             '--workers',
             '1',
             '--no-docs',

@@ -494,6 +494,7 @@ class TestTags:
         assert np.abs(points.uv - expected).max() < 1.0
 
 
+@pytest.mark.xdist_group('photographs')  # searched once
 class TestPhotographs:
     @pytest.fixture(scope='class')
     @classmethod

@@ -81,6 +81,14 @@ def points_of_all_kinds(lens):
     )
 
 
+def test_the_engine_is_compiled_by_one_process_of_the_tests(
+    compiled, request: pytest.FixtureRequest
+) -> None:
+    """The group was given after pytest-xdist had read it: each worker compiled."""
+    grouped = bool(request.config.getoption('loadgroup', False))
+    assert request.node.nodeid.endswith('@engines') == grouped
+
+
 @pytest.mark.parametrize('lens', LENSES)
 @pytest.mark.parametrize('limited', [True, False])
 def test_projection_and_derivatives_of_any_point(compiled, lens, limited):
