@@ -25,6 +25,8 @@ from fisheye_svp_ros.paper.tables import (
     agreeing,
 )
 
+# One process makes both fits.
+pytestmark = pytest.mark.xdist_group('paper search')
 LENS_PAIR = tuple(load_lens(lens_path(name)) for name in LENSES)
 
 

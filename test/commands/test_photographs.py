@@ -29,7 +29,8 @@ from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.scene.rigs import rig
 
-pytestmark = pytest.mark.usefixtures('undrawn')
+# One process renders and searches the photographs.
+pytestmark = [pytest.mark.usefixtures('undrawn'), pytest.mark.xdist_group('photographs')]
 
 PHOTOS = DATA / 'photos'
 

@@ -23,6 +23,8 @@ from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.simulate.render import Exposure, render
 
+# One process renders the photographs.
+pytestmark = pytest.mark.xdist_group('undistort')
 RIG = Pose(rotation_from_vector(np.array([0.02, 0.05, -0.03])), np.array([-0.06, 0.003, 0.004]))
 RIGHT = replace(LENS, name='other', fx=144.0, fy=144.0)
 

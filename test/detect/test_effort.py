@@ -15,6 +15,8 @@ from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import find_photographs
 from fisheye_svp_ros.errors import ObservationError
 
+# One process renders the images.
+pytestmark = pytest.mark.xdist_group('photographs')
 EMPTY = np.full((LENS.height, LENS.width), 90, np.uint8)
 
 
