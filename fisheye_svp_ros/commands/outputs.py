@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from fisheye_svp_ros.errors import OutputError
-from fisheye_svp_ros.io.files import final_path
+from fisheye_svp_ros.io.paths import final_path
 
 _PHOTOGRAPHS = ('observations', 'photographs', 'inputs')  # arguments whose folders are read again
 _OUTPUTS = {'-o': 'output', '--overlays': 'overlays'}  # options and their arguments

@@ -33,7 +33,6 @@ from rosbags.rosbag2.storage_mcap import McapWriter, write_channel, write_string
 from rosbags.typesys import Stores, get_typestore
 
 from fisheye_svp_ros.errors import BagError
-from fisheye_svp_ros.io.files import final_path
 from fisheye_svp_ros.io.mcap import (
     MAX_BYTES,
     RawMessage,
@@ -42,6 +41,7 @@ from fisheye_svp_ros.io.mcap import (
     listed_topics,
     whole_messages,
 )
+from fisheye_svp_ros.io.paths import final_path
 from fisheye_svp_ros.io.recording_files import ROS1_SUFFIX, metadata_topics, recording_files
 
 _REMEDY = 'copy it again, or run `rosbag reindex`'

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.io.files import path_of, read_text, write_text
+from fisheye_svp_ros.io.files import read_text, write_text
+from fisheye_svp_ros.io.paths import path_of
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_quaternion
 from fisheye_svp_ros.scene.observations import MOST_LANDMARK, Observations, make_observations
 from fisheye_svp_ros.scene.table_checks import SIGMA_BOUND, implausible_sigma

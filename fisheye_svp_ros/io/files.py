@@ -25,23 +25,8 @@ from typing import IO, Any, ClassVar
 import numpy as np
 import yaml
 
-from fisheye_svp_ros.errors import FisheyeSvpError, OutputError, ParameterError
-
-
-def path_of(given: str | Path) -> Path:
-    """Return a path; raise ParameterError for what is none."""
-    if not isinstance(given, str | os.PathLike):
-        raise ParameterError(f'a {type(given).__name__} is no path; the name of a file is needed')
-    return Path(given)
-
-
-def final_path(path: str | Path) -> Path:
-    """Return where a path leads, through all symbolic links; raise OutputError for a circle."""
-    resolved = Path(os.path.realpath(path_of(path)))
-    if resolved.is_symlink():
-        raise OutputError(f'{path}: its symbolic links lead in a circle; choose another name')
-    return resolved
-
+from fisheye_svp_ros.errors import FisheyeSvpError, OutputError
+from fisheye_svp_ros.io.paths import final_path
 
 MAX_BYTES = 1 << 30  # bytes of a table or a photograph
 

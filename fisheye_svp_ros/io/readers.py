@@ -19,7 +19,8 @@ from fisheye_svp_ros.io.csv_files import (
     write_observations,
     write_poses,
 )
-from fisheye_svp_ros.io.files import path_of, read_json
+from fisheye_svp_ros.io.files import read_json
+from fisheye_svp_ros.io.paths import path_of
 from fisheye_svp_ros.io.recording_files import is_recording
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.registry import Registry

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.files import dump_yaml, path_of, read_text, write_text
+from fisheye_svp_ros.io.files import dump_yaml, read_text, write_text
 from fisheye_svp_ros.io.lens_files import FILES_OF_RIG, MAX_LENS_BYTES, read_lens_file
 from fisheye_svp_ros.io.lens_formats import Foreign, read_foreign
 from fisheye_svp_ros.io.lens_formats.rig import SEPARATOR, cameras_of, pose_keys
+from fisheye_svp_ros.io.paths import path_of
 from fisheye_svp_ros.pose import Pose, identity, quaternion_from_rotation
 from fisheye_svp_ros.scene.observations import STEREO
 
