@@ -64,7 +64,7 @@ from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, can_be_included
 from fisheye_svp_ros.diagnosis.stages import diagnose, diagnose_against
 from fisheye_svp_ros.diagnosis.stepwise import NAMED_P
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors, total_errors
-from fisheye_svp_ros.diagnosis.variance_budget import stage_shares
+from fisheye_svp_ros.diagnosis.variance_budget import noise_px, stage_shares
 
 __all__ = [
     'CONFIRMED_PROBABILITY',
@@ -115,6 +115,7 @@ __all__ = [
     'diagnose',
     'diagnose_against',
     'frames_of',
+    'noise_px',
     'pose_maps',
     'pose_summary',
     'predict_board',

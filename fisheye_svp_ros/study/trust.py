@@ -16,6 +16,7 @@ from fisheye_svp_ros.diagnosis import (
     LensErrors,
     NullModel,
     compare_errors,
+    noise_px,
     standard_errors,
     total_errors,
 )
@@ -62,13 +63,15 @@ class LensTrust:
     """Standard errors of parameters, the target as it is said to be, and their ranges, by name.
 
     moved (K,): from the values of least squares to those of generalized least squares, the target
-    as far from what it is said to be as the data make likely; covariance (K, K): of these.
+    as far from what it is said to be as the data make likely; covariance (K, K): of these;
+    noise_px: of one coordinate of a point, by the data.
     """
 
     stderr: dict[str, float]
     admissible: dict[str, Admissible]
     moved: Array
     covariance: Array
+    noise_px: float
 
     @property
     def doubtful_shift(self) -> dict[str, Admissible]:
@@ -144,7 +147,9 @@ def assess_lens(observations: Observations, lens: Lens, names: Sequence[str]) ->
     known = np.sqrt(np.diag(targets[0].covariance))
     larger = np.maximum(np.nan_to_num(standard_errors(null)[: len(names)]), known)
     larger = larger / np.maximum(known, 1e-300)
-    return LensTrust(stderr, admissible, moved, covariance * np.outer(larger, larger))
+    return LensTrust(
+        stderr, admissible, moved, covariance * np.outer(larger, larger), noise_px(null)
+    )
 
 
 def generalize(calibration: Calibration, trusted: LensTrust) -> Calibration:

@@ -9,9 +9,11 @@ import pytest
 from helpers.contradictions import check
 from helpers.flawed_sets import flawed
 
+from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, FlawKind, diagnose
 from fisheye_svp_ros.io.lens_files import save_lens
+from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.reporting.wording.first_screen import (
     first_screen,
     terminal_lines,
@@ -109,6 +111,15 @@ def test_a_lens_known_in_part_is_told_by_every_command(tmp_path, capsys):
     save_lens(wide, tmp_path / 'lens.yaml')
     load_with_notes(tmp_path / 'lens.yaml')
     assert 'reach 12 deg of 95 deg; nothing is known beyond' in capsys.readouterr().err
+
+
+def test_calibrate_does_not_pass_over_what_no_lens_explains(tmp_path, capsys):
+    """Without a stated sigma nothing was said of 4 px, at a noise of .05 px."""
+    table, (width, height) = flawed('two cameras in blocks')
+    write_observations(tmp_path / 'points.csv', replace(table, sigma=np.full(len(table), np.nan)))
+    points, lens = (str(tmp_path / name) for name in ('points.csv', 'lens.yaml'))
+    main(['calibrate', points, '--image-size', f'{width}x{height}', '-o', lens])
+    assert re.search(r'px are \d+\.\d times the noise of image points', capsys.readouterr().err)
 
 
 @once('sound')

@@ -15,10 +15,10 @@ from fisheye_svp_ros.reporting.wording.first_screen import first_screen, termina
 Document = Mapping[str, Any]
 ROUNDING = 1e-9
 LENS = {
-    'keep': 'Keep the lens',
-    'use_extended': 'Use ',
-    'recalibrate': 'Do not use the lens as given',
-    'undecided': 'Undecided about the lens',
+    'keep': ['Keep the lens'],
+    'use_extended': ['Use '],
+    'recalibrate': ['Do not use the lens as given'],
+    'undecided': ['Undecided about the lens', 'cannot be judged by these data'],
 }
 # Status: least and largest probability.
 RANGES = {
@@ -186,7 +186,8 @@ def _screen(document: Document, screen: str) -> Iterator[str]:
     """Yield where the first screen says something else than the document."""
     screen, say = ' '.join(screen.split()), document['decision']['lens']['say']
     for answer, words in LENS.items():
-        if (words in _line(screen, 'Lens:')) != (answer == say):
+        line = _line(screen, 'Lens:')
+        if any(one in line for one in words) != (answer == say):
             yield f'{say}, and the screen {"has" if answer != say else "lacks"} {words!r}'
     if document['adequacy'] and ('Enough' in screen or '% sure' in screen):
         yield 'inadequate data, and the screen reassures'

@@ -113,9 +113,20 @@ def test_a_confounded_set_without_a_size_says_what_is_open(found: Diagnosis) -> 
     )
     assert first_screen(alike, 'table').causes == table
     assert headline(alike).startswith(
-        'The sensor is tilted, 89 % sure, or it is dome_port (11 %): one of them is there '
+        'The sensor is tilted, 89 % sure, or the lens looks through a dome, away from its center '
+        '(11 %): one of them is there '
         '(likely, more than 99 %), how large each is remains open. '
     )
+
+
+def test_an_impossible_shift_asks_for_the_unit_first(found: Diagnosis) -> None:
+    """Boards in the wrong unit were to be photographed again, nearer and larger."""
+    parameters = {'e0': {'value': 0.049, 'stderr': 0.001, 'unit': 'm'}}
+    shift = Finding(
+        'viewpoint_shift(order=1)', Reason.IMPLAUSIBLE, 1e-9, 1e-8, parameters=parameters
+    )
+    said = headline(replace(found, candidates=[shift]))
+    assert said.startswith('A shift of 49 mm is larger than in any real lens: are lengths in m? ')
 
 
 def test_the_headline_says_that_the_target_is_imperfect_too(found: Diagnosis) -> None:
@@ -167,7 +178,8 @@ def test_a_board_that_is_longer_one_way_is_not_one_of_another_scale(
         indistinguishable_from=['decentering'],
         odds={'sensor_tilt': 0.6, 'decentering': 0.4},
     )
-    assert ', 60 % sure, or it is decentering (40 %).' in headline(replace(found, causes=[tilt]))
+    said = headline(replace(found, causes=[tilt]))
+    assert ', 60 % sure, or lens elements are not centered on one axis (40 %).' in said
     assert headline(replace(found, causes=[scale])).startswith(f'{words} ({parameter} = 0.47')
 
 

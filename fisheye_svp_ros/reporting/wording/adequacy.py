@@ -13,7 +13,8 @@ _COUNTS = {2: 'two', 3: 'three', 4: 'four'}
 _MAX_FRAMES = 4  # by name
 _REMEDIES = {
     FlawKind.CAMERAS_MIXED: 'calibrate each group of frames by itself',
-    FlawKind.FOCAL_VARIES: 'switch off zoom, autofocus and stabilization, and take all again',
+    FlawKind.FOCAL_VARIES: 'switch off zoom, autofocus and stabilization, and take all again; '
+    'if two cameras are mixed, calibrate each by itself',
     FlawKind.CENTER_VARIES: 'switch off stabilization and cropping, and take all again',
     FlawKind.FRAMES_DIFFER: 'check that all frames are of one camera, one size and one board',
     FlawKind.NO_FIT: 'check order and units of the points, image size and model',
@@ -61,8 +62,8 @@ def flaw_statement(flaw: Flaw) -> str:
         )
     if flaw.kind == FlawKind.ANGLE_SHORT:
         return (
-            f'points{of} reach {degrees(flaw.size):.0f} deg of {degrees(flaw.beside):.0f} deg: '
-            'nothing is known beyond'
+            f'points{of} reach {degrees(flaw.size):.0f} deg, the lens is used to '
+            f'{degrees(flaw.beside):.0f} deg: nothing is known beyond {degrees(flaw.size):.0f} deg'
         )
     return (
         f'the principal point{of} lies {flaw.size:.0f}, {flaw.beside:.0f} px off the center of '

@@ -68,15 +68,16 @@ def _fit_warnings(camera: CalibratedCamera) -> list[str]:
             'photographs, or check these'
         )
     rms, sigma = (camera.lens.calibration or {})['rms_px'], float(np.median(camera.table.sigma))
+    noise = sigma if np.isfinite(sigma) else camera.trust.noise_px
     if is_no_fit(rms, sigma):
         texts.append(
             f'{camera.model} leaves {rms:.1f} px: the model does not fit this lens, or '
             'image points and landmarks do not match (check order, units, axes, '
             'image size)'
         )
-    elif np.isfinite(sigma) and rms > _MODEL_ERROR_RATIO * 2**0.5 * sigma:
+    elif rms > _MODEL_ERROR_RATIO * 2**0.5 * noise:
         texts.append(
-            f'{rms:.2g} px are {rms / sigma / 2**0.5:.1f} times the noise of image '
+            f'{rms:.2g} px are {rms / noise / 2**0.5:.1f} times the noise of image '
             'points: lens or target has a model error; run `fisheye-svp diagnose`'
         )
     if result.beyond:

@@ -93,7 +93,7 @@ _NOISE_RATIO = 1.5  # times the noise, from which an error is more than that
 def lens_words(d: Diagnosis) -> str:
     """Return what to do about the lens, or the lenses of several cameras."""
     if d.adequacy.is_misfit:
-        return LENS['undecided'].partition(';')[0]
+        return f'The lens{"es" if len(d.lenses) > 1 else ""} cannot be judged by these data'
     words = (_OF_RIG if len(d.lenses) > 1 else LENS)[d.decision['lens'].say]
     return words if d.offers_extended or not d.is_lens_off else words.partition(', or ')[0]
 

@@ -22,6 +22,7 @@ from fisheye_svp_ros.diagnosis import (
     Comparison,
     Decision,
     Diagnosis,
+    Reason,
     Status,
     frames_of,
     status_of,
@@ -336,9 +337,12 @@ def photographs_words(d: Diagnosis) -> str:
 
 def headline(d: Diagnosis) -> str:
     """Return the largest cause and the decision about the lens, or what is wrong with the data."""
-    if d.adequacy.flaws:
-        return f'{flaw_headline(d.adequacy.flaws[0])}. {lens_words(d)}.'
-    return f'{largest_cause(d)}{_displaced_landmarks(d)}. {lens_words(d)}.'
+    doubts = [
+        _capital(finding_reason(one)) for one in d.candidates if one.reason is Reason.IMPLAUSIBLE
+    ]
+    flaws = [f'{flaw_headline(flaw)}.' for flaw in d.adequacy.flaws[:1]]
+    rest = flaws or [f'{largest_cause(d)}{_displaced_landmarks(d)}.']
+    return ' '.join([*doubts, *rest, f'{lens_words(d)}.'])
 
 
 def verdict_words(d: Diagnosis) -> str:
@@ -439,17 +443,30 @@ def _sentence(d: Diagnosis, cause: Cause) -> str:
         doubt = _doubt(cause)
     likeliest = max(cause.odds, key=lambda name: cause.odds[name], default=cause.effect)
     if likeliest != cause.effect:
-        words = COMPONENTS.get(likeliest) or describe_effect(likeliest)
+        words = _describe(likeliest)
         own = _statement(d, cause)
         return (
             f'{_capital(words)} ({chance(cause.odds[likeliest])} sure), or '
             f'{own[:1].lower()}{own[1:]} ({chance(cause.odds[cause.effect])}){doubt}'
         )
     if cause.odds.get(cause.effect, 1.0) < CONFIRMED_PROBABILITY:
-        others = ' or '.join(with_odds(cause, name) for name in cause.indistinguishable_from)
+        others = ' or '.join(_with_odds(cause, name) for name in cause.indistinguishable_from)
         sure = chance(cause.odds[cause.effect])
-        doubt = f', {sure} sure, or it is {others}{doubt}'
+        doubt = f', {sure} sure, or {others}{doubt}'
     return _statement(d, cause) + doubt
+
+
+def _with_odds(cause: Cause, name: str) -> str:
+    """Return what another one of a confounded set is, with its share in the probability."""
+    return (
+        f'{_describe(name)} ({chance(cause.odds[name])})'
+        if name in cause.odds
+        else _describe(name)
+    )
+
+
+def _describe(name: str) -> str:
+    return COMPONENTS.get(name) or describe_effect(name)
 
 
 def _doubt(cause: Cause) -> str:
