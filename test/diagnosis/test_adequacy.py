@@ -101,7 +101,9 @@ def test_frames_of_two_cameras_are_told_by_number():
 def test_angle_of_the_points_is_told():
     flaw = diagnosed('central').adequacy.flaws[0]
     assert np.degrees(flaw.size) == pytest.approx(11, abs=3)
-    assert 'nothing is known beyond' in screen(diagnosed('central'))
+    said = screen(diagnosed('central'))
+    assert 'nothing is known beyond' in said
+    assert re.search(r'Undecided about the lens beyond \d+ deg; keep it within, or', said)
 
 
 def test_a_lens_known_in_part_is_told_by_every_command(tmp_path, capsys):

@@ -127,6 +127,14 @@ def test_an_impossible_shift_asks_for_the_unit_first(found: Diagnosis) -> None:
     )
     said = headline(replace(found, candidates=[shift]))
     assert said.startswith('A shift of 49 mm is larger than in any real lens: are lengths in m? ')
+    undecided = replace(found.decision['lens'], say='undecided')
+    inputs = ReportInputs('a.csv', ('l.yaml',), None, None, Path('out'), True)
+    assert command_to_go_on(found, inputs)
+    open_one = replace(found, candidates=[shift], decision=found.decision | {'lens': undecided})
+    assert headline(open_one).endswith(
+        ' Undecided about the lens; check the unit of lengths first.'
+    )
+    assert command_to_go_on(open_one, inputs) == ''
 
 
 def test_the_headline_says_that_the_target_is_imperfect_too(found: Diagnosis) -> None:
@@ -328,6 +336,7 @@ def test_the_command_to_go_on_solves_the_same_problem(found: Diagnosis) -> None:
         evaluation=SimpleNamespace(problem=SimpleNamespace(plannable=True)),
         is_lens_off=False,
         adequacy=SimpleNamespace(is_misfit=False),
+        candidates=[],
     )
     assert command_to_go_on(open_, inputs) == (
         "fisheye-svp diagnose 'a b.csv' --lens l.yaml --poses p.csv --free intrinsics --next 6 "

@@ -12,6 +12,8 @@ from fisheye_svp_ros.diagnosis import (
     Cause,
     Comparison,
     Diagnosis,
+    FlawKind,
+    LensReason,
     Reason,
 )
 from fisheye_svp_ros.effects.base import NO_TIME
@@ -94,8 +96,23 @@ def lens_words(d: Diagnosis) -> str:
     """Return what to do about the lens, or the lenses of several cameras."""
     if d.adequacy.is_misfit:
         return f'The lens{"es" if len(d.lenses) > 1 else ""} cannot be judged by these data'
-    words = (_OF_RIG if len(d.lenses) > 1 else LENS)[d.decision['lens'].say]
+    decision = d.decision['lens']
+    words = (_OF_RIG if len(d.lenses) > 1 else LENS)[decision.say]
+    if decision.say == 'undecided':
+        flaws, undecided = d.adequacy.flaws, words.partition(';')[0]
+        if is_impossible(d):
+            return f'{undecided}; check the unit of lengths first'
+        short = all(flaw.kind is FlawKind.ANGLE_SHORT for flaw in flaws)
+        # Where points are, nothing speaks against it.
+        if flaws and short and decision.reason is LensReason.NO_CAUSE_CONFIRMED:
+            angle = math.degrees(min(flaw.size for flaw in flaws))
+            return f'{undecided} beyond {angle:.0f} deg; keep it within, or take more photographs'
     return words if d.offers_extended or not d.is_lens_off else words.partition(', or ')[0]
+
+
+def is_impossible(d: Diagnosis) -> bool:
+    """Say whether an effect is larger than in any real lens: lengths are in another unit."""
+    return any(one.reason is Reason.IMPLAUSIBLE for one in d.candidates)
 
 
 def refusal_reason(d: Diagnosis) -> str:
