@@ -66,11 +66,12 @@ def nearly_localize(model: ForwardModel, views: Views) -> tuple[Pose, Mask]:
         return solved.pose, solved.converged
     rough, count = start_poses(model, views), len(views.frame)
     flat, centre, normal = _flat_targets(views)
-    start, rows = rough.take(np.append(np.arange(count), flat)), np.append(np.arange(count), flat)
-    start.put(np.arange(count, len(rows)), _mirror_image(rough.take(flat), centre, normal))
+    rows, mirrored = np.append(np.arange(count), flat), np.arange(count, count + len(flat))
+    start = rough.take(rows)
+    start.put(mirrored, _mirror_image(rough.take(flat), centre, normal))
     solved, _ = _solve_from(model, views.take(rows), start, _STARTING_STEPS)
     cost = np.where(solved.converged, solved.cost, np.inf)
-    best, mirrored = np.arange(count), np.arange(count, len(rows))
+    best = np.arange(count)
     best[flat] = np.where(cost[mirrored] < cost[flat], mirrored, flat)
     return solved.pose.take(best), solved.converged[best]
 

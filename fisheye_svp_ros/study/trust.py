@@ -187,7 +187,7 @@ def with_covariance(lens: Lens, trusted: LensTrust) -> Lens:
     )
 
 
-class _ShiftFit(NamedTuple):
+class _ParameterFit(NamedTuple):
     """Steps (K,) of parameters and their covariance (K, K), and the log evidence of a model."""
 
     step: Array
@@ -195,7 +195,7 @@ class _ShiftFit(NamedTuple):
     evidence: float
 
 
-def _fit_targets(null: NullModel, count: int) -> list[_ShiftFit]:
+def _fit_targets(null: NullModel, count: int) -> list[_ParameterFit]:
     """Return how parameters move for a target as it is said to be, and for ones that err more.
 
     The errors of the target are normal, with a share of what is large for each as their standard
@@ -220,11 +220,11 @@ def _fit_targets(null: NullModel, count: int) -> list[_ShiftFit]:
         evidence = score @ inverse @ score - determinant if sign > 0 else -np.inf
         evidence += np.log(more[len(own) :]).sum()
         mine = inverse[:count, :count] / np.outer(scale, scale)
-        fits.append(_ShiftFit((inverse @ score)[:count] / scale, mine, float(evidence) / 2))
+        fits.append(_ParameterFit((inverse @ score)[:count] / scale, mine, float(evidence) / 2))
     return fits
 
 
-def _fit_without_random_parts(null: NullModel, other: _ShiftFit) -> _ShiftFit:
+def _fit_without_random_parts(null: NullModel, other: _ParameterFit) -> _ParameterFit:
     """Return the fit of least squares, which does not move; other: with random parts as they are.
 
     Evidence by the restricted likelihood; a variance counts as a parameter (BIC): in data without
@@ -240,10 +240,10 @@ def _fit_without_random_parts(null: NullModel, other: _ShiftFit) -> _ShiftFit:
 
     cost = int(null.variances.alive.sum()) * np.log(null.full.rows) / 2
     gain = likelihood(null.factorization) - likelihood(bare) - cost
-    return _ShiftFit(np.zeros_like(other.step), other.covariance, other.evidence - gain)
+    return _ParameterFit(np.zeros_like(other.step), other.covariance, other.evidence - gain)
 
 
-def _average_fits(fits: Sequence[_ShiftFit]) -> tuple[Array, Array]:
+def _average_fits(fits: Sequence[_ParameterFit]) -> tuple[Array, Array]:
     """Return the mean step (K,) and its covariance (K, K), each model weighted by its evidence.
 
     Source: Hoeting et al., Bayesian model averaging: a tutorial, Statistical Science 14 (1999).

@@ -87,8 +87,8 @@ class Graph:
         rclpy.try_shutdown()
 
 
-class FedLocalizer:
-    """A localizer that gets the landmarks of Kita's environment, and image points set by set."""
+class HeardLocalizer:
+    """A localizer, what it publishes, and publishers of what it gets."""
 
     def __init__(self, g: Graph) -> None:
         self.graph = g
@@ -99,6 +99,13 @@ class FedLocalizer:
         self.landmarks = g.tell(PointCloud2, 'landmarks', LATCHED)
         self.points = g.tell(PointCloud2, 'image_points')
         g.until(lambda: self.node._result.get_subscription_count() > 0)
+
+
+class FedLocalizer(HeardLocalizer):
+    """A localizer that gets the landmarks of Kita's environment, and image points set by set."""
+
+    def __init__(self, g: Graph) -> None:
+        super().__init__(g)
         self.landmarks.publish(messages.landmarks_message(environment('whole', 2.0), 0, 'map'))
 
     def feed(self, stamp: int, landmark: Any, uv: Any, frame: str) -> None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from helpers.graph import LATCHED, Graph, set_parameter
+from helpers.graph import LATCHED, Graph, HeardLocalizer, set_parameter
 from helpers.kalibr import write_camchain
 from helpers.uncertain import NOISE, uncertain
 
@@ -308,19 +308,12 @@ def test_the_localizer_publishes_everything_of_a_set_under_its_stamp(
     assert np.linalg.eigvalsh(covariance).min() > 0
 
 
-class Sets:
+class Sets(HeardLocalizer):
     """Sets told by hand: what the localizer gets, in whatever order."""
 
     def __init__(self, g: Graph) -> None:
-        self.graph = g
-        self.results = g.hear(DiagnosticArray, 'localizer/result')
-        self.poses = g.hear(PoseWithCovarianceStamped, 'localizer/pose')
-        self.diagnostics = g.hear(DiagnosticArray, '/diagnostics')
-        self.node = g.start(Localizer)
-        self.landmarks = g.tell(PointCloud2, 'landmarks', LATCHED)
-        self.points = g.tell(PointCloud2, 'image_points')
+        super().__init__(g)
         self.truth = g.tell(PoseStamped, 'true_pose')
-        g.until(lambda: self.node._result.get_subscription_count() > 0)
 
     def tell_landmarks(self, stamp: int, radius: float) -> None:
         message = messages.landmarks_message(environment('whole', radius), stamp, 'world')
@@ -347,7 +340,7 @@ class Sets:
 
     def count(self, name: str) -> int:
         """Return what the latest diagnostics count."""
-        return int(values(self.diagnostics[-1])[name]) if self.diagnostics else 0
+        return int(values(self.reports[-1])[name]) if self.reports else 0
 
 
 @pytest.fixture
@@ -588,25 +581,23 @@ def test_malformed_messages_are_counted_and_the_node_lives_on(sets: Sets) -> Non
         'landmarks: dropped': '1',
         'image_points: received': '5',
     }
-    sets.graph.until(
-        lambda: sets.diagnostics and wanted.items() <= values(sets.diagnostics[-1]).items()
-    )
-    told = [message.status[0] for message in sets.diagnostics]
+    sets.graph.until(lambda: sets.reports and wanted.items() <= values(sets.reports[-1]).items())
+    told = [message.status[0] for message in sets.reports]
     assert {status.name for status in told} == {'/localizer: inputs'}
     warnings = [status.message for status in told if status.level == status.WARN]
     assert any('missing' in text or 'finite' in text for text in warnings)
     sets.tell_landmarks(0, 2.0)  # which ends the one that was refused
-    sets.graph.until(lambda: sets.diagnostics[-1].status[0].message == 'all inputs usable')
-    assert sets.diagnostics[-1].status[0].level == told[-1].OK and sets.dropped() == 4
+    sets.graph.until(lambda: sets.reports[-1].status[0].message == 'all inputs usable')
+    assert sets.reports[-1].status[0].level == told[-1].OK and sets.dropped() == 4
 
 
 def test_two_landmarks_of_one_id_are_refused(sets: Sets) -> None:
     twice = Landmarks(np.array([1, 1]), np.zeros((2, 3)))
     sets.landmarks.publish(messages.landmarks_message(twice, 0, 'world'))
     sets.graph.until(
-        lambda: sets.diagnostics and values(sets.diagnostics[-1])['landmarks: dropped'] == '1'
+        lambda: sets.reports and values(sets.reports[-1])['landmarks: dropped'] == '1'
     )
-    assert 'landmark 1 is listed twice' in sets.diagnostics[-1].status[0].message
+    assert 'landmark 1 is listed twice' in sets.reports[-1].status[0].message
 
 
 @pytest.mark.parametrize('style', ['parallel', 'vergent', 'divergent'])

@@ -96,9 +96,10 @@ def belief(status: Status, probability: float) -> str:
     return f'{status.value}, {chance(probability)}'
 
 
-def with_odds(cause: Cause, name: str) -> str:
-    """Return one of the names of a confounded set, with its share in the probability of all."""
-    return f'{name} ({chance(cause.odds[name])})' if name in cause.odds else name
+def with_odds(cause: Cause, name: str, words: str = '') -> str:
+    """Return one of a confounded set, by name or in words, with its share in the probability."""
+    odds = f' ({chance(cause.odds[name])})' if name in cause.odds else ''
+    return f'{words or name}{odds}'
 
 
 def finding_reason(finding: Finding) -> str:

@@ -12,6 +12,7 @@ from fisheye_svp_ros.diagnosis import (
     Cause,
     Comparison,
     Diagnosis,
+    Finding,
     FlawKind,
     LensReason,
     Reason,
@@ -100,7 +101,7 @@ def lens_words(d: Diagnosis) -> str:
     words = (_OF_RIG if len(d.lenses) > 1 else LENS)[decision.say]
     if decision.say == 'undecided':
         flaws, undecided = d.adequacy.flaws, words.partition(';')[0]
-        if is_impossible(d):
+        if impossible_findings(d):
             return f'{undecided}; check the unit of lengths first'
         short = all(flaw.kind is FlawKind.ANGLE_SHORT for flaw in flaws)
         # Where points are, nothing speaks against it.
@@ -110,9 +111,9 @@ def lens_words(d: Diagnosis) -> str:
     return words if d.offers_extended or not d.is_lens_off else words.partition(', or ')[0]
 
 
-def is_impossible(d: Diagnosis) -> bool:
-    """Say whether an effect is larger than in any real lens: lengths are in another unit."""
-    return any(one.reason is Reason.IMPLAUSIBLE for one in d.candidates)
+def impossible_findings(d: Diagnosis) -> list[Finding]:
+    """Return effects that are larger than in any real lens: lengths are in another unit."""
+    return [finding for finding in d.candidates if finding.reason is Reason.IMPLAUSIBLE]
 
 
 def refusal_reason(d: Diagnosis) -> str:

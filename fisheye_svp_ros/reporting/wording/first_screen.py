@@ -22,7 +22,6 @@ from fisheye_svp_ros.diagnosis import (
     Comparison,
     Decision,
     Diagnosis,
-    Reason,
     Status,
     frames_of,
     status_of,
@@ -58,6 +57,7 @@ from fisheye_svp_ros.reporting.wording.diagnosis import (
     LENS_FILE,
     count_frames,
     frame_ranges,
+    impossible_findings,
     is_assumed,
     known_rows,
     lens_words,
@@ -337,9 +337,7 @@ def photographs_words(d: Diagnosis) -> str:
 
 def headline(d: Diagnosis) -> str:
     """Return the largest cause and the decision about the lens, or what is wrong with the data."""
-    doubts = [
-        _capital(finding_reason(one)) for one in d.candidates if one.reason is Reason.IMPLAUSIBLE
-    ]
+    doubts = [_capital(finding_reason(one)) for one in impossible_findings(d)]
     flaws = [f'{flaw_headline(flaw)}.' for flaw in d.adequacy.flaws[:1]]
     rest = flaws or [f'{largest_cause(d)}{_displaced_landmarks(d)}.']
     return ' '.join([*doubts, *rest, f'{lens_words(d)}.'])
@@ -450,19 +448,12 @@ def _sentence(d: Diagnosis, cause: Cause) -> str:
             f'{own[:1].lower()}{own[1:]} ({chance(cause.odds[cause.effect])}){doubt}'
         )
     if cause.odds.get(cause.effect, 1.0) < CONFIRMED_PROBABILITY:
-        others = ' or '.join(_with_odds(cause, name) for name in cause.indistinguishable_from)
+        others = ' or '.join(
+            with_odds(cause, name, _describe(name)) for name in cause.indistinguishable_from
+        )
         sure = chance(cause.odds[cause.effect])
         doubt = f', {sure} sure, or {others}{doubt}'
     return _statement(d, cause) + doubt
-
-
-def _with_odds(cause: Cause, name: str) -> str:
-    """Return what another one of a confounded set is, with its share in the probability."""
-    return (
-        f'{_describe(name)} ({chance(cause.odds[name])})'
-        if name in cause.odds
-        else _describe(name)
-    )
 
 
 def _describe(name: str) -> str:

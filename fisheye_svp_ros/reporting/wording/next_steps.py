@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fisheye_svp_ros.diagnosis import Diagnosis
-from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE, is_impossible
+from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE, impossible_findings
 
 
 class ReportInputs(NamedTuple):
@@ -31,7 +31,7 @@ class ReportInputs(NamedTuple):
 
 def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
     """Return the command to go on with, as a shell takes it; '' where the data are no use."""
-    if diagnosis.adequacy.is_misfit or is_impossible(diagnosis):
+    if diagnosis.adequacy.is_misfit or impossible_findings(diagnosis):
         return ''
     d, files = diagnosis, follow_up_files(diagnosis, inputs)
     observations, lenses = (
