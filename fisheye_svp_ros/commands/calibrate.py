@@ -50,6 +50,8 @@ from fisheye_svp_ros.reporting.calibrated_camera import (
 )
 from fisheye_svp_ros.reporting.terminal import print_table, progress, stages
 from fisheye_svp_ros.reporting.wording.calibration import (
+    ANY_TARGET,
+    ANY_TARGET_NOTE,
     STANDARD_ERRORS,
     calibration_warnings,
     estimate_sentence,
@@ -311,7 +313,7 @@ def _print(camera: CalibratedCamera) -> None:
     print_table(
         f'{lens.name}: {figures["observations"]} points in {figures["frames"]} frames, '
         f'rms {figures["rms_px"]:.4f} px',
-        ('parameter', 'value', 'std. error', *(['with any target'] if open_ones else []), 'unit'),
+        ('parameter', 'value', 'std. error', *([ANY_TARGET] if open_ones else []), 'unit'),
         [
             (name, value, error, *([range_] if open_ones else []), unit)
             for name, value, error, range_, unit in camera.parameter_rows()
@@ -320,10 +322,10 @@ def _print(camera: CalibratedCamera) -> None:
     if sentence := estimate_sentence(figures):
         print(f'  {sentence}')
     if open_ones:
-        print('  with any target: 95 %, with shape, scale and boards of the target estimated too')
+        print(f'  {ANY_TARGET_NOTE}')
     print(
-        f'  max_incidence_deg {np.degrees(lens.max_incidence):.2f}, image points up to '
-        f'{np.degrees(camera.result.reached):.2f}; {STANDARD_ERRORS}'
+        f'  image points reach {np.degrees(camera.result.reached):.2f} deg of max_incidence_deg '
+        f'{np.degrees(lens.max_incidence):.2f}; {STANDARD_ERRORS}'
     )
     if camera.hand_eye:
         print_table(

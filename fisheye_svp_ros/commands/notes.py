@@ -15,6 +15,7 @@ from fisheye_svp_ros.io.lens_formats import READERS_TO_90_DEG, share_beyond_90_d
 from fisheye_svp_ros.reporting.wording.inputs import points_extrapolated
 from fisheye_svp_ros.reporting.wording.poses import wrong_landmark_notes
 from fisheye_svp_ros.scene.observations import frame_name, list_frames
+from fisheye_svp_ros.scene.table_checks import MAX_TARGET_SIZE, target_size
 from fisheye_svp_ros.solve.lens_checks import extrapolated_points
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 _MAX_SIMILAR_NOTES = 3  # frames whose reasons differ by numbers alone; of more, the first only
 _DAY = 86_400.0  # s
 _DIGITS = re.compile(r'\d')
-_MAX_TARGET_SIZE = 20.0  # m; a target larger than this was measured in other units
 
 
 def say(note: str) -> None:
@@ -92,8 +92,8 @@ def note_copies(table: Observations, frames: Sequence[int]) -> None:
 
 def note_huge(table: Observations) -> None:
     """Ask for the unit of a target that is larger than targets are."""
-    across = float((table.xyz.max(axis=0) - table.xyz.min(axis=0)).max())
-    if across > _MAX_TARGET_SIZE:
+    across = target_size(table)
+    if across > MAX_TARGET_SIZE:
         say(f'the target is {across:.0f} m across; x, y, z must be in m, not in mm')
 
 

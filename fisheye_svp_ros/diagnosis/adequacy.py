@@ -17,11 +17,13 @@ from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.decision import Decision, PhotographsAnswer
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
-from fisheye_svp_ros.diagnosis.findings import Flaw, FlawKind
+from fisheye_svp_ros.diagnosis.findings import MAX_SHIFT, Finding, Flaw, FlawKind, Reason
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, SAG
 from fisheye_svp_ros.diagnosis.variance_budget import REPEATED_COMPONENT, Component
 from fisheye_svp_ros.effects.recording_effects import FocalDriftEffect, SessionStepEffect
+from fisheye_svp_ros.scene.boards import is_flat
 from fisheye_svp_ros.scene.observations import frame_names
+from fisheye_svp_ros.scene.table_checks import MAX_TARGET_SIZE, target_size
 from fisheye_svp_ros.solve.frame_groups import MIN_GROUP, find_frame_groups
 from fisheye_svp_ros.solve.lens_checks import image_coverage, is_no_fit
 from fisheye_svp_ros.solve.ray_errors import RANGES, RayError
@@ -69,10 +71,13 @@ def judge_data(
     causes: Sequence[Cause],
     components: Sequence[Component],
     ray_errors: Mapping[str, Mapping[str, Sequence[RayError]]],
+    candidates: Sequence[Finding],
 ) -> Adequacy:
-    """Return what is wrong with the data of an evaluation."""
-    reached = float(np.nanmax(evaluation.simulation.scene.theta))
-    flaws = [*_misfits(evaluation, causes, components)]
+    """Return what is wrong with the data of an evaluation; candidates: not confirmed."""
+    linear = evaluation.null.linear
+    reached = float(np.nanmax(linear.scene.theta[linear.data.views.used]))
+    flaws = [*_impossible_lengths(evaluation, candidates)]
+    flaws += _misfits(evaluation, causes, components)
     if evaluation.free and evaluation.medium is None:
         flaws += _coverage(evaluation)
         if not any(flaw.kind.is_misfit for flaw in flaws):
@@ -90,6 +95,21 @@ def judge_data(
     return Adequacy(
         tuple(replace(flaw, names=one) for flaw, one in zip(flaws, names, strict=True)), reached
     )
+
+
+def _impossible_lengths(evaluation: Evaluation, candidates: Sequence[Finding]) -> Iterator[Flaw]:
+    """Yield lengths that no board and no lens has.
+
+    Landmarks that are no flat board may be those of a hall.
+    """
+    table = evaluation.problem.observations
+    across = target_size(table)
+    if across > MAX_TARGET_SIZE and is_flat(table.xyz):
+        yield Flaw(FlawKind.TARGET_TOO_LARGE, across, MAX_TARGET_SIZE)
+    for candidate in candidates:
+        if candidate.reason is Reason.IMPLAUSIBLE:
+            shift = next(abs(entry['value']) for entry in candidate.parameters.values())
+            yield Flaw(FlawKind.SHIFT_TOO_LARGE, shift, MAX_SHIFT)
 
 
 def _misfits(

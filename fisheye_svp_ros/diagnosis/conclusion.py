@@ -397,7 +397,7 @@ def conclude(
             unit='view' if is_unpaired(evaluation.null.linear.data) else 'frame',
         )
     )
-    adequacy = judge_data(evaluation, causes, components, ray_errors)
+    adequacy = judge_data(evaluation, causes, components, ray_errors, candidates)
     decisions = adequacy.revise({'lens': lens, 'target': target, 'photographs': photographs})
     return Conclusion(decisions, file, ray_errors, candidates, adequacy)
 

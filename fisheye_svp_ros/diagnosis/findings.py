@@ -17,7 +17,7 @@ from fisheye_svp_ros.effects.base import ModelTerm
 CONFIRMED_PROBABILITY = 0.95
 LIKELY_PROBABILITY = 0.5
 _MAX_SQUARE = 200.0  # of z: beyond it, the probability is 0
-_MAX_SHIFT = 0.025  # m: no lens of a machine is known to move its viewpoint by more
+MAX_SHIFT = 0.025  # m: no lens of a machine is known to move its viewpoint by more
 
 
 class Status(Enum):
@@ -193,24 +193,31 @@ def find_doubt(evidence: Evidence) -> Doubt | None:
 
 def is_implausible(cause: ModelTerm) -> bool:
     """Say whether an effect is larger than in any real lens."""
-    return cause.name == 'viewpoint_shift' and bool(abs(cause.values[0]) > _MAX_SHIFT)
+    return cause.name == 'viewpoint_shift' and bool(abs(cause.values[0]) > MAX_SHIFT)
 
 
 class FlawKind(Enum):
     """What is wrong with the data; of the first ones nothing is told of lens or target."""
 
-    CAMERAS_MIXED = 1
-    FOCAL_VARIES = 2
-    CENTER_VARIES = 3
-    FRAMES_DIFFER = 4
-    NO_FIT = 5
-    LENS_UNKNOWN = 6
-    ANGLE_SHORT = 7
-    OFF_CENTER = 8
+    TARGET_TOO_LARGE = 1
+    SHIFT_TOO_LARGE = 2
+    CAMERAS_MIXED = 3
+    FOCAL_VARIES = 4
+    CENTER_VARIES = 5
+    FRAMES_DIFFER = 6
+    NO_FIT = 7
+    LENS_UNKNOWN = 8
+    ANGLE_SHORT = 9
+    OFF_CENTER = 10
+
+    @property
+    def is_unit(self) -> bool:
+        """Whether lengths are in another unit than m."""
+        return self in (FlawKind.TARGET_TOO_LARGE, FlawKind.SHIFT_TOO_LARGE)
 
     @property
     def is_misfit(self) -> bool:
-        """Whether residuals are left that no camera explains."""
+        """Whether lengths are in another unit, or residuals are left that no camera explains."""
         return self.value <= FlawKind.NO_FIT.value
 
 
@@ -218,10 +225,11 @@ class FlawKind(Enum):
 class Flaw:
     """One thing that is wrong with the data.
 
-    size, beside: of mixed cameras and other misfits, px rms that is left and noise; of a focal
-    length, its relative range, of a center, its rms, px, and how many times noise that is; of rays
-    the error, rad, and that of one image point; of an angle, rad, those that points and the lens
-    reach; of a center, px off in u and v.
+    size, beside: of a length, m, and the largest one that is possible; of mixed cameras and other
+    misfits, px rms that is left and noise of a coordinate; of a focal length, its relative range,
+    of a center, its rms, px, and how many times noise that is; of rays the error, rad, and that of
+    a coordinate of an image point; of an angle, rad, those that points and the lens reach; of a
+    center, px off in u and v.
     groups: frames by number, those of each camera or state, or those that differ most; names: the
     photographs of these, as far as they are known.
     """

@@ -16,6 +16,8 @@ from fisheye_svp_ros.reporting.blocks import page, png_uri
 from fisheye_svp_ros.reporting.calibrated_camera import CalibratedCamera
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, drawing, round_number
 from fisheye_svp_ros.reporting.wording.calibration import (
+    ANY_TARGET,
+    ANY_TARGET_NOTE,
     STANDARD_ERRORS,
     calibration_warnings,
     estimate_sentence,
@@ -41,6 +43,8 @@ def write_calibration_report(
             'calibration.html',
             command=command,
             standard_errors=STANDARD_ERRORS,
+            any_target=ANY_TARGET,
+            any_target_note=ANY_TARGET_NOTE,
             cameras=[_camera(name, camera) for name, camera in cameras.items()],
         ),
     )

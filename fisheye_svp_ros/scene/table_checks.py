@@ -12,11 +12,17 @@ from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras, select_cameras
 
 ROUNDING = 1e-7  # px: what is simulated without noise scatters by less, nothing measured does
+MAX_TARGET_SIZE = 20.0  # m; a target larger than this was measured in other units
 _MIN_SIGMA, _MIN_SIGMA_SHARE = 1e-6, 1e-3  # px, and of the median
 SIGMA_BOUND = f'{_MIN_SIGMA:g} px or more, and {_MIN_SIGMA_SHARE:g} of the median or more'
 _COPIED_SHARE = 0.5  # of the image points: no two photographs have so many alike
 _PLACE_TOLERANCE = 1e-3  # of a target's extent: more than places that are written less exactly
 _MANY_POINTS, _MIN_POINTS = 1500, 24  # of a thinned table, and of a view that stays whole
+
+
+def target_size(table: Observations) -> float:
+    """Return the largest extent of the landmarks along x, y or z, m."""
+    return float((table.xyz.max(axis=0) - table.xyz.min(axis=0)).max())
 
 
 def implausible_sigma(sigma: Array) -> Mask:

@@ -14,6 +14,7 @@ from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, FlawKind, diagnose
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import write_observations
+from fisheye_svp_ros.optics.camera import back_project
 from fisheye_svp_ros.reporting.wording.first_screen import (
     first_screen,
     terminal_lines,
@@ -103,7 +104,19 @@ def test_angle_of_the_points_is_told():
     assert np.degrees(flaw.size) == pytest.approx(11, abs=3)
     said = screen(diagnosed('central'))
     assert 'nothing is known beyond' in said
-    assert re.search(r'Undecided about the lens beyond \d+ deg; keep it within, or', said)
+    assert re.search(r'Undecided about the lens beyond \d+ deg; use it within, or', said)
+
+
+def test_landmarks_that_were_not_seen_reach_no_angle():
+    """Landmarks behind the edge of the image counted: 130 deg instead of 90."""
+    table, (width, height) = flawed('sound')
+    inside = np.hypot(*(table.uv - [width / 2, height / 2]).T) < 250
+    part = table.take(np.flatnonzero(inside))
+    lens = calibrate(part, 'kannala_brandt', (width, height)).adjusted.lens
+    found = diagnose(part, lens, options=DiagnosisOptions(quick=True))
+    assert found.adequacy.reached == pytest.approx(
+        back_project(lens, part.uv).theta.max(), abs=0.01
+    )
 
 
 def test_a_lens_known_in_part_is_told_by_every_command(tmp_path, capsys):

@@ -169,6 +169,6 @@ def test_a_lens_that_is_not_recommended_is_not_offered(
     offered = found['decision']['lens']['say'] in ('use_extended', 'recalibrate')
     page = (out / 'report.html').read_text()
     assert ('/extended_lens.yaml' in page) == offered
-    assert ('Correct it by extended_lens.yaml' in page) <= offered
+    assert ('Use it with extended_lens.yaml' in page) <= offered
     first = (out / 'extended_lens.yaml').read_text().partition('\n')[0]
     assert first.startswith('# It is not known to be better than') == (not offered)

@@ -335,7 +335,7 @@ def test_lenses_before_predict_held_out_frames_with_their_own_rig(longer):
     written = adjust(trained, initial_state(trained, left, [right]), ())
     posed = Linearization(data, localize_frames(data, written), ())
     assert found.evaluation.as_given_px == pytest.approx(posed.rms_px, rel=1e-3)
-    said = f'held-out error {posed.rms_px:.3g} px as given, with intrinsics refitted '
+    said = f'held-out error {posed.rms_px:.3g} px with the lens as given, '
     assert said in first_screen(found, 'table').facts
 
 

@@ -117,13 +117,13 @@ def test_ray_errors_are_stated_at_the_range_that_is_asked_for() -> None:
     assert [one.range_m for one in rays['given']] == [0.3, 1.0, 5.0, 0.5]
     near, far, _, asked = (one.value for one in rays['extended'])
     assert min(near, far) * 0.8 < asked < max(near, far) * 1.1
-    assert 'mrad at 0.5 m' in first_screen(found, 'table').facts
+    assert 'mrad at 0.5 m' in first_screen(found, 'table').accuracy
     with pytest.raises(ParameterError, match='a distance in m'):
         DiagnosisOptions(range_m=0.0)
 
 
 def test_a_shift_that_no_lens_can_have_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('fisheye_svp_ros.diagnosis.findings._MAX_SHIFT', 1e-3)
+    monkeypatch.setattr('fisheye_svp_ros.diagnosis.findings.MAX_SHIFT', 1e-3)
     found = diagnosed(0.006, 0.02, options=DiagnosisOptions(quick=True))
     reasons = {one.effect: one.reason for one in found.candidates}
     assert reasons['viewpoint_shift'] is Reason.IMPLAUSIBLE

@@ -18,7 +18,12 @@ LENS = {
     'keep': ['Keep the lens'],
     'use_extended': ['Use '],
     'recalibrate': ['Do not use the lens as given'],
-    'undecided': ['Undecided about the lens', 'cannot be judged by these data'],
+    'undecided': [
+        'Undecided about the lens',
+        'Do not rely on the lens',
+        'Do not use a lens that was calibrated from these data',
+        'cannot be judged before lengths are in m',
+    ],
 }
 # Status: least and largest probability.
 RANGES = {
@@ -195,7 +200,8 @@ def _screen(document: Document, screen: str) -> Iterator[str]:
     for cause in document['causes']:
         if cause['effect'] not in causes:
             yield f'{cause["effect"]} is not among the causes of the screen'
-        if cause['status'] != 'confirmed' and f'{cause["status"]}, ' not in causes:
+        certain = cause['status'] == 'confirmed' or 'none can be trusted' in causes
+        if not certain and f'{cause["status"]}, ' not in causes:
             yield f'{cause["effect"]} is {cause["status"]}, which the screen does not say'
     for entry in document['candidates']:
         for word in re.findall(

@@ -20,13 +20,18 @@ from fisheye_svp_ros.diagnosis import (
     Diagnosis,
     DiagnosisOptions,
     Finding,
+    Flaw,
+    FlawKind,
     Reason,
     diagnose,
 )
+from fisheye_svp_ros.diagnosis.adequacy import Adequacy, judge_data
 from fisheye_svp_ros.diagnosis.decision import EffectBound, Figure
+from fisheye_svp_ros.diagnosis.findings import MAX_SHIFT
 from fisheye_svp_ros.diagnosis.variance_budget import Structure
 from fisheye_svp_ros.reporting.diagnosis_plots import point_residuals
 from fisheye_svp_ros.reporting.diagnosis_report import write_report
+from fisheye_svp_ros.reporting.wording.adequacy import frame_list
 from fisheye_svp_ros.reporting.wording.causes import percent, size
 from fisheye_svp_ros.reporting.wording.diagnosis import (
     lens_contents,
@@ -43,6 +48,7 @@ from fisheye_svp_ros.reporting.wording.first_screen import (
     verdict_words,
 )
 from fisheye_svp_ros.reporting.wording.next_steps import ReportInputs, command_to_go_on
+from fisheye_svp_ros.scene.table_checks import MAX_TARGET_SIZE
 
 
 @pytest.fixture(scope='module')
@@ -77,6 +83,7 @@ def test_bounds_are_read_in_percent_and_millimetres(found: Diagnosis) -> None:
     ]
     said = first_screen(_deciding(found, 'lens', bound=bounds), 'table').bound
     assert 'decentering up to 0.12 % (' in said
+    assert said.endswith('; px at the edge, 95 %')
     assert 'viewpoint_shift up to 0.4 mm (' in said
 
 
@@ -125,16 +132,101 @@ def test_an_impossible_shift_asks_for_the_unit_first(found: Diagnosis) -> None:
     shift = Finding(
         'viewpoint_shift(order=1)', Reason.IMPLAUSIBLE, 1e-9, 1e-8, parameters=parameters
     )
-    said = headline(replace(found, candidates=[shift]))
-    assert said.startswith('A shift of 49 mm is larger than in any real lens: are lengths in m? ')
-    undecided = replace(found.decision['lens'], say='undecided')
-    inputs = ReportInputs('a.csv', ('l.yaml',), None, None, Path('out'), True)
-    assert command_to_go_on(found, inputs)
-    open_one = replace(found, candidates=[shift], decision=found.decision | {'lens': undecided})
-    assert headline(open_one).endswith(
-        ' Undecided about the lens; check the unit of lengths first.'
+    adequacy = judge_data(found.evaluation, [], found.components, found.ray_error, [shift])
+    assert adequacy.flaws[0] == Flaw(FlawKind.SHIFT_TOO_LARGE, 0.049, MAX_SHIFT)
+    assert _flawed(found, adequacy)[0] == (
+        'The viewpoint would shift by 49 mm, more than in any real lens: x, y, z are probably not '
+        'in m. The lens cannot be judged before lengths are in m.'
     )
-    assert command_to_go_on(open_one, inputs) == ''
+
+
+def test_a_board_in_mm_is_no_reason_for_another_lens(found: Diagnosis) -> None:
+    """Once "Use extended_lens.yaml" for a board of 200 m, its bend 1.3 m."""
+    large = Flaw(FlawKind.TARGET_TOO_LARGE, 200.0, MAX_TARGET_SIZE)
+    said = _flawed(replace(found, causes=[_tilt(0.005, 0.002)]), Adequacy((large,), 1.0))
+    assert said[0].startswith('The target is 200 m across: x, y, z must be in m, not in mm. ')
+    assert 'Causes: none can be trusted in such data (sensor_tilt)' in said
+    assert said[-1] == 'Next: fisheye-svp diagnose IN_METERS.csv --lens l.yaml -o diagnosis'
+
+
+def _flawed(found: Diagnosis, adequacy: Adequacy) -> list[str]:
+    """Return the lines of a terminal about data of which something is wrong."""
+    flawed = replace(found, adequacy=adequacy, decision=adequacy.revise(found.decision))
+    inputs = ReportInputs('a.csv', ('l.yaml',), None, None, Path('out'), True)
+    return terminal_lines(first_screen(flawed, 'table'), command_to_go_on(flawed, inputs))
+
+
+def test_data_that_no_lens_fits_have_a_next_step(found: Diagnosis) -> None:
+    """The line "Next" was missing, and frames were cut: "frames 0, 2, 4, 6 and 4 more"."""
+    groups = tuple(range(0, 16, 2)), tuple(range(1, 16, 2))
+    mixed = Flaw(FlawKind.CAMERAS_MIXED, 4.5, 0.05, groups)
+    said = _flawed(found, Adequacy((mixed,), 1.0))
+    assert said[0] == (
+        'Two groups of frames are of two cameras, one lens leaves 4.5 px (noise 0.071 px): frames '
+        '0, 2, … 14; frames 1, 3, … 15. Do not use a lens that was calibrated from these data.'
+    )
+    size = f'{found.lens.width}x{found.lens.height}'
+    assert said[-1] == (
+        f'Next: fisheye-svp calibrate ONE_GROUP.csv --image-size {size} -o new_lens.yaml'
+    )
+    assert not any(line.startswith(('Accuracy', 'Not ')) for line in said)
+
+
+@pytest.mark.parametrize(
+    ('frames', 'names', 'text'),
+    [
+        ([4], (), 'frame 4'),
+        ([0, 1, 2, 3], (), 'frames 0 to 3'),
+        ([0, 1, 5, 7, 8, 9], (), 'frames 0, 1, 5, 7 to 9'),
+        ([1, 4, 7, 10], (), 'frames 1, 4, … 10'),
+        (
+            [*range(0, 30, 3), 31],
+            (),
+            'frames 0, 3, 6, 9, 12, 15, 18, 21 and 3 more (all in diagnosis.json)',
+        ),
+        ([1, 2], ('1.jpg', '2.jpg'), '1.jpg, 2.jpg'),
+    ],
+)
+def test_frames_are_listed_in_ranges(frames: list[int], names: tuple[str, ...], text: str) -> None:
+    assert frame_list(frames, names) == text
+
+
+@pytest.mark.parametrize(('say', 'lens'), [('keep', 'given'), ('use_extended', 'extended')])
+def test_accuracy_is_that_of_the_lens_to_be_used(found: Diagnosis, say: str, lens: str) -> None:
+    """A reader did not know what error to reckon with."""
+    said = first_screen(_deciding(found, 'lens', say=say), 'table').accuracy
+    error = found.ray_error_mrad()[lens][1]
+    assert f'off by about {error["value"]:.2g} mrad at 1 m (95 %: {error["low"]:.2g} to ' in said
+    assert f'Within {np.degrees(found.adequacy.reached):.0f} deg' in said
+    assert ('of the lens as given by' in said) == (say == 'use_extended')
+
+
+def test_an_undecided_lens_may_be_used_where_its_error_does_no_harm(found: Diagnosis) -> None:
+    undecided = _deciding(found, 'lens', say='undecided')
+    said = first_screen(undecided, 'table').accuracy
+    assert 'rays of the lens as given' in said
+    assert said.endswith('meanwhile use it only where that is good enough')
+    high = found.ray_error_mrad()['given'][1]['high']
+    assert f'; until then it is good to {high:.2g} mrad at 1 m (95 %).' in headline(undecided)
+
+
+def test_what_remains_is_said_beside_a_better_lens(found: Diagnosis) -> None:
+    """Once "Use extended_lens.yaml" and "Enough" at seven times the noise."""
+    left = 5 * 2**0.5 * found.noise_px
+    better = _deciding(found, 'lens', say='use_extended')
+    better = replace(better, file=found.file._replace(given_px=2 * left, extended_px=left))
+    said = terminal_lines(first_screen(better, 'table'), '')
+    assert said[0].endswith(f' (95 %); {left:.3f} px remain, 5.0 times the noise.')
+    (accuracy,) = (line for line in said if line.startswith('Accuracy'))
+    assert f'Held-out points are predicted to {left:.3f} px, 5.0 times the noise' in accuracy
+    noise = replace(better, file=found.file._replace(given_px=2 * left, extended_px=left / 5))
+    assert 'remain' not in headline(noise)
+
+
+def test_the_headline_counts_the_causes_that_it_does_not_name(found: Diagnosis) -> None:
+    tilt = _tilt(0.005, 0.002)
+    more = [replace(tilt, form=name) for name in ('decentering', 'skew')]
+    assert '; 2 more causes below. ' in headline(replace(found, causes=[tilt, *more]))
 
 
 def test_the_headline_says_that_the_target_is_imperfect_too(found: Diagnosis) -> None:
@@ -252,8 +344,8 @@ def test_a_likely_shift_is_not_told_as_no_model_error(found: Diagnosis) -> None:
     """The headline was "No model error shows in these data. Use extended_lens.yaml."."""
     likely = replace(_deciding(found, 'lens', say='use_extended'), causes=[], remaining=[])
     assert likely.verdict == 'adequate'
-    assert headline(likely) == (
-        'No model error is confirmed in these data. Use extended_lens.yaml.'
+    assert headline(likely).startswith(
+        'No model error is confirmed in these data. Use extended_lens.yaml: good to '
     )
     assert verdict_words(likely) == 'Adequate: no model error is confirmed in these data'
     wrong, gained, _ = verdict_sentences(likely)
@@ -306,7 +398,7 @@ def test_words_about_the_target_agree_with_its_decision(found: Diagnosis) -> Non
     assert not kept.offers_extended
     assert target_words(kept) == 'Correct the target: measure it, or flatten or replace it'
     offered = _deciding(kept, 'lens', say='use_extended')
-    assert target_words(offered).startswith('Correct it by extended_lens.yaml')
+    assert target_words(offered).startswith('Use it with extended_lens.yaml')
 
 
 def test_without_a_cause_the_truth_is_told_once(found: Diagnosis) -> None:

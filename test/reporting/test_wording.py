@@ -87,7 +87,8 @@ def test_every_reason_is_a_short_clause(
         (
             LensReason.PREDICTS_BETTER,
             LENS,
-            'on the same corrected target it takes the held-out error from 0.123 to 0.081 px',
+            'it predicts held-out frames to 0.081 px, the lens as given to 0.123 px, the same '
+            'corrected target in both',
         ),
         (
             LensReason.EFFECT_POSSIBLE,
@@ -111,8 +112,7 @@ def test_every_reason_is_a_short_clause(
             LensReason.NO_CAUSE_CONFIRMED,
             LENS._replace(offset=LensOffset(0.3, 0.8, 0.6, 0.1)),
             'no cause in the lens is confirmed and its parameters agree with these data within '
-            'their errors; effects that these data do not exclude cause at most 0.32 px '
-            '(0.58 mrad) at the edge',
+            'their errors',
         ),
         (
             TargetReason.OFFSETS_BELOW_NOISE,
@@ -122,8 +122,7 @@ def test_every_reason_is_a_short_clause(
         (
             TargetReason.CORRECTION_GAINS,
             TARGET,
-            'board 0 is bent by 0.81 mm; the correction removes 82 % of the squared held-out '
-            'error',
+            'board 0 is bent by 0.81 mm; held-out frames confirm it',
         ),
         (
             PhotographsReason.SOME_ARE_WRONG,

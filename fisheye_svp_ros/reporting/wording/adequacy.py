@@ -6,12 +6,17 @@ from collections.abc import Sequence
 from math import degrees
 from typing import Any
 
+import numpy as np
+
 from fisheye_svp_ros.diagnosis import Flaw, FlawKind
 
-NOT_CERTAIN = 'not certain, since the data are inadequate'
 _COUNTS = {2: 'two', 3: 'three', 4: 'four'}
-_MAX_FRAMES = 4  # by name
+_MAX_FRAMES = 4  # by name, and of those that differ most
+_MAX_RUNS = 8  # of frame numbers
+_UNIT_REMEDY = 'correct the unit of x, y, z, and diagnose again'
 _REMEDIES = {
+    FlawKind.TARGET_TOO_LARGE: _UNIT_REMEDY,
+    FlawKind.SHIFT_TOO_LARGE: _UNIT_REMEDY,
     FlawKind.CAMERAS_MIXED: 'calibrate each group of frames by itself',
     FlawKind.FOCAL_VARIES: 'switch off zoom, autofocus and stabilization, and take all again; '
     'if two cameras are mixed, calibrate each by itself',
@@ -22,9 +27,14 @@ _REMEDIES = {
     FlawKind.ANGLE_SHORT: 'take photographs with the board near the edges of the image',
     FlawKind.OFF_CENTER: 'check the image size, and that images are not cropped',
 }
-_OF_TARGET = {
-    True: 'nothing is known of it while frames contradict each other',
-    False: 'its errors show only where the points are',
+_OF_LENS_MISFIT = {
+    False: 'of another lens they say nothing',
+    True: 'shifts, bends and ray errors are stated for lengths in m',
+}
+_OF_LENS = {
+    FlawKind.LENS_UNKNOWN: 'these views leave its parameters open',
+    FlawKind.ANGLE_SHORT: 'beyond its points, its curve is extrapolated',
+    FlawKind.OFF_CENTER: 'no sound image has its center there',
 }
 
 
@@ -32,11 +42,18 @@ def flaw_statement(flaw: Flaw) -> str:
     """Return what is wrong as a clause."""
     of = f' of {flaw.camera}' if flaw.camera else ''
     groups = [frame_list(*pair) for pair in zip(flaw.groups, _names(flaw), strict=True)]
+    if flaw.kind == FlawKind.TARGET_TOO_LARGE:
+        return f'the target is {flaw.size:.0f} m across: x, y, z must be in m, not in mm'
+    if flaw.kind == FlawKind.SHIFT_TOO_LARGE:
+        return (
+            f'the viewpoint would shift by {1e3 * flaw.size:.0f} mm, more than in any real lens: '
+            'x, y, z are probably not in m'
+        )
     if flaw.kind == FlawKind.CAMERAS_MIXED:
         count = _COUNTS.get(len(groups), str(len(groups)))
         return (
-            f'{count} groups of frames fit {count} cameras, not one ({flaw.size:.2g} px, noise '
-            f'{flaw.beside:.2g} px): {"; ".join(groups)}'
+            f'{count} groups of frames are of {count} cameras, one lens leaves {flaw.size:.2g} px '
+            f'({_noise(flaw)}): {"; ".join(groups)}'
         )
     if flaw.kind == FlawKind.FOCAL_VARIES:
         return (
@@ -46,19 +63,19 @@ def flaw_statement(flaw: Flaw) -> str:
     if flaw.kind == FlawKind.CENTER_VARIES:
         return (
             f'the image{of} is shifted by {flaw.size:.2g} px rms from frame to frame, most in '
-            f'{groups[0]}'
+            f'{_first_frames(flaw)}'
         )
     if flaw.kind == FlawKind.FRAMES_DIFFER:
         return (
-            f'frames contradict each other: {flaw.size:.2g} px are left, noise {flaw.beside:.2g} '
-            f'px, most in {groups[0]}'
+            f'frames contradict each other: {flaw.size:.2g} px are left ({_noise(flaw)}), most in '
+            f'{_first_frames(flaw)}'
         )
     if flaw.kind == FlawKind.NO_FIT:
-        return f'{flaw.size:.2g} px are left, noise {flaw.beside:.2g} px: no camera fits'
+        return f'no camera fits: {flaw.size:.2g} px are left ({_noise(flaw)})'
     if flaw.kind == FlawKind.LENS_UNKNOWN:
         return (
             f'rays{of} are known to {1e3 * flaw.size:.2g} mrad only, even where points are '
-            f'(noise of a point {1e3 * flaw.beside:.2g} mrad)'
+            f'(noise of a point: {1e3 * 2**0.5 * flaw.beside:.2g} mrad)'
         )
     if flaw.kind == FlawKind.ANGLE_SHORT:
         return (
@@ -84,10 +101,16 @@ def flaw_headline(flaw: Flaw) -> str:
 
 def flaw_reason(flaws: Sequence[Flaw], about: str) -> str:
     """Return why nothing else is said about `lens`, `target` or `photographs`, as a clause."""
+    worst = flaws[0].kind
     if about == 'lens':
-        return '; '.join(flaw_statement(flaw) for flaw in flaws)
+        first = _OF_LENS_MISFIT[worst.is_unit] if worst.is_misfit else _OF_LENS[worst]
+        return '; '.join([first, *map(flaw_statement, flaws[1:])])
     if about == 'target':
-        return _OF_TARGET[flaws[0].kind.is_misfit]
+        if worst.is_unit:
+            return 'its errors are stated in the wrong unit'
+        if worst.is_misfit:
+            return 'nothing is known of it while one lens does not fit the frames'
+        return 'such views do not tell its errors from those of the lens'
     return '; '.join(dict.fromkeys(flaw_remedy(flaw) for flaw in flaws))
 
 
@@ -106,15 +129,35 @@ def flaw_document(flaw: Flaw) -> dict[str, Any]:
 
 
 def frame_list(frames: Sequence[int], names: Sequence[str] = ()) -> str:
-    """Return frames as one enumerates them: a range, or the first ones and how many more."""
+    """Return frames as one enumerates them, ranges as such; of many, the first ones."""
     if names:
-        more = len(names) - _MAX_FRAMES
-        return ', '.join(names[:_MAX_FRAMES]) + (f' and {more} more' if more > 0 else '')
-    if len(frames) > 2 and [*frames] == [*range(frames[0], frames[-1] + 1)]:
-        return f'frames {frames[0]} to {frames[-1]}'
-    more = len(frames) - _MAX_FRAMES
-    listed = ', '.join(map(str, frames[:_MAX_FRAMES])) + (f' and {more} more' if more > 0 else '')
-    return f'frame{"s" * (len(frames) > 1)} {listed}'
+        return _first_of([(name, 1) for name in names], _MAX_FRAMES)
+    step = frames[1] - frames[0] if len(frames) > 2 else 0
+    if step > 1 and [*frames] == [*range(frames[0], frames[-1] + 1, step)]:
+        return f'frames {frames[0]}, {frames[1]}, … {frames[-1]}'
+    runs = np.split(np.array(frames), np.flatnonzero(np.diff(frames) != 1) + 1)
+    words = [
+        (f'{run[0]} to {run[-1]}' if len(run) > 2 else ', '.join(map(str, run)), len(run))
+        for run in runs
+    ]
+    return f'frame{"s" * (len(frames) > 1)} {_first_of(words, _MAX_RUNS)}'
+
+
+def _first_of(parts: Sequence[tuple[str, int]], most: int) -> str:
+    """Return the first of some parts, how many frames the others are, and where these are."""
+    more = sum(count for _, count in parts[most:])
+    rest = f' and {more} more (all in diagnosis.json)' if more else ''
+    return ', '.join(words for words, _ in parts[:most]) + rest
+
+
+def _first_frames(flaw: Flaw) -> str:
+    """Return those of the frames that differ most."""
+    return frame_list(sorted(flaw.groups[0][:_MAX_FRAMES]), _names(flaw)[0][:_MAX_FRAMES])
+
+
+def _noise(flaw: Flaw) -> str:
+    """Return what noise alone would leave, as the rms of both coordinates."""
+    return f'noise {2**0.5 * flaw.beside:.2g} px'
 
 
 def _names(flaw: Flaw) -> tuple[tuple[str, ...], ...]:

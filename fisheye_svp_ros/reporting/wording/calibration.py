@@ -15,8 +15,12 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.reporting.calibrated_camera import CalibratedCamera
 
 STANDARD_ERRORS = (
-    'standard errors include local errors of target, frames and image, and the '
-    'shape and scale of the target'
+    'standard errors allow for local errors of target, frames and image, and for a target that is '
+    'off its stated shape and scale by as much as is likely'
+)
+ANY_TARGET = '95 %, any target'  # heads the range of a parameter
+ANY_TARGET_NOTE = (
+    f'{ANY_TARGET}: if its shape and scale are as wrong as can go unnoticed, not only as is likely'
 )
 _WORTH_SAYING = 1.001  # residuals over those of least squares
 _MODEL_ERROR_RATIO = 2.0  # times the noise, from which residuals show a model error
@@ -73,12 +77,13 @@ def _fit_warnings(camera: CalibratedCamera) -> list[str]:
         texts.append(
             f'{camera.model} leaves {rms:.1f} px: the model does not fit this lens, or '
             'image points and landmarks do not match (check order, units, axes, '
-            'image size)'
+            'image size); do not use it'
         )
     elif rms > _MODEL_ERROR_RATIO * 2**0.5 * noise:
         texts.append(
             f'{rms:.2g} px are {rms / noise / 2**0.5:.1f} times the noise of image '
-            'points: lens or target has a model error; run `fisheye-svp diagnose`'
+            'points: lens, target or data have a model error; before you use this lens, run '
+            '`fisheye-svp diagnose`'
         )
     if result.beyond:
         texts.append(

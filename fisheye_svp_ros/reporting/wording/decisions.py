@@ -90,8 +90,8 @@ def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
         LensReason.ONE_FRAME: f'{_ONE_FRAME}; take {MIN_FRAMES} frames or more',
         LensReason.INTRINSICS_WRONG: 'the lens as given is wrong in '
         f'{", ".join(facts.wrong_intrinsics)}',
-        LensReason.PREDICTS_BETTER: 'on the same corrected target it takes the held-out error '
-        f'from {pixels(file.given_px)} to {pixels(file.extended_px)} px'
+        LensReason.PREDICTS_BETTER: f'it predicts held-out frames to {pixels(file.extended_px)} '
+        f'px, the lens as given to {pixels(file.given_px)} px, the same corrected target in both'
         f'{_unconfirmed_clause(facts)}',
         LensReason.RAYS_BETTER: 'the expected error of its rays is '
         f'{facts.rays[1]:.2g} mrad, of the lens as given {facts.rays[0]:.2g} mrad'
@@ -110,11 +110,11 @@ def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
 def _unconfirmed_clause(facts: LensFacts) -> str:
     """Return what the extended lens has without a confirmed cause, as a clause; '' for nothing."""
     if facts.written:
-        parts = ' and '.join(name.replace('_', ' ') for name in facts.written)
-        return f', an unconfirmed {parts} included'
+        parts = ' and '.join(f'the {name.replace("_", " ")}' for name in facts.written)
+        return f'; part of it, {parts}, has no confirmed cause'
     if facts.lens_causes:
         return ''
-    return ', its parameters estimated with errors of the target'
+    return '; its parameters are estimated with errors of the target'
 
 
 def _offset(facts: LensFacts) -> str:
@@ -148,16 +148,9 @@ def _possible_effects(facts: LensFacts) -> str:
 
 
 def _no_cause_clause(facts: LensFacts) -> str:
-    worst = max(facts.bounds, key=lambda bound: bound.edge_px, default=None)
     agrees = facts.offset is not None and facts.offset.is_chance
     fit = ' and its parameters agree with these data within their errors' if agrees else ''
-    cost = ''
-    if worst is not None:
-        cost = (
-            f'; effects that these data do not exclude cause at most {worst.edge_px:.2g} px '
-            f'({worst.edge_mrad:.2g} mrad) {bound_location(worst)}'
-        )
-    return f'no cause in the lens is confirmed{fit}{cost}'
+    return f'no cause in the lens is confirmed{fit}'
 
 
 def bound_location(bound: EffectBound) -> str:
@@ -180,8 +173,7 @@ def _target_reasons(facts: TargetFacts) -> dict[TargetReason, str]:
     largest = target_error(facts.largest) if facts.largest else ''
     return {
         TargetReason.CAMERAS_CONTRADICT: 'the cameras contradict each other about its shape',
-        TargetReason.CORRECTION_GAINS: f'{largest}; the correction removes '
-        f'{100 * facts.gain[0]:.0f} % of the squared held-out error',
+        TargetReason.CORRECTION_GAINS: f'{largest}; held-out frames confirm it',
         TargetReason.CORRECTION_GAINS_NOTHING: f'{largest}; the correction does not lower the '
         'held-out error significantly',
         TargetReason.CAUSE_AND_OFFSETS: f'{largest}; in addition, {local}',

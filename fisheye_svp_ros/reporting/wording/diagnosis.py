@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 from fisheye_svp_ros.diagnosis import (
     TURNED,
@@ -12,7 +13,6 @@ from fisheye_svp_ros.diagnosis import (
     Cause,
     Comparison,
     Diagnosis,
-    Finding,
     FlawKind,
     LensReason,
     Reason,
@@ -93,27 +93,47 @@ _MAX_NAMES = 6  # names in one sentence
 _NOISE_RATIO = 1.5  # times the noise, from which an error is more than that
 
 
+class RemainingError(NamedTuple):
+    """What predictions of held-out points leave, rms in px, and how many times the noise."""
+
+    px: float
+    ratio: float
+
+
 def lens_words(d: Diagnosis) -> str:
     """Return what to do about the lens, or the lenses of several cameras."""
+    several = 'es' if len(d.lenses) > 1 else ''
     if d.adequacy.is_misfit:
-        return f'The lens{"es" if len(d.lenses) > 1 else ""} cannot be judged by these data'
+        if d.adequacy.flaws[0].kind.is_unit:
+            return f'The lens{several} cannot be judged before lengths are in m'
+        return 'Do not use a lens that was calibrated from these data'
     decision = d.decision['lens']
-    words = (_OF_RIG if len(d.lenses) > 1 else LENS)[decision.say]
-    if decision.say == 'undecided':
-        flaws, undecided = d.adequacy.flaws, words.partition(';')[0]
-        if impossible_findings(d):
-            return f'{undecided}; check the unit of lengths first'
-        short = all(flaw.kind is FlawKind.ANGLE_SHORT for flaw in flaws)
-        # Where points are, nothing speaks against it.
-        if flaws and short and decision.reason is LensReason.NO_CAUSE_CONFIRMED:
-            angle = math.degrees(min(flaw.size for flaw in flaws))
-            return f'{undecided} beyond {angle:.0f} deg; keep it within, or take more photographs'
+    words = (_OF_RIG if several else LENS)[decision.say]
+    if d.adequacy.flaws:
+        return _of_flawed_data(d, words, f'the lens{several}')
     return words if d.offers_extended or not d.is_lens_off else words.partition(', or ')[0]
 
 
-def impossible_findings(d: Diagnosis) -> list[Finding]:
-    """Return effects that are larger than in any real lens: lengths are in another unit."""
-    return [finding for finding in d.candidates if finding.reason is Reason.IMPLAUSIBLE]
+def _of_flawed_data(d: Diagnosis, words: str, lens: str) -> str:
+    """Return what a lens is good for whose data reach or determine too little."""
+    decision, kinds = d.decision['lens'], {flaw.kind for flaw in d.adequacy.flaws}
+    if decision.say == 'use_extended':
+        return f'{words} for now; take more photographs'
+    if decision.say == 'undecided' and FlawKind.LENS_UNKNOWN in kinds:
+        return f'Do not rely on {lens}; take more photographs'
+    # Where points are, nothing speaks against it.
+    if kinds == {FlawKind.ANGLE_SHORT} and decision.reason is LensReason.NO_CAUSE_CONFIRMED:
+        angle = math.degrees(min(flaw.size for flaw in d.adequacy.flaws))
+        it = f'{angle:.0f} deg; use {"them" if len(d.lenses) > 1 else "it"} within'
+        return f'{words.partition(";")[0]} beyond {it}, or take more photographs'
+    return words
+
+
+def remaining_error(d: Diagnosis) -> RemainingError | None:
+    """Return what the lens that is to be used leaves, the target corrected; None for noise."""
+    px = d.file.extended_px if d.offers_extended else d.file.given_px
+    ratio = px / max(2**0.5 * d.noise_px, 1e-3)
+    return RemainingError(px, ratio) if ratio > _NOISE_RATIO else None
 
 
 def refusal_reason(d: Diagnosis) -> str:

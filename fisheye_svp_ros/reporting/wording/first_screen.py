@@ -6,6 +6,7 @@ The headline is the largest cause, and what to do about the lens.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import degrees
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,17 +23,15 @@ from fisheye_svp_ros.diagnosis import (
     Comparison,
     Decision,
     Diagnosis,
+    FlawKind,
+    LensReason,
     Status,
     frames_of,
     status_of,
 )
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.blocks import image_uri
-from fisheye_svp_ros.reporting.wording.adequacy import (
-    NOT_CERTAIN,
-    flaw_headline,
-    flaw_statement,
-)
+from fisheye_svp_ros.reporting.wording.adequacy import flaw_headline, flaw_statement
 from fisheye_svp_ros.reporting.wording.causes import (
     COMPONENTS,
     HUMAN_UNITS,
@@ -43,7 +42,6 @@ from fisheye_svp_ros.reporting.wording.causes import (
     describe_effect,
     finding_reason,
     most_significant,
-    percent,
     pixels,
     size,
     with_odds,
@@ -57,18 +55,25 @@ from fisheye_svp_ros.reporting.wording.diagnosis import (
     LENS_FILE,
     count_frames,
     frame_ranges,
-    impossible_findings,
     is_assumed,
     known_rows,
     lens_words,
     only_gross,
+    remaining_error,
 )
 from fisheye_svp_ros.reporting.wording.external import travel_sentence
 from fisheye_svp_ros.scene.observations import photograph_names
 
+_AS_GIVEN = 'with the lens as given'
 _MAX_NAMES = 4  # photographs, and candidates, by name
 _MIN_SIGMAS = 2.0  # a size nearer to 0 stands in no headline
 _MIN_CONFIDENCE = 0.5  # what is less is no reason for what a decision says
+_LENS = 'Lens'
+_REMAINING_PARTS = {
+    'lens': '; the largest part stays in the image ({})',
+    'frame': '; the largest part changes with the view ({}), not with the lens: '
+    '`localize --model-error` counts it in poses',
+}
 _THUMBNAIL = 96  # px, the longer side
 _VERDICTS = {
     'adequate': 'Adequate: the simulation of the lens describes these data',
@@ -78,16 +83,15 @@ _VERDICTS = {
 }
 TARGET = {
     'keep': 'Keep the target',
-    'correct': f'Correct it by {LENS_FILE} (valid for this target only)',
+    'correct': f'Use it with {LENS_FILE}, which corrects this target and no other',
     'measure_again': 'Measure the target',
-    'undecided': 'Undecided about the target',
+    'undecided': 'Undecided',
 }
 PHOTOGRAPHS = {
-    'enough': 'Enough',
+    'enough': 'Enough for this answer',
     'more': 'Take more',
     'retake': 'Take some again',
 }
-_INADEQUATE_PHOTOGRAPHS = {'more': 'Take more', 'retake': 'Do not use them together'}
 NO_CONFIRMED_ERROR = 'no model error is confirmed in these data'
 
 
@@ -112,7 +116,8 @@ class Action(NamedTuple):
 class Screen(NamedTuple):
     """What is read first; warning: '' unless an error rises with the causes in the model.
 
-    travel: '' unless there is another set.
+    accuracy: what to reckon with, '' where nothing is known of it; travel: '' unless there is
+    another set.
     """
 
     headline: str
@@ -123,7 +128,7 @@ class Screen(NamedTuple):
     candidates: str
     bound: str
     truth: str
-    causes_title: str = 'Causes'
+    accuracy: str
     travel: str = ''
 
 
@@ -133,9 +138,9 @@ def first_screen(
     """Return the first screen; source: what was diagnosed; known: errors against the truth."""
     paths = _paths(d)
     kind = {'retake': RETAKE, 'more': UNLIKE}.get(d.decision['photographs'].say, '')
-    about = frames_of(d.advice, kind) if kind else []
+    about = frames_of(d.advice, kind) if kind and not d.adequacy.is_misfit else []
     answers: tuple[tuple[str, str, Decision, list[str]], ...] = (
-        ('Lens', lens_words(d), d.decision['lens'], []),
+        (_LENS, lens_words(d), d.decision['lens'], []),
         ('Target', target_words(d), d.decision['target'], []),
         (
             'Photographs',
@@ -166,7 +171,7 @@ def first_screen(
             f'{name} {before}' + (f' → {after}' if after != '-' else '')
             for name, before, after, _ in known_rows(d, known or {})
         ),
-        f'Causes ({NOT_CERTAIN})' if d.adequacy.is_misfit else 'Causes',
+        _accuracy(d),
         '' if d.against is None else travel_sentence(d.against),
     )
 
@@ -182,7 +187,7 @@ def _reason(decision: Decision, d: Diagnosis) -> str:
 
 
 def terminal_lines(screen: Screen, command: str) -> list[str]:
-    """Return the screen as at most ten lines, one more where there is another set."""
+    """Return the screen as at most eleven lines, one more where there is another set."""
     lines = [*filter(None, [screen.travel]), screen.headline, screen.facts]
     lines += [f'Warning: {screen.warning}'] if screen.warning else []
     for action in screen.actions:
@@ -192,7 +197,9 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
             f'{action.about}: {action.do}{names and f": {names}"}. {action.why}'
             f'{action.sure and f" ({action.sure})"}.'
         )
-    lines += [f'{screen.causes_title}: {screen.causes}'] if screen.causes else []
+        if action.about == _LENS and screen.accuracy:
+            lines.append(f'Accuracy: {screen.accuracy}.')
+    lines += [f'Causes: {screen.causes}'] if screen.causes else []
     lines += [f'Against the truth: {screen.truth}'] if screen.truth else []
     lines += [f'Not confirmed: {screen.candidates}'] if screen.candidates else []
     lines += [f'Not excluded: {screen.bound}'] if screen.bound else []
@@ -200,24 +207,87 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
 
 
 def _facts(d: Diagnosis, source: str) -> str:
-    figures = d.figures
     base, named, extended = (
-        quality.heldout_rms_px for quality in (figures.base, figures.named, figures.extended)
+        quality.heldout_rms_px for quality in (d.figures.base, d.figures.named, d.figures.extended)
     )
-    rays, near = d.ray_error_mrad(), ''
-    if rays and d.offers_extended:
-        asked = d.evaluation.problem.options.range_m or 1.0
-        before, after = (
-            next(error['value'] for error in rays[side] if error['range_m'] == asked)
-            for side in ('given', 'extended')
-        )
-        near = f'; ray error {before:.2g} → {after:.2g} mrad at {asked:g} m'
-    given = d.evaluation.as_given_px
-    of_file = '' if given is None else f'{pixels(given)} px as given, with intrinsics refitted '
+    given, refitted = d.evaluation.as_given_px, bool(d.evaluation.intrinsics)
+    errors = [] if given is None else [f'{pixels(given)} px {_AS_GIVEN}']
+    if given is None or pixels(given) != pixels(base):
+        errors.append(f'{pixels(base)} px {"with intrinsics refitted" if refitted else _AS_GIVEN}')
+    if not d.adequacy.is_misfit:
+        errors += [f'{pixels(named)} px with the causes corrected'] if d.causes else []
+        errors.append(f'{pixels(extended)} px with local offsets{" too" if d.causes else ""}')
     return (
-        f'{source}: {d.observations} points in {count_frames(d)}; held-out error {of_file}'
-        f'{pixels(base)} → {pixels(named)} px ({pixels(extended)} px with local offsets), '
-        f'noise {pixels(d.noise_px)} px{near}'
+        f'{source}: {d.observations} points in {count_frames(d)}; held-out error '
+        f'{", ".join(errors)}; noise alone {pixels(2**0.5 * d.noise_px)} px'
+    )
+
+
+class _UsedRays(NamedTuple):
+    """Expected ray errors, mrad, of the lens that is to be used: `used`; range_m: where, m."""
+
+    used: Mapping[str, float]
+    given: Mapping[str, float]
+    range_m: float
+
+    @property
+    def bound(self) -> str:
+        """How good the lens is."""
+        return f'good to {self.used["high"]:.2g} mrad at {self.range_m:g} m (95 %)'
+
+
+def _used_rays(d: Diagnosis) -> _UsedRays | None:
+    """Return how far rays are off by the lens that is to be used; None where that is unknown."""
+    rays = d.ray_error_mrad()
+    if not rays or d.adequacy.is_misfit:
+        return None
+    asked = d.evaluation.problem.options.range_m or 1.0
+    given, extended = (
+        next(error for error in rays[side] if error['range_m'] == asked)
+        for side in ('given', 'extended')
+    )
+    return _UsedRays(extended if d.offers_extended else given, given, asked)
+
+
+def _accuracy(d: Diagnosis) -> str:
+    """Return how far rays are off by the lens that is to be used, where, and what else remains."""
+    rays = _used_rays(d)
+    if rays is None:
+        return ''
+    used, several = rays.used, len(d.lenses) > 1
+    which, other = 'the lens as given', ''
+    if d.offers_extended:
+        which = 'the extended lenses' if several else LENS_FILE
+        other = f'; of the lens as given by {rays.given["value"]:.2g} mrad'
+    lens = next(iter(d.evaluation.problem.inputs.lenses.values()))
+    ratio = used['value'] / (1e3 * max(2**0.5 * d.noise_px, 1e-3) / lens.fx)
+    words = (
+        f'Within {degrees(d.adequacy.reached):.0f} deg, rays of {which}'
+        f'{" (the worst camera)" if several else ""} are off by about {used["value"]:.2g} mrad '
+        f'at {rays.range_m:g} m (95 %: {used["low"]:.2g} to {used["high"]:.2g}), {ratio:.1f} '
+        f'times the noise of a point{other}'
+    )
+    if d.decision['lens'].say == 'undecided' and not d.adequacy.flaws:
+        words += '; meanwhile use it only where that is good enough'
+    return '. '.join(filter(None, [words, _remains(d)]))
+
+
+def _remains(d: Diagnosis) -> str:
+    """Return what is left of held-out points beside noise, mostly of what; '' for nothing."""
+    remaining = remaining_error(d)
+    if remaining is None:
+        return ''
+    # Offsets of landmarks are predicted with either lens.
+    parts = [part for part in d.components if part.stage in _REMAINING_PARTS]
+    largest = max(parts, key=lambda part: part.share - part.named_share, default=None)
+    where = ''
+    if largest is not None and largest.share > largest.named_share:
+        where = _REMAINING_PARTS[largest.stage].format(
+            f'{COMPONENTS[largest.name]}, {largest.sd_px:.2g} px'
+        )
+    return (
+        f'Held-out points are predicted to {pixels(remaining.px)} px, {remaining.ratio:.1f} times '
+        f'the noise{where}'
     )
 
 
@@ -252,10 +322,10 @@ def _confidence(decision: Decision) -> str:
         or decision.confidence < _MIN_CONFIDENCE
     ):
         return ''
-    sure = f'{chance(decision.confidence)} sure'
-    if decision.say == 'use_extended':
-        return f'removes {percent(decision.figure.value)} of the squared error, {sure}'
-    return sure
+    if decision.reason is LensReason.NO_CAUSE_CONFIRMED:
+        return ''  # how sure bounds are stands beside them
+    better = ' that it is better' if decision.say == 'use_extended' else ''
+    return f'{chance(decision.confidence)} sure{better}'
 
 
 def _causes(d: Diagnosis) -> str:
@@ -263,6 +333,9 @@ def _causes(d: Diagnosis) -> str:
 
     Also which frames the others predict worse with it.
     """
+    if d.adequacy.is_misfit and d.causes:
+        names = ', '.join(cause.effect for cause in d.causes)
+        return f'none can be trusted in such data ({names})'
     found = []
     for cause in d.causes:
         worse = frame_ranges(d, cause.refuted_by_frames)
@@ -279,6 +352,9 @@ def _causes(d: Diagnosis) -> str:
 
 
 def _candidates(d: Diagnosis) -> str:
+    if d.adequacy.is_misfit:
+        return ''
+    included = f'{LENS_FILE} includes ' if d.offers_extended else ''
     shifts = d.evaluation.averaged_model.shifts
     others = [
         candidate
@@ -287,7 +363,7 @@ def _candidates(d: Diagnosis) -> str:
     ]
     words = [
         f'{f"{shift.camera} " if shift.camera else ""}viewpoint_shift '
-        f'({belief(status_of(shift.weight, False), shift.weight)}: the extended lens includes '
+        f'({belief(status_of(shift.weight, False), shift.weight)}: {included}'
         f'e0 = {1e3 * shift.e0:.2g} ± {1e3 * shift.stderr:.2g} mm)'
         for shift in shifts
     ]
@@ -306,10 +382,10 @@ def _bound_text(decision: Decision) -> str:
         factor, unit = HUMAN_UNITS.get(bound.unit, (1.0, ''))
         words.append(
             f'{bound.effect} up to {factor * bound.value:.2g} {unit}'.rstrip()
-            + f' ({bound.edge_px:.2g} px, {bound.edge_mrad:.2g} mrad at the edge)'
+            + f' ({bound.edge_px:.2g} px)'
         )
-    place = bound_location(decision.bound[0]) if decision.bound else ''
-    return '; '.join(words) + (f'; {place}' if place.endswith(')') else '')
+    place = f'; px {bound_location(decision.bound[0])}, 95 %' if decision.bound else ''
+    return '; '.join(words) + place
 
 
 def _paths(d: Diagnosis) -> dict[str, str]:
@@ -331,16 +407,30 @@ def _thumbnail(path: str | None) -> str:
 
 def photographs_words(d: Diagnosis) -> str:
     """Return what to do about the photographs."""
-    say = d.decision['photographs'].say
-    return (_INADEQUATE_PHOTOGRAPHS if d.adequacy.is_misfit else PHOTOGRAPHS)[say]
+    if d.adequacy.is_misfit:
+        kind = d.adequacy.flaws[0].kind
+        if kind.is_unit:
+            return 'Do not use this table as it is'
+        return 'Check them' if kind is FlawKind.NO_FIT else 'Do not use them together'
+    return PHOTOGRAPHS[d.decision['photographs'].say]
 
 
 def headline(d: Diagnosis) -> str:
     """Return the largest cause and the decision about the lens, or what is wrong with the data."""
-    doubts = [_capital(finding_reason(one)) for one in impossible_findings(d)]
-    flaws = [f'{flaw_headline(flaw)}.' for flaw in d.adequacy.flaws[:1]]
-    rest = flaws or [f'{largest_cause(d)}{_displaced_landmarks(d)}.']
-    return ' '.join([*doubts, *rest, f'{lens_words(d)}.'])
+    lens = lens_words(d)
+    if d.adequacy.flaws:
+        return f'{flaw_headline(d.adequacy.flaws[0])}. {lens}.'
+    remaining, more = remaining_error(d), len(d.causes) - len(_headline_causes(d))
+    parts = [f'{largest_cause(d)}{_displaced_landmarks(d)}']
+    parts += [f'{more} more cause{"s" * (more > 1)} below'] if more else []
+    if d.causes and d.open_lens is not None:
+        parts.append(unconfirmed_effects(d.open_lens))
+    if d.decision['lens'].say != 'recalibrate' and (rays := _used_rays(d)):
+        undecided = d.decision['lens'].say == 'undecided'
+        lens += f'; until then it is {rays.bound}' if undecided else f': {rays.bound}'
+        if remaining is not None:
+            lens += f'; {pixels(remaining.px)} px remain, {remaining.ratio:.1f} times the noise'
+    return f'{"; ".join(parts)}. {lens}.'
 
 
 def verdict_words(d: Diagnosis) -> str:
@@ -365,6 +455,8 @@ def tone(d: Diagnosis) -> str:
     """Return the verdict whose color the headline has: that of adequate data reassures."""
     if d.adequacy.is_misfit:
         return 'unexplained'
+    if d.adequacy.flaws:
+        return 'partly_explained'
     settled = d.decision['lens'].say == 'keep' and d.decision['photographs'].say == 'enough'
     return 'partly_explained' if d.verdict == 'adequate' and not settled else d.verdict
 
@@ -385,14 +477,11 @@ def largest_cause(d: Diagnosis) -> str:
 
     Two where the lens and the target each have one.
     """
-    causes = sorted(d.causes, key=lambda cause: (-cause.share, cause.p_value))
+    causes = [_sentence(d, cause) for cause in _headline_causes(d)]
     if causes:
-        first, stage = causes[0], causes[0].stage
-        other = next(
-            (rival for rival in causes if {stage, rival.stage} == {'lens', 'target'}), None
+        return ', and '.join(
+            [causes[0], *(f'{other[0].lower()}{other[1:]}' for other in causes[1:])]
         )
-        second = _sentence(d, other) if other else ''
-        return _sentence(d, first) + (f', and {second[0].lower()}{second[1:]}' if second else '')
     if d.frames < 2 and (d.candidates or d.decision['target'].figure.value > 0):
         return 'Errors show in one frame, which does not tell their cause'
     if d.decision['lens'].say == 'recalibrate':
@@ -418,6 +507,14 @@ def largest_cause(d: Diagnosis) -> str:
             else 'No model error shows in these data'
         )
     return 'No effect of the catalog explains the residual error'
+
+
+def _headline_causes(d: Diagnosis) -> list[Cause]:
+    """Return the cause of the largest share, of lens and target one of each."""
+    causes = sorted(d.causes, key=lambda cause: (-cause.share, cause.p_value))
+    stages = {'lens', 'target'}
+    others = [rival for rival in causes if {causes[0].stage, rival.stage} == stages]
+    return [*causes[:1], *others[:1]]
 
 
 def _displaced_landmarks(d: Diagnosis) -> str:

@@ -6,8 +6,8 @@ import shlex
 from pathlib import Path
 from typing import NamedTuple
 
-from fisheye_svp_ros.diagnosis import Diagnosis
-from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE, impossible_findings
+from fisheye_svp_ros.diagnosis import Diagnosis, FlawKind
+from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE
 
 
 class ReportInputs(NamedTuple):
@@ -30,9 +30,12 @@ class ReportInputs(NamedTuple):
 
 
 def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
-    """Return the command to go on with, as a shell takes it; '' where the data are no use."""
-    if diagnosis.adequacy.is_misfit or impossible_findings(diagnosis):
-        return ''
+    """Return the command to go on with, as a shell takes it.
+
+    In capitals: what the user has to make first, where these data are no use.
+    """
+    if diagnosis.adequacy.is_misfit:
+        return _command_for_other_data(diagnosis, inputs)
     d, files = diagnosis, follow_up_files(diagnosis, inputs)
     observations, lenses = (
         files['observations'],
@@ -57,6 +60,22 @@ def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
         )
     used = files['options'] if d.offers_extended else ' '.join(lenses)
     return f'fisheye-svp localize {observations} {used} -o poses'
+
+
+def _command_for_other_data(d: Diagnosis, inputs: ReportInputs) -> str:
+    """Return the command for what replaces data that are no use."""
+    kind = d.adequacy.flaws[0].kind
+    if kind.is_unit:
+        lenses = shlex.join(word for lens in inputs.lens for word in ('--lens', lens))
+        return f'fisheye-svp diagnose IN_METERS.csv {lenses} -o diagnosis'
+    table = {
+        FlawKind.CAMERAS_MIXED: 'ONE_GROUP.csv',
+        FlawKind.FOCAL_VARIES: 'NEW.csv',
+        FlawKind.CENTER_VARIES: 'NEW.csv',
+    }.get(kind, 'CORRECTED.csv')
+    return f'fisheye-svp calibrate {table} {_image_sizes(d)} -o new_lens' + (
+        '' if len(d.lenses) > 1 else '.yaml'
+    )
 
 
 def follow_up_files(diagnosis: Diagnosis, inputs: ReportInputs) -> dict[str, str]:
