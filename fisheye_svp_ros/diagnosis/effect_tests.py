@@ -245,7 +245,7 @@ class EffectTests:
             null.restrict_information(information, included, at)
             for information in (
                 null.information[at[:, None], at],
-                null.information_without_frames(at),
+                null.information_without_frames(at, self._held_out_columns),
             )
         )
         inside, more = np.searchsorted(at, included), np.searchsorted(at, columns)
@@ -253,6 +253,20 @@ class EffectTests:
             _log_marginal(whole, inside, more, prior)
             - np.array([_log_marginal(part, inside, more, prior) for part in parts])
         )
+
+    @cached_property
+    def _held_out_columns(self) -> Index:
+        """The border's columns that held-out frames may be asked about.
+
+        What is in the model, what is significant beside it, and the residual.
+        """
+        null = self.null
+        significant = [
+            null.form_columns(candidate.form)
+            for candidate in self.candidates(null.included_columns, per_frame=False)
+            if candidate.corrected < SIGNIFICANCE and candidate.criterion > 0
+        ]
+        return null.columns_and_residual(np.concatenate([*significant, null.included_columns]))
 
 
 def sum_gains(gains: Array) -> HeldOutGain:

@@ -247,23 +247,22 @@ class NullModel:
         """Information (X + 1, X + 1) of the border, its last row and column the score."""
         return self.factorization.information / self.variances.sigma**2
 
-    def leave_one_out(self, at: Index) -> LeaveOneOut:
+    def leave_one_out(self, at: Index, likely: Index | None = None) -> LeaveOneOut:
         """Return each frame, seen from all the others, of some of the border (m,).
 
-        Often what is in the model is enough, a fifth of all that could be.
+        likely: what else may be asked for; together they take little more than one alone.
         """
-        own = np.append(self.included_columns, len(self.scale))
-        if np.isin(at, own).all():
-            return self._prediction_of_fixed.select(np.searchsorted(own, at))
-        return self._prediction_with_effects.select(at)
+        for known, found in self._left_out:
+            if np.isin(at, known).all():
+                return found.select(np.searchsorted(known, at))
+        columns = np.unique(at if likely is None else np.concatenate([at, likely]))
+        self._left_out.append((columns, self._leave_one_out(columns)))
+        return self.leave_one_out(at)
 
     @cached_property
-    def _prediction_of_fixed(self) -> LeaveOneOut:
-        return self._leave_one_out(np.append(self.included_columns, len(self.scale)))
-
-    @cached_property
-    def _prediction_with_effects(self) -> LeaveOneOut:
-        return self._leave_one_out(np.arange(len(self.scale) + 1))
+    def _left_out(self) -> list[tuple[Index, LeaveOneOut]]:
+        """What was asked for: columns of the border and the frames seen from all the others."""
+        return []
 
     def _leave_one_out(self, at: Index) -> LeaveOneOut:
         return leave_groups_out(
@@ -273,9 +272,12 @@ class NullModel:
             self.fixed.border[..., at],
         )
 
-    def information_without_frames(self, at: Index) -> Array:
-        """Return the information (F, m, m) of all frames but one, of some of the border (m,)."""
-        frames = self.leave_one_out(at).information
+    def information_without_frames(self, at: Index, likely: Index | None = None) -> Array:
+        """Return the information (F, m, m) of all frames but one, of some of the border (m,).
+
+        likely: see `leave_one_out`.
+        """
+        frames = self.leave_one_out(at, likely).information
         return self.information[at[:, None], at] - frames / self.variances.sigma**2
 
     def information_without_poses(self, at: Index) -> Array:
