@@ -43,7 +43,8 @@ STAGE_OF = {
 }
 NAMES = tuple(STAGE_OF)
 OF_LANDMARKS = np.array([name.startswith('landmark') for name in NAMES])  # components
-_NUMEROUS = np.isin(NAMES, ('frame_bumps', 'image_finest'))  # coefficients, seldom called for
+# Of many coefficients, seldom called for: asked for beside all others that are there.
+_NUMEROUS = np.isin(NAMES, ('frame_bumps', 'image_fine', 'image_finest'))
 _IMAGE_GRIDS = (
     ('image_broad', 3, 0.5),
     ('image_coarse', 6, 0.5),

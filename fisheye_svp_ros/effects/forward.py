@@ -30,7 +30,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Views, views_of
 
-_STEP = 1e-4  # px
+_STEP = 1e-6  # px
 _PUPIL_STEPS = 3  # of the angle at which a ray comes, each nearer by the motion over the range
 
 
@@ -189,20 +189,27 @@ class ForwardModel:
                     for rows, i, own in linear.cameras
                 ]
             )
-        for stage, uv in (('image', linear.ideal), ('detector', linear.optical)):
+        for stage, before, after in (
+            ('image', linear.ideal, linear.optical),
+            ('detector', linear.optical, linear.uv),
+        ):
             if self._acts(stage):
-                columns = columns + self._slope(linear, views, stage, uv) @ columns
+                columns = columns + self._slope(linear, views, stage, before, after) @ columns
         return columns
 
-    def _slope(self, linear: LinearViews, views: Views, stage: str, uv: Array) -> Array:
-        """Return the derivatives (S, N, 2, 2) of the displacements of a stage by image points."""
-        scene = Scene(views, self.lens, linear.pose, uv, linear.image.incidence)
+    def _slope(
+        self, linear: LinearViews, views: Views, stage: str, before: Array, after: Array
+    ) -> Array:
+        """Return the derivatives (S, N, 2, 2) of the displacements of a stage by image points.
 
-        def displace(step: Array) -> Array:
-            return np.asarray(self._displace(replace(scene, uv=uv + step), stage))
-
-        moves = [displace(step) - displace(-step) for step in _STEP * np.eye(2)]
-        return np.stack(moves, axis=-1) / (2 * _STEP)
+        before, after (S, N, 2), px: image points without them and with them.
+        """
+        scene = Scene(views, self.lens, linear.pose, before, linear.image.incidence)
+        moves = [
+            self._displace(replace(scene, uv=before + step), stage) - (after - before)
+            for step in _STEP * np.eye(2)
+        ]
+        return np.stack(moves, axis=-1) / _STEP
 
     def back_project(self, uv: Array) -> Rays:
         """Return the rays of image points (S, N, 2), px, in the camera frame."""

@@ -76,6 +76,15 @@ def nearly_localize(model: ForwardModel, views: Views) -> tuple[Pose, Mask]:
     return solved.pose.take(best), solved.converged[best]
 
 
+def improve_poses(model: ForwardModel, views: Views, start: Pose) -> Pose:
+    """Return poses (S,) a few steps from others toward their minima; no other minima are tried.
+
+    Raises GeometryError, naming the frame, for fewer than MIN_POINTS usable points.
+    """
+    still = model.seeing(views).without_motion()
+    return _solve_from(still, views, start, _STARTING_STEPS)[0].pose
+
+
 def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localization:
     """Return the poses of views whose cameras do not move, see `localize`."""
     anywhere = start is None

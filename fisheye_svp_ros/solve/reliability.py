@@ -17,7 +17,13 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.initial_pose import initial_poses
-from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization, localize, residuals
+from fisheye_svp_ros.solve.localization import (
+    MIN_POINTS,
+    Localization,
+    improve_poses,
+    localize,
+    residuals,
+)
 from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
 from fisheye_svp_ros.solve.weak_geometry import hold_weak_geometry
 
@@ -261,7 +267,7 @@ def consensus_pose(
         off = np.minimum(_lengths(model, pose, views), _INFINITE)
         scale = np.maximum(sigma, _median(off, views) / _MEDIAN)[:, None]
         fading = 1 / (1 + (off / (_FADE * scale)) ** 2)
-        pose = localize(model, views._replace(weight=views.weight * fading), pose).pose
+        pose = improve_poses(model, views._replace(weight=views.weight * fading), pose)
     worst = (3 * _GROSS * sigma) ** 2
     squares = np.minimum(_lengths(model, pose, views) ** 2, worst)
     score = np.where(views.weight > 0, squares, 0.0).sum(axis=1)
