@@ -74,7 +74,7 @@ def judge_data(
     candidates: Sequence[Finding],
 ) -> Adequacy:
     """Return what is wrong with the data of an evaluation; candidates: not confirmed."""
-    linear = evaluation.null.linear
+    linear = evaluation.simulation
     reached = float(np.nanmax(linear.scene.theta[linear.data.views.used]))
     flaws = [*_impossible_lengths(evaluation, candidates)]
     flaws += _misfits(evaluation, causes, components)

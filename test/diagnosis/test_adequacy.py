@@ -104,7 +104,7 @@ def test_angle_of_the_points_is_told():
     assert np.degrees(flaw.size) == pytest.approx(11, abs=3)
     said = screen(diagnosed('central'))
     assert 'nothing is known beyond' in said
-    assert re.search(r'Undecided about the lens beyond \d+ deg; use it within, or', said)
+    assert re.search(r'Undecided about the lens beyond \d+ deg; use it only within, or', said)
 
 
 def test_landmarks_that_were_not_seen_reach_no_angle():

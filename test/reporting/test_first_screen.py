@@ -210,6 +210,18 @@ def test_an_undecided_lens_may_be_used_where_its_error_does_no_harm(found: Diagn
     assert f'; until then it is good to {high:.2g} mrad at 1 m (95 %).' in headline(undecided)
 
 
+@pytest.mark.parametrize(('times', 'words'), [(3.2, 'known only to '), (2.8, 'good to ')])
+def test_rays_far_above_the_noise_of_a_point_are_not_called_good(
+    found: Diagnosis, times: float, words: str
+) -> None:
+    """Once "Keep the lens" alone, at nine times the noise of a point."""
+    value = found.ray_error_mrad()['given'][1]['value']
+    (given,) = found.evaluation.problem.inputs.lenses.values()
+    noise = 1e-3 * value / times * given.fx / 2**0.5
+    kept = replace(_deciding(found, 'lens', say='keep'), noise_px=noise)
+    assert f'Keep the lens: {words}' in headline(kept)
+
+
 def test_what_remains_is_said_beside_a_better_lens(found: Diagnosis) -> None:
     """Once "Use extended_lens.yaml" and "Enough" at seven times the noise."""
     left = 5 * 2**0.5 * found.noise_px

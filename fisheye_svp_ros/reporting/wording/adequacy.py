@@ -29,7 +29,7 @@ _REMEDIES = {
 }
 _OF_LENS_MISFIT = {
     False: 'of another lens they say nothing',
-    True: 'shifts, bends and ray errors are stated for lengths in m',
+    True: 'until then, trust no lens, pose or size from these data',
 }
 _OF_LENS = {
     FlawKind.LENS_UNKNOWN: 'these views leave its parameters open',

@@ -15,12 +15,13 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.reporting.calibrated_camera import CalibratedCamera
 
 STANDARD_ERRORS = (
-    'standard errors allow for local errors of target, frames and image, and for a target that is '
-    'off its stated shape and scale by as much as is likely'
+    'standard errors allow for local errors of target, frames and image, and for a target as '
+    'wrong in shape and scale as is likely'
 )
 ANY_TARGET = '95 %, any target'  # heads the range of a parameter
 ANY_TARGET_NOTE = (
-    f'{ANY_TARGET}: if its shape and scale are as wrong as can go unnoticed, not only as is likely'
+    f'{ANY_TARGET}: if it is as wrong in shape and scale as can go unnoticed, not only as is '
+    'likely'
 )
 _WORTH_SAYING = 1.001  # residuals over those of least squares
 _MODEL_ERROR_RATIO = 2.0  # times the noise, from which residuals show a model error

@@ -124,7 +124,7 @@ def _of_flawed_data(d: Diagnosis, words: str, lens: str) -> str:
     # Where points are, nothing speaks against it.
     if kinds == {FlawKind.ANGLE_SHORT} and decision.reason is LensReason.NO_CAUSE_CONFIRMED:
         angle = math.degrees(min(flaw.size for flaw in d.adequacy.flaws))
-        it = f'{angle:.0f} deg; use {"them" if len(d.lenses) > 1 else "it"} within'
+        it = f'{angle:.0f} deg; use {"them" if len(d.lenses) > 1 else "it"} only within'
         return f'{words.partition(";")[0]} beyond {it}, or take more photographs'
     return words
 

@@ -66,6 +66,7 @@ from fisheye_svp_ros.scene.observations import photograph_names
 
 _AS_GIVEN = 'with the lens as given'
 _MAX_NAMES = 4  # photographs, and candidates, by name
+_COARSE_RATIO = 3.0  # times the noise of a point: rays known no better are no good ones
 _MIN_SIGMAS = 2.0  # a size nearer to 0 stands in no headline
 _MIN_CONFIDENCE = 0.5  # what is less is no reason for what a decision says
 _LENS = 'Lens'
@@ -224,16 +225,26 @@ def _facts(d: Diagnosis, source: str) -> str:
 
 
 class _UsedRays(NamedTuple):
-    """Expected ray errors, mrad, of the lens that is to be used: `used`; range_m: where, m."""
+    """Expected ray errors, mrad, of the lens that is to be used, and of the lens as given.
+
+    range_m: where, m; point_mrad: noise of a point, of both coordinates.
+    """
 
     used: Mapping[str, float]
     given: Mapping[str, float]
     range_m: float
+    point_mrad: float
+
+    @property
+    def ratio(self) -> float:
+        """How many times the noise of a point a ray is off."""
+        return self.used['value'] / self.point_mrad
 
     @property
     def bound(self) -> str:
         """How good the lens is."""
-        return f'good to {self.used["high"]:.2g} mrad at {self.range_m:g} m (95 %)'
+        how = 'known only' if self.ratio > _COARSE_RATIO else 'good'
+        return f'{how} to {self.used["high"]:.2g} mrad at {self.range_m:g} m (95 %)'
 
 
 def _used_rays(d: Diagnosis) -> _UsedRays | None:
@@ -246,7 +257,9 @@ def _used_rays(d: Diagnosis) -> _UsedRays | None:
         next(error for error in rays[side] if error['range_m'] == asked)
         for side in ('given', 'extended')
     )
-    return _UsedRays(extended if d.offers_extended else given, given, asked)
+    lens = next(iter(d.evaluation.problem.inputs.lenses.values()))
+    point = 1e3 * max(2**0.5 * d.noise_px, 1e-3) / lens.fx
+    return _UsedRays(extended if d.offers_extended else given, given, asked, point)
 
 
 def _accuracy(d: Diagnosis) -> str:
@@ -259,12 +272,10 @@ def _accuracy(d: Diagnosis) -> str:
     if d.offers_extended:
         which = 'the extended lenses' if several else LENS_FILE
         other = f'; of the lens as given by {rays.given["value"]:.2g} mrad'
-    lens = next(iter(d.evaluation.problem.inputs.lenses.values()))
-    ratio = used['value'] / (1e3 * max(2**0.5 * d.noise_px, 1e-3) / lens.fx)
     words = (
         f'Within {degrees(d.adequacy.reached):.0f} deg, rays of {which}'
         f'{" (the worst camera)" if several else ""} are off by about {used["value"]:.2g} mrad '
-        f'at {rays.range_m:g} m (95 %: {used["low"]:.2g} to {used["high"]:.2g}), {ratio:.1f} '
+        f'at {rays.range_m:g} m (95 %: {used["low"]:.2g} to {used["high"]:.2g}), {rays.ratio:.1f} '
         f'times the noise of a point{other}'
     )
     if d.decision['lens'].say == 'undecided' and not d.adequacy.flaws:
