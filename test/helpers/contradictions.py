@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from math import isnan
 from typing import Any
 
-from fisheye_svp_ros.diagnosis import Diagnosis
+from fisheye_svp_ros.diagnosis import Diagnosis, FlawKind
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
 from fisheye_svp_ros.reporting.wording.first_screen import first_screen, terminal_lines
@@ -196,16 +196,18 @@ def _screen(document: Document, screen: str) -> Iterator[str]:
             yield f'{say}, and the screen {"has" if answer != say else "lacks"} {words!r}'
     if document['adequacy'] and ('Enough' in screen or '% sure' in screen):
         yield 'inadequate data, and the screen reassures'
-    causes = re.split('Against the truth:|Not confirmed:|Next:', screen.partition('Causes')[2])[0]
-    for cause in document['causes']:
+    causes = re.split('Against the truth:|Not confirmed:|Next:', screen.partition('Causes:')[2])[0]
+    misfit = any(FlawKind[one['flaw'].upper()].is_misfit for one in document['adequacy'])
+    if misfit and causes:
+        yield 'no cause can be trusted in such data, and the screen names some'
+    for cause in () if misfit else document['causes']:
         if cause['effect'] not in causes:
             yield f'{cause["effect"]} is not among the causes of the screen'
-        certain = cause['status'] == 'confirmed' or 'none can be trusted' in causes
-        if not certain and f'{cause["status"]}, ' not in causes:
+        if cause['status'] != 'confirmed' and f'{cause["status"]}, ' not in causes:
             yield f'{cause["effect"]} is {cause["status"]}, which the screen does not say'
     for entry in document['candidates']:
         for word in re.findall(
-            rf'(\w+)(?: \([^)]*\))? but not confirmed: {entry["effect"]}', screen
+            rf'(\w+)(?: \([^)]*\))? but not confirmed[^:]*: {entry["effect"]}', screen
         ):
             if entry['status'] == 'refuted':
                 yield f'{entry["effect"]} is refuted and {word}'
@@ -213,6 +215,6 @@ def _screen(document: Document, screen: str) -> Iterator[str]:
                 yield f'{entry["effect"]} is {word} at {entry["probability"]:.2f}'
     for shift in document['lens'].get('averaged_shift', []):
         if shift['weight'] < 0.5 and re.search(
-            'ikely[^;]* not confirmed: viewpoint_shift', screen
+            'ikely[^;]* not confirmed[^:]*: viewpoint_shift', screen
         ):
             yield f'a shift of weight {shift["weight"]:.2f} is likely'

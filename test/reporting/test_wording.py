@@ -87,8 +87,8 @@ def test_every_reason_is_a_short_clause(
         (
             LensReason.PREDICTS_BETTER,
             LENS,
-            'it predicts held-out frames to 0.081 px, the lens as given to 0.123 px, the same '
-            'corrected target in both',
+            'it predicts held-out frames to 0.081 px, the lens as given to 0.123 px, with each '
+            'landmark where the other frames see it',
         ),
         (
             LensReason.EFFECT_POSSIBLE,

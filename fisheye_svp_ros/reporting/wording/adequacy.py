@@ -13,11 +13,11 @@ from fisheye_svp_ros.diagnosis import Flaw, FlawKind
 _COUNTS = {2: 'two', 3: 'three', 4: 'four'}
 _MAX_FRAMES = 4  # by name, and of those that differ most
 _MAX_RUNS = 8  # of frame numbers
-_UNIT_REMEDY = 'correct the unit of x, y, z, and diagnose again'
+_UNIT_REMEDY = 'write x, y, z in m (divide mm by 1000), and diagnose again'
 _REMEDIES = {
     FlawKind.TARGET_TOO_LARGE: _UNIT_REMEDY,
     FlawKind.SHIFT_TOO_LARGE: _UNIT_REMEDY,
-    FlawKind.CAMERAS_MIXED: 'calibrate each group of frames by itself',
+    FlawKind.CAMERAS_MIXED: 'calibrate each group of frames by itself, a table for each',
     FlawKind.FOCAL_VARIES: 'switch off zoom, autofocus and stabilization, and take all again; '
     'if two cameras are mixed, calibrate each by itself',
     FlawKind.CENTER_VARIES: 'switch off stabilization and cropping, and take all again',
@@ -28,7 +28,7 @@ _REMEDIES = {
     FlawKind.OFF_CENTER: 'check the image size, and that images are not cropped',
 }
 _OF_LENS_MISFIT = {
-    False: 'of another lens they say nothing',
+    False: 'a lens from other photographs is neither confirmed nor refuted',
     True: 'until then, trust no lens, pose or size from these data',
 }
 _OF_LENS = {
@@ -74,12 +74,12 @@ def flaw_statement(flaw: Flaw) -> str:
         return f'no camera fits: {flaw.size:.2g} px are left ({_noise(flaw)})'
     if flaw.kind == FlawKind.LENS_UNKNOWN:
         return (
-            f'rays{of} are known to {1e3 * flaw.size:.2g} mrad only, even where points are '
+            f'rays{of} are known to about {1e3 * flaw.size:.2g} mrad only, even where points are '
             f'(noise of a point: {1e3 * 2**0.5 * flaw.beside:.2g} mrad)'
         )
     if flaw.kind == FlawKind.ANGLE_SHORT:
         return (
-            f'points{of} reach {degrees(flaw.size):.0f} deg, the lens is used to '
+            f'points{of} reach {degrees(flaw.size):.0f} deg, the lens claims '
             f'{degrees(flaw.beside):.0f} deg: nothing is known beyond {degrees(flaw.size):.0f} deg'
         )
     return (
@@ -107,7 +107,7 @@ def flaw_reason(flaws: Sequence[Flaw], about: str) -> str:
         return '; '.join([first, *map(flaw_statement, flaws[1:])])
     if about == 'target':
         if worst.is_unit:
-            return 'its errors are stated in the wrong unit'
+            return 'not judged before lengths are in m'
         if worst.is_misfit:
             return 'nothing is known of it while one lens does not fit the frames'
         return 'such views do not tell its errors from those of the lens'

@@ -83,8 +83,8 @@ def _fit_warnings(camera: CalibratedCamera) -> list[str]:
     elif rms > _MODEL_ERROR_RATIO * 2**0.5 * noise:
         texts.append(
             f'{rms:.2g} px are {rms / noise / 2**0.5:.1f} times the noise of image '
-            'points: lens, target or data have a model error; before you use this lens, run '
-            '`fisheye-svp diagnose`'
+            'points: lens, target or data have a model error; do not use this lens before '
+            '`fisheye-svp diagnose` says which'
         )
     if result.beyond:
         texts.append(

@@ -8,6 +8,7 @@ from math import degrees
 from typing import Any
 
 from fisheye_svp_ros.diagnosis import (
+    CONFIRMED_PROBABILITY,
     MIN_FRAMES,
     Action,
     Advice,
@@ -91,8 +92,8 @@ def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
         LensReason.INTRINSICS_WRONG: 'the lens as given is wrong in '
         f'{", ".join(facts.wrong_intrinsics)}',
         LensReason.PREDICTS_BETTER: f'it predicts held-out frames to {pixels(file.extended_px)} '
-        f'px, the lens as given to {pixels(file.given_px)} px, the same corrected target in both'
-        f'{_unconfirmed_clause(facts)}',
+        f'px, the lens as given to {pixels(file.given_px)} px, with each landmark where the other '
+        f'frames see it{_unconfirmed_clause(facts)}',
         LensReason.RAYS_BETTER: 'the expected error of its rays is '
         f'{facts.rays[1]:.2g} mrad, of the lens as given {facts.rays[0]:.2g} mrad'
         f'{_unconfirmed_clause(facts)}',
@@ -111,7 +112,7 @@ def _unconfirmed_clause(facts: LensFacts) -> str:
     """Return what the extended lens has without a confirmed cause, as a clause; '' for nothing."""
     if facts.written:
         parts = ' and '.join(f'the {name.replace("_", " ")}' for name in facts.written)
-        return f'; part of it, {parts}, has no confirmed cause'
+        return f'; part of the gain, {parts}, has no confirmed cause'
     if facts.lens_causes:
         return ''
     return '; its parameters are estimated with errors of the target'
@@ -131,10 +132,13 @@ def _offset(facts: LensFacts) -> str:
 def unconfirmed_effects(facts: LensFacts) -> str:
     """Return the effects for which the lens is undecided, as a clause that says how likely."""
     effects = [bound.effect for bound in facts.possible_effects]
-    how = 'likely' if any(map(facts.is_likely, effects)) else 'possible'
+    how, by = 'likely' if any(map(facts.is_likely, effects)) else 'possible', ''
     if len(effects) == 1 and effects[0] in facts.open:
-        how += f' ({chance(facts.open[effects[0]])})'
-    return f'{how} but not confirmed: {" or ".join(effects)}'
+        probability = facts.open[effects[0]]
+        how += f' ({chance(probability)})'
+        # All else that a cause needs it has.
+        by = ' by held-out frames' if probability >= CONFIRMED_PROBABILITY else ''
+    return f'{how} but not confirmed{by}: {" or ".join(effects)}'
 
 
 def _possible_effects(facts: LensFacts) -> str:

@@ -67,12 +67,13 @@ from fisheye_svp_ros.scene.observations import photograph_names
 _AS_GIVEN = 'with the lens as given'
 _MAX_NAMES = 4  # photographs, and candidates, by name
 _COARSE_RATIO = 3.0  # times the noise of a point: rays known no better are no good ones
+_EXTRAPOLATED_RATIO = 1.1  # of the angle that a lens claims to that of the points
 _MIN_SIGMAS = 2.0  # a size nearer to 0 stands in no headline
 _MIN_CONFIDENCE = 0.5  # what is less is no reason for what a decision says
 _LENS = 'Lens'
 _REMAINING_PARTS = {
-    'lens': '; the largest part stays in the image ({})',
-    'frame': '; the largest part changes with the view ({}), not with the lens: '
+    'lens': '; the largest part ({}) stays in the image',
+    'frame': '; the largest part ({}) changes with the view, not with the lens: '
     '`localize --model-error` counts it in poses',
 }
 _THUMBNAIL = 96  # px, the longer side
@@ -84,14 +85,15 @@ _VERDICTS = {
 }
 TARGET = {
     'keep': 'Keep the target',
-    'correct': f'Use it with {LENS_FILE}, which corrects this target and no other',
-    'measure_again': 'Measure the target',
+    'correct': f'Use it with {LENS_FILE}, whose lens serves any scene, its correction this '
+    'target only',
+    'measure_again': 'For better poses, measure the target',
     'undecided': 'Undecided',
 }
 PHOTOGRAPHS = {
     'enough': 'Enough for this answer',
     'more': 'Take more',
-    'retake': 'Take some again',
+    'retake': 'For a better answer, take some again',
 }
 NO_CONFIRMED_ERROR = 'no model error is confirmed in these data'
 
@@ -182,9 +184,15 @@ def _reason(decision: Decision, d: Diagnosis) -> str:
     why = _capital(decision_reason(decision))
     if decision is not d.decision['photographs'] or not d.turned:
         return why
-    names = [frame.photograph for frame in d.turned]
-    more = f' and {len(names) - _MAX_NAMES} more' if len(names) > _MAX_NAMES else ''
-    return f'{why}; numbered from another end of the board: {", ".join(names[:_MAX_NAMES])}{more}'
+    done = {
+        True: 'numbered from another end of the board, and reordered',
+        False: 'perhaps numbered from another end of the board, and used as they are',
+    }
+    for corrected, words in done.items():
+        names = [frame.photograph for frame in d.turned if frame.corrected == corrected]
+        more = f' and {len(names) - _MAX_NAMES} more' if len(names) > _MAX_NAMES else ''
+        why += f'; {words}: {", ".join(names[:_MAX_NAMES])}{more}' if names else ''
+    return why
 
 
 def terminal_lines(screen: Screen, command: str) -> list[str]:
@@ -208,16 +216,13 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
 
 
 def _facts(d: Diagnosis, source: str) -> str:
-    base, named, extended = (
-        quality.heldout_rms_px for quality in (d.figures.base, d.figures.named, d.figures.extended)
-    )
+    base, named = (quality.heldout_rms_px for quality in (d.figures.base, d.figures.named))
     given, refitted = d.evaluation.as_given_px, bool(d.evaluation.intrinsics)
     errors = [] if given is None else [f'{pixels(given)} px {_AS_GIVEN}']
     if given is None or pixels(given) != pixels(base):
         errors.append(f'{pixels(base)} px {"with intrinsics refitted" if refitted else _AS_GIVEN}')
-    if not d.adequacy.is_misfit:
-        errors += [f'{pixels(named)} px with the causes corrected'] if d.causes else []
-        errors.append(f'{pixels(extended)} px with local offsets{" too" if d.causes else ""}')
+    if d.causes and not d.adequacy.is_misfit:
+        errors.append(f'{pixels(named)} px with the causes corrected')
     return (
         f'{source}: {d.observations} points in {count_frames(d)}; held-out error '
         f'{", ".join(errors)}; noise alone {pixels(2**0.5 * d.noise_px)} px'
@@ -227,12 +232,13 @@ def _facts(d: Diagnosis, source: str) -> str:
 class _UsedRays(NamedTuple):
     """Expected ray errors, mrad, of the lens that is to be used, and of the lens as given.
 
-    range_m: where, m; point_mrad: noise of a point, of both coordinates.
+    range_m, reached: where, m and rad; point_mrad: noise of a point, of both coordinates.
     """
 
     used: Mapping[str, float]
     given: Mapping[str, float]
     range_m: float
+    reached: float
     point_mrad: float
 
     @property
@@ -244,7 +250,8 @@ class _UsedRays(NamedTuple):
     def bound(self) -> str:
         """How good the lens is."""
         how = 'known only' if self.ratio > _COARSE_RATIO else 'good'
-        return f'{how} to {self.used["high"]:.2g} mrad at {self.range_m:g} m (95 %)'
+        where = f'at {self.range_m:g} m within {degrees(self.reached):.0f} deg'
+        return f'{how} to {self.used["high"]:.2g} mrad {where} (95 %)'
 
 
 def _used_rays(d: Diagnosis) -> _UsedRays | None:
@@ -259,7 +266,8 @@ def _used_rays(d: Diagnosis) -> _UsedRays | None:
     )
     lens = next(iter(d.evaluation.problem.inputs.lenses.values()))
     point = 1e3 * max(2**0.5 * d.noise_px, 1e-3) / lens.fx
-    return _UsedRays(extended if d.offers_extended else given, given, asked, point)
+    used = extended if d.offers_extended else given
+    return _UsedRays(used, given, asked, d.adequacy.reached, point)
 
 
 def _accuracy(d: Diagnosis) -> str:
@@ -273,13 +281,16 @@ def _accuracy(d: Diagnosis) -> str:
         which = 'the extended lenses' if several else LENS_FILE
         other = f'; of the lens as given by {rays.given["value"]:.2g} mrad'
     words = (
-        f'Within {degrees(d.adequacy.reached):.0f} deg, rays of {which}'
+        f'Within {degrees(rays.reached):.0f} deg, rays of {which}'
         f'{" (the worst camera)" if several else ""} are off by about {used["value"]:.2g} mrad '
         f'at {rays.range_m:g} m (95 %: {used["low"]:.2g} to {used["high"]:.2g}), {rays.ratio:.1f} '
         f'times the noise of a point{other}'
     )
     if d.decision['lens'].say == 'undecided' and not d.adequacy.flaws:
         words += '; meanwhile use it only where that is good enough'
+    claimed = min(lens.max_incidence for lens in d.lenses.values())
+    if claimed > _EXTRAPOLATED_RATIO * rays.reached and not d.adequacy.flaws:
+        words += f'; beyond, to {degrees(claimed):.0f} deg, it is extrapolated'
     return '. '.join(filter(None, [words, _remains(d)]))
 
 
@@ -297,8 +308,8 @@ def _remains(d: Diagnosis) -> str:
             f'{COMPONENTS[largest.name]}, {largest.sd_px:.2g} px'
         )
     return (
-        f'Held-out points are predicted to {pixels(remaining.px)} px, {remaining.ratio:.1f} times '
-        f'the noise{where}'
+        f'Single points are off by {pixels(remaining.px)} px, {remaining.ratio:.1f} times the '
+        f'noise{where}'
     )
 
 
@@ -344,9 +355,8 @@ def _causes(d: Diagnosis) -> str:
 
     Also which frames the others predict worse with it.
     """
-    if d.adequacy.is_misfit and d.causes:
-        names = ', '.join(cause.effect for cause in d.causes)
-        return f'none can be trusted in such data ({names})'
+    if d.adequacy.is_misfit:
+        return ''  # none can be trusted in such data
     found = []
     for cause in d.causes:
         worse = frame_ranges(d, cause.refuted_by_frames)
@@ -372,12 +382,13 @@ def _candidates(d: Diagnosis) -> str:
         for candidate in d.candidates
         if not shifts or candidate.effect != 'viewpoint_shift'
     ]
-    words = [
-        f'{f"{shift.camera} " if shift.camera else ""}viewpoint_shift '
-        f'({belief(status_of(shift.weight, False), shift.weight)}: {included}'
-        f'e0 = {1e3 * shift.e0:.2g} ± {1e3 * shift.stderr:.2g} mm)'
-        for shift in shifts
-    ]
+    words = []
+    for shift in shifts:
+        status = status_of(shift.weight, False)
+        size_of = f'e0 = {1e3 * shift.e0:.2g} ± {1e3 * shift.stderr:.2g} mm'
+        told = f': {included}{size_of}' if included or status is not Status.NOT_NEEDED else ''
+        camera = f'{shift.camera} ' if shift.camera else ''
+        words.append(f'{camera}viewpoint_shift ({belief(status, shift.weight)}{told})')
     words += [
         f'{finding.effect} ({belief(finding.status, finding.probability)}: '
         f'{finding_reason(finding)})'
@@ -429,18 +440,22 @@ def photographs_words(d: Diagnosis) -> str:
 def headline(d: Diagnosis) -> str:
     """Return the largest cause and the decision about the lens, or what is wrong with the data."""
     lens = lens_words(d)
+    remaining, rays = remaining_error(d), _used_rays(d)
     if d.adequacy.flaws:
-        return f'{flaw_headline(d.adequacy.flaws[0])}. {lens}.'
-    remaining, more = remaining_error(d), len(d.causes) - len(_headline_causes(d))
+        it = 'They are' if len(d.lenses) > 1 else 'It is'
+        good = f' {it} {rays.bound}.' if rays else ''
+        return f'{flaw_headline(d.adequacy.flaws[0])}. {lens}.{good}'
+    more = len(d.causes) - len(_headline_causes(d))
     parts = [f'{largest_cause(d)}{_displaced_landmarks(d)}']
     parts += [f'{more} more cause{"s" * (more > 1)} below'] if more else []
     if d.causes and d.open_lens is not None:
         parts.append(unconfirmed_effects(d.open_lens))
-    if d.decision['lens'].say != 'recalibrate' and (rays := _used_rays(d)):
+    if d.decision['lens'].say != 'recalibrate' and rays:
         undecided = d.decision['lens'].say == 'undecided'
         lens += f'; until then it is {rays.bound}' if undecided else f': {rays.bound}'
         if remaining is not None:
-            lens += f'; {pixels(remaining.px)} px remain, {remaining.ratio:.1f} times the noise'
+            lens += f'; single points are off by {pixels(remaining.px)} px'
+            lens += f', {remaining.ratio:.1f} times the noise'
     return f'{"; ".join(parts)}. {lens}.'
 
 
@@ -478,7 +493,7 @@ def target_words(d: Diagnosis) -> str:
     if say in ('keep', 'undecided'):
         return TARGET[say]
     by_file = d.offers_extended or say != 'correct'
-    words = TARGET[say] if by_file else 'Correct the target: measure it'
+    words = TARGET[say] if by_file else 'For better poses, correct the target: measure it'
     bent = any(cause.effect == 'target_shape' for cause in d.causes)
     return f'{words}, or {"flatten or " if bent else ""}replace it'
 

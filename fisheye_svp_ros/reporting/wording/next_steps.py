@@ -6,8 +6,9 @@ import shlex
 from pathlib import Path
 from typing import NamedTuple
 
-from fisheye_svp_ros.diagnosis import Diagnosis, FlawKind
-from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE
+from fisheye_svp_ros.diagnosis import Diagnosis, FlawKind, LensErrors
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE, remaining_error
 
 
 class ReportInputs(NamedTuple):
@@ -59,7 +60,19 @@ def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
             '' if len(d.lenses) > 1 else '.yaml'
         )
     used = files['options'] if d.offers_extended else ' '.join(lenses)
-    return f'fisheye-svp localize {observations} {used} -o poses'
+    return f'fisheye-svp localize {observations} {used}{_model_error_option(d)} -o poses'
+
+
+def _model_error_option(d: Diagnosis) -> str:
+    """Return the option that counts what remains in poses, where the lens states its errors."""
+    if len(d.lenses) > 1 or remaining_error(d) is None:
+        return ''
+    if not d.offers_extended:
+        try:
+            LensErrors.from_lens(next(iter(d.lenses.values())))
+        except LensError:
+            return ''
+    return ' --model-error'
 
 
 def _command_for_other_data(d: Diagnosis, inputs: ReportInputs) -> str:
