@@ -87,7 +87,7 @@ def test_every_reason_is_a_short_clause(
         (
             LensReason.PREDICTS_BETTER,
             LENS,
-            'it predicts held-out frames to 0.081 px, the lens as given to 0.123 px, with each '
+            'it predicts held-out frames to 0.081 px, the lens as given to 0.123 px, each '
             'landmark where the other frames see it',
         ),
         (
@@ -111,7 +111,7 @@ def test_every_reason_is_a_short_clause(
         (
             LensReason.NO_CAUSE_CONFIRMED,
             LENS._replace(offset=LensOffset(0.3, 0.8, 0.6, 0.1)),
-            'no cause in the lens is confirmed and its parameters agree with these data within '
+            'no error of the lens is confirmed and its parameters agree with these data within '
             'their errors',
         ),
         (

@@ -32,7 +32,7 @@ _OF_LENS_MISFIT = {
     True: 'until then, trust no lens, pose or size from these data',
 }
 _OF_LENS = {
-    FlawKind.LENS_UNKNOWN: 'these views leave its parameters open',
+    FlawKind.LENS_UNKNOWN: 'its parameters are hardly determined',
     FlawKind.ANGLE_SHORT: 'beyond its points, its curve is extrapolated',
     FlawKind.OFF_CENTER: 'no sound image has its center there',
 }
@@ -74,8 +74,8 @@ def flaw_statement(flaw: Flaw) -> str:
         return f'no camera fits: {flaw.size:.2g} px are left ({_noise(flaw)})'
     if flaw.kind == FlawKind.LENS_UNKNOWN:
         return (
-            f'rays{of} are known to about {1e3 * flaw.size:.2g} mrad only, even where points are '
-            f'(noise of a point: {1e3 * 2**0.5 * flaw.beside:.2g} mrad)'
+            f'these views leave the lens{of} open, even where points are: a ray is off by '
+            f'{flaw.size / 2**0.5 / flaw.beside:.1f} times the noise of a point'
         )
     if flaw.kind == FlawKind.ANGLE_SHORT:
         return (

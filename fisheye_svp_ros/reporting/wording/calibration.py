@@ -77,8 +77,8 @@ def _fit_warnings(camera: CalibratedCamera) -> list[str]:
     if is_no_fit(rms, sigma):
         texts.append(
             f'{camera.model} leaves {rms:.1f} px: the model does not fit this lens, or '
-            'image points and landmarks do not match (check order, units, axes, '
-            'image size); do not use it'
+            'image points and landmarks do not match (order, units, axes, image size), or two '
+            'cameras are mixed; do not use it'
         )
     elif rms > _MODEL_ERROR_RATIO * 2**0.5 * noise:
         texts.append(

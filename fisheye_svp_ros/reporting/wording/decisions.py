@@ -92,7 +92,7 @@ def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
         LensReason.INTRINSICS_WRONG: 'the lens as given is wrong in '
         f'{", ".join(facts.wrong_intrinsics)}',
         LensReason.PREDICTS_BETTER: f'it predicts held-out frames to {pixels(file.extended_px)} '
-        f'px, the lens as given to {pixels(file.given_px)} px, with each landmark where the other '
+        f'px, the lens as given to {pixels(file.given_px)} px, each landmark where the other '
         f'frames see it{_unconfirmed_clause(facts)}',
         LensReason.RAYS_BETTER: 'the expected error of its rays is '
         f'{facts.rays[1]:.2g} mrad, of the lens as given {facts.rays[0]:.2g} mrad'
@@ -112,7 +112,7 @@ def _unconfirmed_clause(facts: LensFacts) -> str:
     """Return what the extended lens has without a confirmed cause, as a clause; '' for nothing."""
     if facts.written:
         parts = ' and '.join(f'the {name.replace("_", " ")}' for name in facts.written)
-        return f'; part of the gain, {parts}, has no confirmed cause'
+        return f'; for part of the gain, {parts}, the cause is not known'
     if facts.lens_causes:
         return ''
     return '; its parameters are estimated with errors of the target'
@@ -154,7 +154,7 @@ def _possible_effects(facts: LensFacts) -> str:
 def _no_cause_clause(facts: LensFacts) -> str:
     agrees = facts.offset is not None and facts.offset.is_chance
     fit = ' and its parameters agree with these data within their errors' if agrees else ''
-    return f'no cause in the lens is confirmed{fit}'
+    return f'no error of the lens is confirmed{fit}'
 
 
 def bound_location(bound: EffectBound) -> str:

@@ -72,9 +72,9 @@ _MIN_SIGMAS = 2.0  # a size nearer to 0 stands in no headline
 _MIN_CONFIDENCE = 0.5  # what is less is no reason for what a decision says
 _LENS = 'Lens'
 _REMAINING_PARTS = {
-    'lens': '; the largest part ({}) stays in the image',
-    'frame': '; the largest part ({}) changes with the view, not with the lens: '
-    '`localize --model-error` counts it in poses',
+    'lens': '; of that, {} stay in the image',
+    'frame': '; of that, {} change with the view, not with the lens: `localize --model-error` '
+    'counts it in poses',
 }
 _THUMBNAIL = 96  # px, the longer side
 _VERDICTS = {
@@ -85,8 +85,7 @@ _VERDICTS = {
 }
 TARGET = {
     'keep': 'Keep the target',
-    'correct': f'Use it with {LENS_FILE}, whose lens serves any scene, its correction this '
-    'target only',
+    'correct': f'Use it with {LENS_FILE}',
     'measure_again': 'For better poses, measure the target',
     'undecided': 'Undecided',
 }
@@ -202,9 +201,11 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
     for action in screen.actions:
         names = ', '.join(photo.name for photo in action.photographs)
         names += f' and {action.more} more' if action.more else ''
+        # Of the lens it is the decision that is sure, of others the reason.
+        sure = f' ({action.sure})' if action.sure else ''
+        first, last = (sure, '') if action.about == _LENS else ('', sure)
         lines.append(
-            f'{action.about}: {action.do}{names and f": {names}"}. {action.why}'
-            f'{action.sure and f" ({action.sure})"}.'
+            f'{action.about}: {action.do}{first}{names and f": {names}"}. {action.why}{last}.'
         )
         if action.about == _LENS and screen.accuracy:
             lines.append(f'Accuracy: {screen.accuracy}.')
@@ -284,7 +285,7 @@ def _accuracy(d: Diagnosis) -> str:
         f'Within {degrees(rays.reached):.0f} deg, rays of {which}'
         f'{" (the worst camera)" if several else ""} are off by about {used["value"]:.2g} mrad '
         f'at {rays.range_m:g} m (95 %: {used["low"]:.2g} to {used["high"]:.2g}), {rays.ratio:.1f} '
-        f'times the noise of a point{other}'
+        f'times the noise of a point{other}{_whichever(d)}'
     )
     if d.decision['lens'].say == 'undecided' and not d.adequacy.flaws:
         words += '; meanwhile use it only where that is good enough'
@@ -292,6 +293,16 @@ def _accuracy(d: Diagnosis) -> str:
     if claimed > _EXTRAPOLATED_RATIO * rays.reached and not d.adequacy.flaws:
         words += f'; beyond, to {degrees(claimed):.0f} deg, it is extrapolated'
     return '. '.join(filter(None, [words, _remains(d)]))
+
+
+def _whichever(d: Diagnosis) -> str:
+    """Return which effects of the lens are not told apart, whose ray errors are averaged."""
+    sets = [
+        ' or '.join([cause.effect, *cause.indistinguishable_from])
+        for cause in d.causes
+        if cause.stage == 'lens' and cause.indistinguishable_from
+    ]
+    return f'; that allows for {" and for ".join(sets)}' if sets else ''
 
 
 def _remains(d: Diagnosis) -> str:
@@ -305,7 +316,7 @@ def _remains(d: Diagnosis) -> str:
     where = ''
     if largest is not None and largest.share > largest.named_share:
         where = _REMAINING_PARTS[largest.stage].format(
-            f'{COMPONENTS[largest.name]}, {largest.sd_px:.2g} px'
+            f'{largest.sd_px:.2g} px ({COMPONENTS[largest.name]})'
         )
     return (
         f'Single points are off by {pixels(remaining.px)} px, {remaining.ratio:.1f} times the '
@@ -433,7 +444,9 @@ def photographs_words(d: Diagnosis) -> str:
         kind = d.adequacy.flaws[0].kind
         if kind.is_unit:
             return 'Do not use this table as it is'
-        return 'Check them' if kind is FlawKind.NO_FIT else 'Do not use them together'
+        if kind is FlawKind.NO_FIT:
+            return 'Check them'
+        return 'Do not use them' + (' together' if kind is FlawKind.CAMERAS_MIXED else '')
     return PHOTOGRAPHS[d.decision['photographs'].say]
 
 
@@ -495,7 +508,9 @@ def target_words(d: Diagnosis) -> str:
     by_file = d.offers_extended or say != 'correct'
     words = TARGET[say] if by_file else 'For better poses, correct the target: measure it'
     bent = any(cause.effect == 'target_shape' for cause in d.causes)
-    return f'{words}, or {"flatten or " if bent else ""}replace it'
+    words = f'{words}, or {"flatten or " if bent else ""}replace it'
+    holds = ' (the lens in that file serves any scene, the correction this target only)'
+    return words + (holds if say == 'correct' and by_file else '')
 
 
 def largest_cause(d: Diagnosis) -> str:
