@@ -238,7 +238,8 @@ def test_what_remains_is_said_beside_a_better_lens(found: Diagnosis) -> None:
     better = _deciding(found, 'lens', say='use_extended')
     better = replace(better, file=found.file._replace(given_px=2 * left, extended_px=left))
     said = terminal_lines(first_screen(better, 'table'), '')
-    off = f'ingle points are off by {left:.3f} px, 5.0 times the noise'
+    mrad = 1e3 * left / next(iter(found.lenses.values())).fx
+    off = f'ingle points are off by {left:.3f} px ({mrad:.2g} mrad), 5.0 times the noise'
     assert said[0].endswith(f' (95 %); s{off}.')
     (accuracy,) = (line for line in said if line.startswith('Accuracy'))
     assert f'. S{off}' in accuracy

@@ -74,7 +74,7 @@ def flaw_statement(flaw: Flaw) -> str:
         return f'no camera fits: {flaw.size:.2g} px are left ({_noise(flaw)})'
     if flaw.kind == FlawKind.LENS_UNKNOWN:
         return (
-            f'these views leave the lens{of} open, even where points are: a ray is off by '
+            f'these views leave the lens{of} open, even where points are: a ray may be off by '
             f'{flaw.size / 2**0.5 / flaw.beside:.1f} times the noise of a point'
         )
     if flaw.kind == FlawKind.ANGLE_SHORT:

@@ -53,6 +53,7 @@ from fisheye_svp_ros.reporting.wording.decisions import (
 )
 from fisheye_svp_ros.reporting.wording.diagnosis import (
     LENS_FILE,
+    RemainingError,
     count_frames,
     frame_ranges,
     is_assumed,
@@ -72,10 +73,11 @@ _MIN_SIGMAS = 2.0  # a size nearer to 0 stands in no headline
 _MIN_CONFIDENCE = 0.5  # what is less is no reason for what a decision says
 _LENS = 'Lens'
 _REMAINING_PARTS = {
-    'lens': '; of that, {} stay in the image',
-    'frame': '; of that, {} change with the view, not with the lens: `localize --model-error` '
+    'lens': '{} of that stays in the image ({})',
+    'frame': '{} of that changes with the view ({}), not with the lens: `localize --model-error` '
     'counts it in poses',
 }
+_NEARLY_ALL, _MOST = 0.8, 0.5  # of the squares
 _THUMBNAIL = 96  # px, the longer side
 _VERDICTS = {
     'adequate': 'Adequate: the simulation of the lens describes these data',
@@ -298,11 +300,11 @@ def _accuracy(d: Diagnosis) -> str:
 def _whichever(d: Diagnosis) -> str:
     """Return which effects of the lens are not told apart, whose ray errors are averaged."""
     sets = [
-        ' or '.join([cause.effect, *cause.indistinguishable_from])
+        ' and '.join([cause.effect, *cause.indistinguishable_from])
         for cause in d.causes
         if cause.stage == 'lens' and cause.indistinguishable_from
     ]
-    return f'; that allows for {" and for ".join(sets)}' if sets else ''
+    return f'; this holds whichever of {"; of ".join(sets)} is there' if sets else ''
 
 
 def _remains(d: Diagnosis) -> str:
@@ -310,17 +312,34 @@ def _remains(d: Diagnosis) -> str:
     remaining = remaining_error(d)
     if remaining is None:
         return ''
+    words = f'Single points are off by {_single_points(d, remaining)}'
     # Offsets of landmarks are predicted with either lens.
-    parts = [part for part in d.components if part.stage in _REMAINING_PARTS]
-    largest = max(parts, key=lambda part: part.share - part.named_share, default=None)
-    where = ''
-    if largest is not None and largest.share > largest.named_share:
-        where = _REMAINING_PARTS[largest.stage].format(
-            f'{largest.sd_px:.2g} px ({COMPONENTS[largest.name]})'
-        )
+    squares = {
+        part.name: (part.stage, 2 * part.sd_px**2 * (1 - part.named_share / part.share))
+        for part in d.components
+        if part.stage in _REMAINING_PARTS and part.share > 0
+    }
+    stages = {
+        stage: sum(square for of, square in squares.values() if of == stage)
+        for stage in _REMAINING_PARTS
+    }
+    stage = max(stages, key=stages.__getitem__)
+    if not stages[stage]:
+        return words
+    share = stages[stage] / remaining.px**2
+    how_much = f'{stages[stage] ** 0.5:.2g} px'
+    if share > _MOST:
+        how_much = 'nearly all' if share > _NEARLY_ALL else f'most ({how_much})'
+    largest = max((name for name in squares if squares[name][0] == stage), key=squares.__getitem__)
+    return f'{words}; {_REMAINING_PARTS[stage].format(how_much, COMPONENTS[largest])}'
+
+
+def _single_points(d: Diagnosis, remaining: RemainingError) -> str:
+    """Return by how much single points are off, of both coordinates."""
+    focal = next(iter(d.lenses.values())).fx
     return (
-        f'Single points are off by {pixels(remaining.px)} px, {remaining.ratio:.1f} times the '
-        f'noise{where}'
+        f'{pixels(remaining.px)} px ({1e3 * remaining.px / focal:.2g} mrad), '
+        f'{remaining.ratio:.1f} times the noise'
     )
 
 
@@ -467,8 +486,7 @@ def headline(d: Diagnosis) -> str:
         undecided = d.decision['lens'].say == 'undecided'
         lens += f'; until then it is {rays.bound}' if undecided else f': {rays.bound}'
         if remaining is not None:
-            lens += f'; single points are off by {pixels(remaining.px)} px'
-            lens += f', {remaining.ratio:.1f} times the noise'
+            lens += f'; single points are off by {_single_points(d, remaining)}'
     return f'{"; ".join(parts)}. {lens}.'
 
 
