@@ -35,8 +35,8 @@ from fisheye_svp_ros.mixed_model import (
 
 # What is named is surer than significant: a local error now and then has the form of an effect.
 NAMED_P = 0.002
-# So many landmarks are no single ones any more: of those that are exact, and of those that err
-# from landmark to landmark anyway.
+# So many landmarks are no single ones any more: of those that are exact or far from all others,
+# and of those that err from landmark to landmark anyway.
 _MAX_SHARE, _MAX_BESIDE_BULK = 0.12, 3
 _OUTWEIGHED_RATIO = 10.0  # times smaller a statistic may be the doing of the largest
 _TAIL_FREEDOMS = (3.0, 5.0, 8.0, 12.0, 20.0, 40.0, 1e6)  # degrees of freedom, the last: normal
@@ -173,11 +173,15 @@ def find_single_landmarks(
     p = np.asarray(special.chdtrc(np.maximum(rank, 1), statistic))
     number = 2 * count * tests.effect_count
     standing_out = outliers = np.flatnonzero((rank > 0) & (p * number < SIGNIFICANCE))
-    most = _MAX_BESIDE_BULK if bulk else max(3, int(_MAX_SHARE * count))
-    if outliers.size > most:
+    most = max(_MAX_BESIDE_BULK, int(_MAX_SHARE * count))
+    few = _MAX_BESIDE_BULK if bulk else most
+    if outliers.size > few:
         # A landmark that is far off makes others seem so.
         outliers = outliers[statistic[outliers] > statistic[outliers].max() / _OUTWEIGHED_RATIO]
-    if outliers.size > most:
+    rest = np.delete(statistic, outliers)[np.delete(rank, outliers) > 0]
+    if outliers.size > few and statistic[outliers].min() > _OUTWEIGHED_RATIO * rest.max():
+        few = most  # no tail of the others reaches so far
+    if outliers.size > few:
         return None
     if bulk and outliers.size:
         p = bulk_p_values(statistic, rank, standing_out)

@@ -42,6 +42,7 @@ DIMENSIONS = {
     'detector': 2,
     'noise': 0,
 }  # D
+_MAX_SPARSER = 2.0  # times as much time between frames: over more a camera need not move evenly
 _PAUSE = 4.0  # times the median time between views: over so long no motion is known
 _MAX_PLAUSIBLE = 30.0  # times what would be a large value of a parameter
 
@@ -248,7 +249,12 @@ class Effect(ABC):
         return False
 
     def holds_for(self, t: Array, known: Array) -> bool:
-        """Whether it says anything of other frames, of times t (s), than those of known times."""
+        """Whether it says anything of other frames, of times t (s), than those of known times.
+
+        Of motion only where they follow each other about as quickly: velocities are differences.
+        """
+        if self.of_motion and _time_step(t) > _MAX_SPARSER * _time_step(known):
+            return False
         if not self.of_recording:
             return True
         return bool(np.nanmin(known) <= np.median(t) <= np.nanmax(known))
@@ -446,6 +452,12 @@ class ModelTerm:
     def displacement(self, scene: Scene) -> Array:
         """Displacement (S, N, D) at the effect's stage."""
         return self.effect.displacement(scene, self.values)
+
+
+def _time_step(t: Array) -> float:
+    """Return the median time between frames of times t (N,), s; NaN where there are no two."""
+    known = np.unique(t[np.isfinite(t)])
+    return float(np.median(np.diff(known))) if len(known) > 1 else np.nan
 
 
 def camera_terms(terms: Iterable[ModelTerm], camera: int) -> tuple[ModelTerm, ...]:

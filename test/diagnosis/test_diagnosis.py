@@ -187,6 +187,19 @@ def test_a_single_landmark_keeps_its_name_beside_landmarks_that_are_all_a_little
         assert abs(parameter['value'] - true) < 4 * parameter['stderr']
 
 
+@pytest.mark.parametrize('seed', [0, 1])
+def test_four_landmarks_far_off_are_single_ones_and_no_scatter_of_all(seed):
+    """Once "Keep the target": they were taken for the tail of a scatter of 0.2 mm."""
+    rng = np.random.default_rng(seed)
+    pose, views = scene(rng)
+    moved = {7: [4e-3, 0, 0], 21: [0, -4e-3, 1e-3], 38: [3e-3, 3e-3, 0], 51: [0, 3e-3, -3e-3]}
+    effect, moves = LandmarkSurveyEffect((*moved,)), np.concatenate([*moved.values()])
+    table = observe(lens(), [ModelTerm(effect, moves)], pose, views, SIGMA, rng)
+    (cause,) = diagnose(table, lens()).causes
+    assert cause.effect == 'landmark_survey'
+    assert {int(name.partition('.')[0]) for name in cause.parameters} == {*moved}
+
+
 def test_landmarks_far_from_their_place_are_no_gross_errors():
     rng = np.random.default_rng(20)
     pose, views = scene(rng)

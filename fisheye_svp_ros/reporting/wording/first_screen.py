@@ -68,6 +68,7 @@ from fisheye_svp_ros.scene.observations import photograph_names
 _AS_GIVEN = 'with the lens as given'
 _MAX_NAMES = 4  # photographs, and candidates, by name
 _COARSE_RATIO = 3.0  # times the noise of a point: rays known no better are no good ones
+_MIN_RAY_MRAD = 1e-6  # of a lens of which nothing is fitted, so that nothing is known of its error
 _EXTRAPOLATED_RATIO = 1.1  # of the angle that a lens claims to that of the points
 _MIN_SIGMAS = 2.0  # a size nearer to 0 stands in no headline
 _MIN_CONFIDENCE = 0.5  # what is less is no reason for what a decision says
@@ -270,6 +271,8 @@ def _used_rays(d: Diagnosis) -> _UsedRays | None:
     lens = next(iter(d.evaluation.problem.inputs.lenses.values()))
     point = 1e3 * max(2**0.5 * d.noise_px, 1e-3) / lens.fx
     used = extended if d.offers_extended else given
+    if used['high'] < _MIN_RAY_MRAD:
+        return None
     return _UsedRays(used, given, asked, d.adequacy.reached, point)
 
 
