@@ -24,7 +24,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
-.PHONY: demo check test tests coverage lint paper docs study hardening peers bench test-oldest clean
+.PHONY: demo check test test-all tests coverage lint paper docs study hardening peers bench test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -35,8 +35,13 @@ check tests coverage test-oldest: export OMP_NUM_THREADS := 1
 test: $(VENV)/ready
 	$(MAKE) --no-print-directory -j2 lint tests
 
+# Also what test/long_tests.txt names: before a release.
+test-all: $(VENV)/ready
+	$(MAKE) --no-print-directory -j2 lint tests MARKED=
+
+MARKED ?= -m 'not long'
 tests: $(VENV)/ready
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(MARKED) $(PYTEST)
 
 # For every save: lint, and the tests that take under two minutes on two cores.
 check: $(VENV)/ready lint

@@ -27,6 +27,7 @@ from helpers.shared_memory import remove_orphans, segments  # noqa: E402
 from fisheye_svp_ros.optics import engines  # noqa: E402
 
 _SEGMENTS = segments()
+_LONG = Path(__file__).with_name('long_tests.txt')
 
 
 def _is_free(domain: int) -> bool:
@@ -53,7 +54,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     Processes that talk are at the mercy of the machine: such a test that fails runs once more.
     """
     again = config.pluginmanager.hasplugin('rerunfailures')
+    long = {line for line in _LONG.read_text().splitlines() if not line.startswith('#')}
     for item in items:
+        name = f'{item.path.relative_to(_LONG.parent.parent)}::{item.nodeid.partition("::")[2]}'
+        if {name, name.partition('[')[0]} & long:
+            item.add_marker(pytest.mark.long)
         fixtures = set(getattr(item, 'fixturenames', ()))
         if {'engine', 'compiled'} & fixtures:
             item.add_marker(pytest.mark.xdist_group('engines'))

@@ -196,3 +196,12 @@ def test_make_installs_ros_although_an_activated_environment_has_it(installation
     """The new environment does not see that one: every test of a node was skipped."""
     pytest.importorskip('rclpy.node')
     assert ',ros]' in installation('python3')
+
+
+def test_what_is_left_out_of_the_shorter_run_is_there():
+    lines = (ROOT / 'test' / 'long_tests.txt').read_text().splitlines()
+    tests = [line for line in lines if not line.startswith('#')]
+    assert tests == sorted(set(tests))
+    for line in tests:
+        file, *_, name = line.partition('[')[0].split('::')
+        assert re.search(rf'\bdef {name}\(', (ROOT / file).read_text()), line
