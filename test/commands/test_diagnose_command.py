@@ -305,7 +305,7 @@ class TestTerminal:
     def test_nothing_wrong(self, scene, capsys):
         assert run('clean.csv', scene) == 0
         out = ' '.join(capsys.readouterr().out.split())
-        assert out.startswith('No model error shows in these data. Keep the lens: good to ')
+        assert out.startswith('No model error shows in these data. Keep the lens. ')
         assert 'Not excluded: viewpoint_shift up to' in out and 'px' in out
 
     def test_intrinsics_of_another_day_are_told(self, scene, capsys, tmp_path):

@@ -76,7 +76,8 @@ def test_reversed_photographs_are_named_and_put_in_order() -> None:
         if line.startswith('Photographs: ')
     )
     assert (
-        'numbered from another end of the board: left03.png, left08.png, left09.png, left14.png'
+        'numbered from another end of the board, and reordered: left03.png, left08.png, '
+        'left09.png, left14.png'
     ) in told
 
 
