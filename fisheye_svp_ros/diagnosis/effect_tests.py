@@ -258,13 +258,13 @@ class EffectTests:
     def _held_out_columns(self) -> Index:
         """The border's columns that held-out frames may be asked about.
 
-        What is in the model, what may become significant beside it, and the residual.
+        What is in the model, what is significant beside it, and the residual.
         """
         null = self.null
         significant = [
             null.form_columns(candidate.form)
             for candidate in self.candidates(null.included_columns, per_frame=False)
-            if candidate.score.p_value < SIGNIFICANCE
+            if candidate.corrected < SIGNIFICANCE and candidate.criterion > 0
         ]
         return null.columns_and_residual(np.concatenate([*significant, null.included_columns]))
 
