@@ -382,9 +382,14 @@ class _HeldOutEvidence:
     confounded: Sequence[tuple[str, Index, list[str]]]
 
     def z_of_file(self) -> float | None:
-        if self.predicted is None:
+        evaluation, effect = self.evaluation, self.cause.effect
+        if self.predicted is None or evaluation.held_out is None:
             return None
-        return _gain_in_sigmas(self.evaluation.predict([self.cause.name]), self.predicted)
+        z = _gain_in_sigmas(evaluation.predict([self.cause.name]), self.predicted)
+        times = (
+            one.observations.t for one in (evaluation.held_out.data, self.tests.null.linear.data)
+        )
+        return z if z > 0 or effect.is_refutable_by(*times) else None
 
     def adds_density(self) -> bool:
         """See `Evidence`: the sum of squares may be one frame's doing, of few, or a near one."""

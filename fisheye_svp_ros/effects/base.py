@@ -249,15 +249,17 @@ class Effect(ABC):
         return False
 
     def holds_for(self, t: Array, known: Array) -> bool:
-        """Whether it says anything of other frames, of times t (s), than those of known times.
-
-        Of motion only where they follow each other about as quickly: velocities are differences.
-        """
-        if self.of_motion and _time_step(t) > _MAX_SPARSER * _time_step(known):
-            return False
+        """Whether it says anything of other frames, of times t (s), than those of known times."""
         if not self.of_recording:
             return True
         return bool(np.nanmin(known) <= np.median(t) <= np.nanmax(known))
+
+    def is_refutable_by(self, t: Array, known: Array) -> bool:
+        """Whether other frames, of times t (s), can refute it; known: those it was found in.
+
+        Velocities are differences of poses: frames that are far apart may not tell of motion.
+        """
+        return not (self.of_motion and _time_step(t) > _MAX_SPARSER * _time_step(known))
 
     @property
     def per_frame(self) -> bool:
