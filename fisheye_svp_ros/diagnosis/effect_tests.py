@@ -188,9 +188,7 @@ class EffectTests:
 
     def significant_candidates(self, included: Index) -> Iterator[Candidate]:
         """Yield what is significant, best criterion first, the variances' uncertainty taken in."""
-        for candidate in self.candidates(included):
-            if candidate.corrected >= SIGNIFICANCE or candidate.criterion <= 0:
-                continue
+        for candidate in self._promising_candidates(included):
             if not candidate.effect.per_frame:  # that one holds at any size of the variances
                 columns = self.null.form_columns(candidate.form)
                 score = self.adjust_p_value(candidate.score, included, columns, candidate.effect)
@@ -198,6 +196,14 @@ class EffectTests:
                 candidate = replace(candidate, score=score, corrected=corrected)
             if candidate.corrected < SIGNIFICANCE:
                 yield candidate
+
+    def _promising_candidates(self, included: Index, per_frame: bool = True) -> list[Candidate]:
+        """Return what is significant beside the variances as they are, best criterion first."""
+        return [
+            candidate
+            for candidate in self.candidates(included, per_frame)
+            if candidate.corrected < SIGNIFICANCE and candidate.criterion > 0
+        ]
 
     def correct(self, effect: Effect, p_value: float) -> float:
         """Return a p-value times the numbers of effects and of this one's forms (Bonferroni)."""
@@ -263,8 +269,7 @@ class EffectTests:
         null = self.null
         significant = [
             null.form_columns(candidate.form)
-            for candidate in self.candidates(null.included_columns, per_frame=False)
-            if candidate.corrected < SIGNIFICANCE and candidate.criterion > 0
+            for candidate in self._promising_candidates(null.included_columns, per_frame=False)
         ]
         return null.columns_and_residual(np.concatenate([*significant, null.included_columns]))
 
