@@ -15,6 +15,11 @@ from helpers.nodes import ROOT
 import fisheye_svp_ros as fsvp
 from fisheye_svp_ros.cli import COMMANDS
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
+from fisheye_svp_ros.study.solutions import (
+    LOCALIZATION_METRICS,
+    STEREO_CALIBRATION_METRICS,
+    STEREO_DEPTH_METRICS,
+)
 
 PAGES = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').rglob('*.md')])
 _CODE = re.compile(r'^```.*?^```|`[^`\n]*`', re.DOTALL | re.MULTILINE)
@@ -81,6 +86,14 @@ def test_the_lens_files_name_every_curve() -> None:
     page = (ROOT / 'docs' / 'reference' / 'lens_files.md').read_text(encoding='utf-8')
     for name in (*IMAGE_HEIGHTS, *VIEWPOINT_SHIFTS):
         assert f'`{name}`' in page, name
+
+
+def test_the_page_of_the_nodes_names_every_metric() -> None:
+    """Along y and z as along x."""
+    page = (ROOT / 'docs' / 'reference' / 'nodes.md').read_text(encoding='utf-8')
+    for name in (*LOCALIZATION_METRICS, *STEREO_CALIBRATION_METRICS, *STEREO_DEPTH_METRICS):
+        if not name.endswith(('_y_m', '_z_m')):
+            assert f'`{name}`' in page, name
 
 
 def test_a_diagnosis_is_what_its_schema_says() -> None:

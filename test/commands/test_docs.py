@@ -139,22 +139,3 @@ def test_the_help_of_a_command_has_an_example(name: str) -> None:
 def test_without_a_command_the_first_ones_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([]) == 0
     assert len(_COMMAND.findall(capsys.readouterr().out)) == 5
-
-
-def test_architecture_names_every_room_and_what_is_there() -> None:
-    page = (ROOT / 'docs' / 'explanation' / 'architecture.md').read_text()
-    paths = re.findall(r'`([\w./]+/[\w./]*|\w+\.(?:py|toml))`', page)
-    assert len(paths) > 40
-    for path in paths:
-        assert (ROOT / path).exists() or (ROOT / 'fisheye_svp_ros' / path).exists(), path
-    for room in (ROOT / 'fisheye_svp_ros').iterdir():
-        if (room / '__init__.py').exists():
-            assert re.search(rf'\b{re.escape(room.name)}\b', page), room.name
-    for registry, home in (
-        ('READERS', 'io/readers.py'),
-        ('COMMANDS', 'cli.py'),
-        ('_drawings', 'paper/report.py'),
-        ('CATALOGUE', 'effects/catalogue.py'),
-        ('IMAGE_HEIGHTS', 'optics/curves.py'),
-    ):
-        assert registry in (ROOT / 'fisheye_svp_ros' / home).read_text()

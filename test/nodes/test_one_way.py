@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.graph import LATCHED, Graph
 from helpers.targets import plane, poses_around
+from helpers.walks import files_run, walk
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # isort: skip
 from sensor_msgs.msg import PointCloud2  # isort: skip
@@ -114,6 +115,29 @@ def test_flat_boards_have_the_same_poses_by_every_way(
     # Some of them are on the wrong side where that fits better; hardly any is far off.
     off = np.linalg.norm(told - true.position, axis=1)
     assert np.quantile(off, 0.9) < 1.0
+
+
+def test_a_message_goes_to_its_topics(flat: Scenario, graph: Graph) -> None:
+    seen, files = simulate_scenario(flat).observations, walk('an `image_points` message')
+    heard = graph.hear(PoseWithCovarianceStamped, 'localizer/pose')
+    node = graph.start(Localizer)
+    landmarks = graph.tell(PointCloud2, 'landmarks', LATCHED)
+    points = graph.tell(PointCloud2, 'image_points')
+    graph.until(lambda: node._pose.get_subscription_count() > 0)
+    landmarks.publish(messages.landmarks_message(seen.landmarks(), 0, 'world'))
+    views = group_views(seen)
+    sent = [
+        messages.image_points_message(views.landmark[0], views.uv[0], stamp, 'camera')
+        for stamp in (2, 1)
+    ]
+
+    def tell() -> None:
+        points.publish(sent.pop())
+        graph.until(lambda: len(heard) + len(sent) == 2)
+
+    for timer in node.timers:  # they look at the sets, too, at any time
+        timer.cancel()
+    assert files_run(tell, files) == files
 
 
 def test_angles_and_ranges_are_those_of_the_corrected_target(tmp_path: Path) -> None:
