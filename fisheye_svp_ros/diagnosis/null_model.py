@@ -153,6 +153,19 @@ class NullModel:
         return bare._with_priors(known)
 
     @classmethod
+    def linearize(
+        cls,
+        data: RigViews,
+        state: RigState,
+        free: Sequence[str],
+        variances: Variances,
+        left_out: Sequence[str],
+        finest: bool,
+    ) -> NullModel:
+        """Linearize a state; variances: found around a similar one."""
+        return cls._linearize(data, state, free, left_out, finest)._with_priors(variances)
+
+    @classmethod
     def _linearize(
         cls,
         data: RigViews,
@@ -175,17 +188,6 @@ class NullModel:
         """Return the model with variances, and the priors of its effects beside their noise."""
         products = prior_products(self.linear, self.linear.state, self.scale, variances.sigma)
         return replace(self, variances=variances, full=self.full.add_products(products))
-
-    def relinearize(
-        self,
-        data: RigViews,
-        state: RigState,
-        free: Sequence[str],
-        left_out: Sequence[str],
-        finest: bool,
-    ) -> NullModel:
-        """Return the model around another state, the variances as they are."""
-        return self._linearize(data, state, free, left_out, finest)._with_priors(self.variances)
 
     def calls_for_finest_field(
         self, data: RigViews, state: RigState, left_out: Sequence[str]

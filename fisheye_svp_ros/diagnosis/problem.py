@@ -320,7 +320,7 @@ def _misfit_ratio(problem: Problem, poses: dict[int, Pose]) -> float:
     if not np.isfinite(Linearization(held, state, problem.free).residual).all():
         return np.inf
     free = NullModel.estimate(data, problem.base, problem.free, left_out=left_out)
-    fixed = free.relinearize(held, state, problem.free, left_out, finest=False)
+    fixed = NullModel.linearize(held, state, problem.free, free.variances, left_out, False)
     before, after = (
         float(
             eliminate(

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -122,7 +123,7 @@ def select_causes(problem: Problem, progress: Progress) -> Selection:
         1 if problem.options.quick else _MAX_ROUNDS,
     )
     first: NullModel | None = None
-    for turn in range(_MAX_ROUNDS):
+    for turn in count():
         progress(
             f'testing {len(CATALOGUE)} effects, round {turn + 1}',
             0.8 - 0.75 * _PROGRESS_DECAY**turn,
@@ -142,16 +143,19 @@ def select_causes(problem: Problem, progress: Progress) -> Selection:
             )
         if search.state is before.state:
             search = _revise(problem, search, null)
-        if search.state is before.state and search.finest == before.finest:
-            break
-        if search.state is not before.state:
+        changed = search.state is not before.state
+        if changed:
             search = replace(
                 search, state=_refit(problem, search, null), refits_left=search.refits_left - 1
             )
-        if not search.refits_left:
+        # The next one takes the memory of this one: fresh pages cost as much as sums over them.
+        del null
+        if not changed and search.finest == before.finest:
+            break
+        if not search.refits_left or turn + 1 == _MAX_ROUNDS:
             break
     assert first is not None
-    search, null = _finish(problem, search, null)
+    search, null = _finish(problem, search, changed)
     revision = search.revision or Revision(problem.outliers, None)
     return Selection(problem, first, null, revision, search.trace)
 
@@ -241,16 +245,21 @@ def _refit(problem: Problem, search: _Search, null: NullModel) -> RigState:
     return refit(search.data, state, problem.free, search.variances)
 
 
-def _finish(problem: Problem, search: _Search, null: NullModel) -> tuple[_Search, NullModel]:
-    """Fit once more with the last variances, without what they no longer call for."""
+def _finish(problem: Problem, search: _Search, changed: bool) -> tuple[_Search, NullModel]:
+    """Fit once more with the last variances, without what they no longer call for.
+
+    changed: whether the state is another one than these variances are of.
+    """
     free, options = problem.free, problem.options
-    changed = search.state is not null.linear.state
     if changed and not options.quick:
-        null = search.estimate_null_model(problem)
+        search = _renew_variances(problem, search)
     while True:
         # The last variances weigh the last fit.
-        state = refit(search.data, search.state, free, null.variances)
-        null = null.relinearize(search.data, state, free, options.left_out, search.finest)
+        assert search.variances is not None
+        state = refit(search.data, search.state, free, search.variances)
+        null = NullModel.linearize(
+            search.data, state, free, search.variances, options.left_out, search.finest
+        )
         if not changed:
             return search, null  # all that is in the model was asked for beside these variances
         included, steps = eliminate_effects(
@@ -259,13 +268,14 @@ def _finish(problem: Problem, search: _Search, null: NullModel) -> tuple[_Search
         if not steps:
             return search, null
         gone = [step.effect for step in steps]
-        search = replace(
-            search,
-            state=_change_state(null, included, gone, ()),
-            variances=null.variances,
-            trace=(*search.trace, *steps),
-        )
-        null = search.estimate_null_model(problem)
+        state = _change_state(null, included, gone, ())
+        search = replace(search, state=state, trace=(*search.trace, *steps))
+        del null
+        search = _renew_variances(problem, search)
+
+
+def _renew_variances(problem: Problem, search: _Search) -> _Search:
+    return replace(search, variances=search.estimate_null_model(problem).variances)
 
 
 def without_cause(selection: Selection, name: str) -> Selection:
@@ -274,9 +284,10 @@ def without_cause(selection: Selection, name: str) -> Selection:
     free, left_out = problem.free, problem.options.left_out
     data, finest = null.linear.data, bool(null.variances.alive[NAMES.index(FINEST_FIELD)])
     state = fit_without_causes(null, [name], free)
-    null = NullModel.estimate(data, state, free, null.variances, left_out, finest)
-    state = refit(data, state, free, null.variances)
-    return replace(selection, null=null.relinearize(data, state, free, left_out, finest))
+    variances = NullModel.estimate(data, state, free, null.variances, left_out, finest).variances
+    state = refit(data, state, free, variances)
+    null = NullModel.linearize(data, state, free, variances, left_out, finest)
+    return replace(selection, null=null)
 
 
 def _known_effects(problem: Problem) -> tuple[str, ...]:
