@@ -22,6 +22,7 @@ from fisheye_svp_ros.mixed_model.equations import (
     factor_equations,
     map_in_threads,
     no_variances,
+    prior_precisions,
     solve_lower,
 )
 from fisheye_svp_ros.mixed_model.model_columns import project_out
@@ -189,16 +190,20 @@ def _least_p_value(ratio: float, count: int) -> float:
 def component_traces(eq: Equations, now: Variances) -> Array:
     """Return what each component adds per unit of its variance (K,), groups' columns out.
 
-    Sums of squares of its columns once the fixed columns of groups are projected out, units by
-    their weights; 0 for what is not there.
+    Sums of squares of its columns once the fixed columns of groups are projected out, over the
+    factors on the precision of each unit's; 0 for what is not there.
     """
     nothing = no_variances(eq.components.count, len(now.weight))
     f = factor_equations(eq.select(nothing.alive), nothing.lam, now.weight)
     traces = np.zeros(len(nothing.lam))
+    factor_e, factor_r = prior_precisions(eq, np.ones(len(nothing.lam)), now.weight)
     for kind in np.flatnonzero(now.alive):
         columns = _component_columns(eq, nothing.alive, int(kind))
         if columns is not None:
-            traces[kind] = _remaining_information(f, columns, False).trace
+            in_e, in_r = eq.blocks.e_label == kind, eq.blocks.r_label == kind
+            factor = np.concatenate([factor_e[in_e], factor_r[in_r]])
+            diagonal = _remaining_information(f, columns, False).diagonal
+            traces[kind] = (diagonal / factor.reshape(diagonal.shape)).sum()
     return traces
 
 
@@ -231,8 +236,18 @@ class _Information(NamedTuple):
 
     @property
     def trace(self) -> float:
-        own = float(np.einsum('gww->', self.own))
-        return own - float(np.einsum('bkw,bkw->', self.first, self.first) + (self.u**2).sum())
+        return float(self.diagonal.sum())
+
+    @property
+    def diagonal(self) -> Array:
+        """What is left of the square of each column (g, w)."""
+        diagonal = np.einsum('gww->gw', self.own) - (self.u**2).sum(axis=0)
+        shared = np.einsum('bkw,bkw->bw', self.first, self.first)
+        if len(diagonal) > 1:
+            diagonal[self.present] -= shared
+        else:
+            diagonal -= shared.sum(axis=0)
+        return np.asarray(diagonal)
 
     @property
     def block(self) -> Array:

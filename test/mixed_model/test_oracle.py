@@ -9,7 +9,9 @@ from scipy import sparse
 from fisheye_svp_ros.mixed_model import (
     Components,
     RandomColumns,
+    Variances,
     component_p_values,
+    component_traces,
     estimate_variances,
     factor_equations,
     initial_variances,
@@ -161,17 +163,37 @@ def test_some_of_the_columns_are_left_out_as_all_of_them_are(case):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
+def with_offsets(columns, unit):
+    """Return random columns with offsets (1,) of units beside them, unit (G, N), component 2."""
+    units = int(unit.max()) + 1
+    return columns._replace(
+        offset=np.random.default_rng(0).normal(size=(*unit.shape, 2, 1)),
+        unit=unit,
+        fields=sparse.csr_array((units, 0)),
+        unit_label=np.full((units, 1), 2),
+        components=Components(np.array([False, False, True]), np.zeros(3, dtype=bool)),
+    )
+
+
+@pytest.mark.parametrize('by_group', [True, False])
+def test_units_add_to_the_variance_by_their_own_scales(case, by_group):
+    (_, columns, border), _, _, _, _, _ = case
+    points = np.arange(GROUPS * ROWS // 2).reshape(GROUPS, -1)
+    crossed = with_offsets(columns, points % (ROWS // 2) if by_group else points)
+    fixed = np.ones((GROUPS, ROWS, 1))
+    eq = make_equations(crossed, fixed, border)
+    assert eq.by_group == by_group
+    weight = np.random.default_rng(1).uniform(0.1, 2.0, len(crossed.unit_label))
+    traces = component_traces(eq, Variances(1.0, np.ones(3), weight))
+    z = crossed.unit_columns.toarray().reshape(GROUPS, ROWS, -1)
+    z = z - z.mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(traces[2], ((z**2).sum(axis=(0, 1)) / weight).sum(), rtol=1e-6)
+
+
 def test_units_that_are_exact_leave_all_as_it_is(case):
     """Offsets of units, a second grouping factor, of which the variance is zero."""
     (_, columns, border), _, now, f, _, _ = case
-    rng = np.random.default_rng(0)
-    crossed = columns._replace(
-        offset=rng.normal(size=(GROUPS, ROWS // 2, 2, 1)),
-        unit=np.tile(np.arange(ROWS // 2), (GROUPS, 1)),
-        fields=sparse.csr_array((ROWS // 2, 0)),
-        unit_label=np.full((ROWS // 2, 1), 2),
-        components=Components(np.array([False, False, True]), np.zeros(3, dtype=bool)),
-    )
+    crossed = with_offsets(columns, np.tile(np.arange(ROWS // 2), (GROUPS, 1)))
     eq = make_equations(crossed, np.zeros((GROUPS, ROWS, 0)), border)
     lam = np.append(now.lam, 1e12)
     alive = replace(now, lam=lam, weight=np.ones(ROWS // 2))
