@@ -134,6 +134,7 @@ def test_a_message_goes_to_its_topics(flat: Scenario, graph: Graph) -> None:
     def tell() -> None:
         points.publish(sent.pop())
         graph.until(lambda: len(heard) + len(sent) == 2)
+        graph.idle(0.1)  # what is left to look at
 
     for timer in node.timers:  # they look at the sets, too, at any time
         timer.cancel()
