@@ -6,6 +6,7 @@ import fcntl
 import math
 import os
 import random
+import shutil
 import socket
 import subprocess
 import sys
@@ -22,11 +23,9 @@ sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
 
 from helpers.lasting import LastingWorker  # noqa: E402
 from helpers.nodes import TIMEOUT, Caller, NodeProcess  # noqa: E402
-from helpers.shared_memory import remove_orphans, segments  # noqa: E402
 
 from fisheye_svp_ros.optics import engines  # noqa: E402
 
-_SEGMENTS = segments()
 _LONG = Path(__file__).with_name('long_tests.txt')
 
 
@@ -41,9 +40,14 @@ def _is_free(domain: int) -> bool:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Remove the shared memory of nodes that tests have killed, once all workers have ended."""
-    if not hasattr(session.config, 'workerinput'):
-        remove_orphans(_SEGMENTS)
+    """Have Fast DDS remove what killed nodes left in shared memory, once all workers have ended.
+
+    As users do; among living nodes it takes their locks for a moment.
+    """
+    places = f'{Path(sys.executable).parent}{os.pathsep}{os.environ["PATH"]}'
+    tool = shutil.which('fastdds', path=places)
+    if tool and not hasattr(session.config, 'workerinput'):
+        subprocess.run([tool, 'shm', 'clean'], stdout=subprocess.DEVNULL, check=False)
 
 
 @pytest.hookimpl(tryfirst=True)  # pytest-xdist reads the groups in the same hook

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from helpers import shared_memory
 from helpers.nodes import need_ros, until
 
 from fisheye_svp_ros.cli import main
@@ -48,22 +46,6 @@ def test_children_end_with_their_parent(tmp_path: Path, number: signal.Signals) 
     parent.send_signal(number)
     parent.wait()
     until(lambda: not any(map(_runs, children)), 20)
-
-
-def test_shared_memory_of_a_living_process_is_left_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nor is its lock tried, which it might want at that moment; new segments have none yet."""
-    monkeypatch.setattr(shared_memory, '_SHARED_MEMORY', tmp_path)
-    monkeypatch.setattr(shared_memory, '_is_locked', lambda lock: False)
-    held, orphan = (tmp_path / f'fastrtps_port{number}' for number in (1, 2))
-    for file in (held, orphan):
-        file.touch()
-        file.with_name(f'{file.name}_el').touch()
-    with held.with_name('fastrtps_port1_el').open('rb') as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        shared_memory.remove_orphans(set())
-        assert held.exists() and not orphan.exists()
 
 
 def _runs(pid: int) -> bool:
