@@ -1,7 +1,5 @@
 """Recordings: their files, compressed or not, and the messages in them, read and written.
 
-Those of rosbag2, and to read also bags of ROS 1.
-
 They are written so that a crash loses what came since the last flush only.
 """
 
@@ -12,7 +10,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from functools import cache
 from io import BytesIO
 from pathlib import Path
@@ -43,8 +41,8 @@ from fisheye_svp_ros.io.mcap import (
 )
 from fisheye_svp_ros.io.paths import final_path
 from fisheye_svp_ros.io.recording_files import ROS1_SUFFIX, metadata_topics, recording_files
+from fisheye_svp_ros.io.ros1_bags import ros1_messages, ros1_topics, ros1_types
 
-_REMEDY = 'copy it again, or run `rosbag reindex`'
 _ZSTD = b'\x28\xb5\x2f\xfd'  # CDR begins with 0
 _EXPANDS = 1000  # times the size of a file, at most
 _BLOCK_BYTES = 1 << 20  # bytes
@@ -54,54 +52,7 @@ _CHECKSUM = 9 + 3 * 8  # bytes from the start of a chunk to its checksum
 _UNLIMITED_TIME = QosTime(9223372036, 854775807)  # as rmw has it
 
 
-@cache
-def _ros1_types() -> Any:
-    """Return the types of ROS 1 Noetic."""
-    return get_typestore(Stores.ROS1_NOETIC)
-
-
-def _ros1_topics(path: Path) -> set[tuple[str, str]]:
-    """Return the topics and types of a bag; raise BagError where it cannot be read."""
-    with _open_ros1(path) as reader:
-        return {(connection.topic, connection.msgtype) for connection in reader.connections}
-
-
-def _ros1_messages(
-    path: Path, note: Callable[[str], None], passed: Callable[[int], None]
-) -> Iterator[RawMessage]:
-    """Yield the messages of a bag by time, as ROS 1 serializes them.
-
-    note: told what is damaged; passed: told how many bytes more have been read.  Raises BagError
-    where nothing can be read.
-    """
-    with _open_ros1(path) as reader:
-        messages = reader.messages()
-        while True:
-            try:
-                connection, when, data = next(messages)
-            except StopIteration:
-                break
-            except Exception as cause:  # of whatever a damaged file leads a parser to
-                note(f'{path.name} is damaged ({cause!r:.100})')
-                break
-            yield RawMessage(connection.topic, connection.msgtype, when, data)
-    passed(path.stat().st_size)
-
-
-@contextmanager
-def _open_ros1(path: Path) -> Iterator[Any]:
-    from rosbags.rosbag1 import Reader  # where a bag is read alone
-
-    reader = Reader(path)
-    try:
-        reader.open()
-    except Exception as cause:  # of whatever a damaged file leads a parser to
-        raise BagError(f'{path}: not a whole ROS 1 bag ({cause!s:.100}); {_REMEDY}') from cause
-    with closing(reader):
-        yield reader
-
-
-_READERS = {'.db3': database_messages, ROS1_SUFFIX: _ros1_messages}  # others are MCAP
+_READERS = {'.db3': database_messages, ROS1_SUFFIX: ros1_messages}  # others are MCAP
 
 
 @contextmanager
@@ -290,7 +241,7 @@ class Bag:
         Of a recording that was cut short or damaged everything whole is yielded, and in the end
         `damage` says so.  Raises BagError where nothing can be read.
         """
-        store = _ros1_types() if self._is_ros1 else _types()
+        store = ros1_types() if self._is_ros1 else _types()
         notes: list[str] = []
         for topic, typename, when, data in self._raw(notes.append, passed):
             if typename not in store.fielddefs or not wanted(topic, typename):
@@ -356,7 +307,7 @@ def _list_topics(file: Path) -> set[tuple[str, str]]:
     if file.suffix == '.zstd':
         return metadata_topics(file.parent)  # it is not unpacked for this alone
     if file.suffix.lower() == ROS1_SUFFIX:
-        return _ros1_topics(file)
+        return ros1_topics(file)
     return database_topics(file) if file.suffix == '.db3' else listed_topics(file)
 
 

@@ -6,7 +6,6 @@ The headline is the largest cause, and what to do about the lens.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import degrees
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,6 +30,7 @@ from fisheye_svp_ros.diagnosis import (
 )
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.blocks import image_uri
+from fisheye_svp_ros.reporting.wording.accuracy import accuracy, single_points, used_rays
 from fisheye_svp_ros.reporting.wording.adequacy import flaw_headline, flaw_statement
 from fisheye_svp_ros.reporting.wording.causes import (
     COMPONENTS,
@@ -53,7 +53,6 @@ from fisheye_svp_ros.reporting.wording.decisions import (
 )
 from fisheye_svp_ros.reporting.wording.diagnosis import (
     LENS_FILE,
-    RemainingError,
     count_frames,
     frame_ranges,
     is_assumed,
@@ -67,18 +66,9 @@ from fisheye_svp_ros.scene.observations import photograph_names
 
 _AS_GIVEN = 'with the lens as given'
 _MAX_NAMES = 4  # photographs, and candidates, by name
-_COARSE_RATIO = 3.0  # times the noise of a point: rays known no better are no good ones
-_MIN_RAY_MRAD = 1e-6  # of a lens of which nothing is fitted, so that nothing is known of its error
-_EXTRAPOLATED_RATIO = 1.1  # of the angle that a lens claims to that of the points
 _MIN_SIGMAS = 2.0  # a size nearer to 0 stands in no headline
 _MIN_CONFIDENCE = 0.5  # what is less is no reason for what a decision says
 _LENS = 'Lens'
-_REMAINING_PARTS = {
-    'lens': '{} of that stays in the image ({})',
-    'frame': '{} of that changes with the view ({}), not with the lens: `localize --model-error` '
-    'counts it in poses',
-}
-_NEARLY_ALL, _MOST = 0.8, 0.5  # of the squares
 _THUMBNAIL = 96  # px, the longer side
 _VERDICTS = {
     'adequate': 'Adequate: the simulation of the lens describes these data',
@@ -176,7 +166,7 @@ def first_screen(
             f'{name} {before}' + (f' → {after}' if after != '-' else '')
             for name, before, after, _ in known_rows(d, known or {})
         ),
-        _accuracy(d),
+        accuracy(d),
         '' if d.against is None else travel_sentence(d.against),
     )
 
@@ -230,119 +220,6 @@ def _facts(d: Diagnosis, source: str) -> str:
     return (
         f'{source}: {d.observations} points in {count_frames(d)}; held-out error '
         f'{", ".join(errors)}; noise alone {pixels(2**0.5 * d.noise_px)} px'
-    )
-
-
-class _UsedRays(NamedTuple):
-    """Expected ray errors, mrad, of the lens that is to be used, and of the lens as given.
-
-    range_m, reached: where, m and rad; point_mrad: noise of a point, of both coordinates.
-    """
-
-    used: Mapping[str, float]
-    given: Mapping[str, float]
-    range_m: float
-    reached: float
-    point_mrad: float
-
-    @property
-    def ratio(self) -> float:
-        """How many times the noise of a point a ray is off."""
-        return self.used['value'] / self.point_mrad
-
-    @property
-    def bound(self) -> str:
-        """How good the lens is."""
-        how = 'known only' if self.ratio > _COARSE_RATIO else 'good'
-        where = f'at {self.range_m:g} m within {degrees(self.reached):.0f} deg'
-        return f'{how} to {self.used["high"]:.2g} mrad {where} (95 %)'
-
-
-def _used_rays(d: Diagnosis) -> _UsedRays | None:
-    """Return how far rays are off by the lens that is to be used; None where that is unknown."""
-    rays = d.ray_error_mrad()
-    if not rays or d.adequacy.is_misfit:
-        return None
-    asked = d.evaluation.problem.options.range_m or 1.0
-    given, extended = (
-        next(error for error in rays[side] if error['range_m'] == asked)
-        for side in ('given', 'extended')
-    )
-    lens = next(iter(d.evaluation.problem.inputs.lenses.values()))
-    point = 1e3 * max(2**0.5 * d.noise_px, 1e-3) / lens.fx
-    used = extended if d.offers_extended else given
-    if used['high'] < _MIN_RAY_MRAD:
-        return None
-    return _UsedRays(used, given, asked, d.adequacy.reached, point)
-
-
-def _accuracy(d: Diagnosis) -> str:
-    """Return how far rays are off by the lens that is to be used, where, and what else remains."""
-    rays = _used_rays(d)
-    if rays is None:
-        return ''
-    used, several = rays.used, len(d.lenses) > 1
-    which, other = 'the lens as given', ''
-    if d.offers_extended:
-        which = 'the extended lenses' if several else LENS_FILE
-        other = f'; of the lens as given by {rays.given["value"]:.2g} mrad'
-    words = (
-        f'Within {degrees(rays.reached):.0f} deg, rays of {which}'
-        f'{" (the worst camera)" if several else ""} are off by about {used["value"]:.2g} mrad '
-        f'at {rays.range_m:g} m (95 %: {used["low"]:.2g} to {used["high"]:.2g}), {rays.ratio:.1f} '
-        f'times the noise of a point{other}{_whichever(d)}'
-    )
-    if d.decision['lens'].say == 'undecided' and not d.adequacy.flaws:
-        words += '; meanwhile use it only where that is good enough'
-    claimed = min(lens.max_incidence for lens in d.lenses.values())
-    if claimed > _EXTRAPOLATED_RATIO * rays.reached and not d.adequacy.flaws:
-        words += f'; beyond, to {degrees(claimed):.0f} deg, it is extrapolated'
-    return '. '.join(filter(None, [words, _remains(d)]))
-
-
-def _whichever(d: Diagnosis) -> str:
-    """Return which effects of the lens are not told apart, whose ray errors are averaged."""
-    sets = [
-        ' and '.join([cause.effect, *cause.indistinguishable_from])
-        for cause in d.causes
-        if cause.stage == 'lens' and cause.indistinguishable_from
-    ]
-    return f'; this holds whichever of {"; of ".join(sets)} is there' if sets else ''
-
-
-def _remains(d: Diagnosis) -> str:
-    """Return what is left of held-out points beside noise, mostly of what; '' for nothing."""
-    remaining = remaining_error(d)
-    if remaining is None:
-        return ''
-    words = f'Single points are off by {_single_points(d, remaining)}'
-    # Offsets of landmarks are predicted with either lens.
-    squares = {
-        part.name: (part.stage, 2 * part.sd_px**2 * (1 - part.named_share / part.share))
-        for part in d.components
-        if part.stage in _REMAINING_PARTS and part.share > 0
-    }
-    stages = {
-        stage: sum(square for of, square in squares.values() if of == stage)
-        for stage in _REMAINING_PARTS
-    }
-    stage = max(stages, key=stages.__getitem__)
-    if not stages[stage]:
-        return words
-    share = stages[stage] / remaining.px**2
-    how_much = f'{stages[stage] ** 0.5:.2g} px'
-    if share > _MOST:
-        how_much = 'nearly all' if share > _NEARLY_ALL else f'most ({how_much})'
-    largest = max((name for name in squares if squares[name][0] == stage), key=squares.__getitem__)
-    return f'{words}; {_REMAINING_PARTS[stage].format(how_much, COMPONENTS[largest])}'
-
-
-def _single_points(d: Diagnosis, remaining: RemainingError) -> str:
-    """Return by how much single points are off, of both coordinates."""
-    focal = next(iter(d.lenses.values())).fx
-    return (
-        f'{pixels(remaining.px)} px ({1e3 * remaining.px / focal:.2g} mrad), '
-        f'{remaining.ratio:.1f} times the noise'
     )
 
 
@@ -475,7 +352,7 @@ def photographs_words(d: Diagnosis) -> str:
 def headline(d: Diagnosis) -> str:
     """Return the largest cause and the decision about the lens, or what is wrong with the data."""
     lens = lens_words(d)
-    remaining, rays = remaining_error(d), _used_rays(d)
+    remaining, rays = remaining_error(d), used_rays(d)
     if d.adequacy.flaws:
         it = 'They are' if len(d.lenses) > 1 else 'It is'
         good = f' {it} {rays.bound}.' if rays else ''
@@ -489,7 +366,7 @@ def headline(d: Diagnosis) -> str:
         undecided = d.decision['lens'].say == 'undecided'
         lens += f'; until then it is {rays.bound}' if undecided else f': {rays.bound}'
         if remaining is not None:
-            lens += f'; single points are off by {_single_points(d, remaining)}'
+            lens += f'; single points are off by {single_points(d, remaining)}'
     return f'{"; ".join(parts)}. {lens}.'
 
 

@@ -1,0 +1,134 @@
+"""How good the lens is that is to be used: the line of the accuracy, its part of the headline."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import degrees
+from typing import NamedTuple
+
+from fisheye_svp_ros.diagnosis import Diagnosis
+from fisheye_svp_ros.reporting.wording.causes import COMPONENTS, pixels
+from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE, RemainingError, remaining_error
+
+_COARSE_RATIO = 3.0  # times the noise of a point: rays known no better are no good ones
+_MIN_RAY_MRAD = 1e-6  # of a lens of which nothing is fitted, so that nothing is known of its error
+_EXTRAPOLATED_RATIO = 1.1  # of the angle that a lens claims to that of the points
+_REMAINING_PARTS = {
+    'lens': '{} of that stays in the image ({})',
+    'frame': '{} of that changes with the view ({}), not with the lens: `localize --model-error` '
+    'counts it in poses',
+}
+_NEARLY_ALL, _MOST = 0.8, 0.5  # of the squares
+
+
+class UsedRays(NamedTuple):
+    """Expected ray errors, mrad, of the lens that is to be used, and of the lens as given.
+
+    range_m, reached: where, m and rad; point_mrad: noise of a point, of both coordinates.
+    """
+
+    used: Mapping[str, float]
+    given: Mapping[str, float]
+    range_m: float
+    reached: float
+    point_mrad: float
+
+    @property
+    def ratio(self) -> float:
+        """How many times the noise of a point a ray is off."""
+        return self.used['value'] / self.point_mrad
+
+    @property
+    def bound(self) -> str:
+        """How good the lens is."""
+        how = 'known only' if self.ratio > _COARSE_RATIO else 'good'
+        where = f'at {self.range_m:g} m within {degrees(self.reached):.0f} deg'
+        return f'{how} to {self.used["high"]:.2g} mrad {where} (95 %)'
+
+
+def used_rays(d: Diagnosis) -> UsedRays | None:
+    """Return how far rays are off by the lens that is to be used; None where that is unknown."""
+    rays = d.ray_error_mrad()
+    if not rays or d.adequacy.is_misfit:
+        return None
+    asked = d.evaluation.problem.options.range_m or 1.0
+    given, extended = (
+        next(error for error in rays[side] if error['range_m'] == asked)
+        for side in ('given', 'extended')
+    )
+    lens = next(iter(d.evaluation.problem.inputs.lenses.values()))
+    point = 1e3 * max(2**0.5 * d.noise_px, 1e-3) / lens.fx
+    used = extended if d.offers_extended else given
+    if used['high'] < _MIN_RAY_MRAD:
+        return None
+    return UsedRays(used, given, asked, d.adequacy.reached, point)
+
+
+def accuracy(d: Diagnosis) -> str:
+    """Return how far rays are off by the lens that is to be used, where, and what else remains."""
+    rays = used_rays(d)
+    if rays is None:
+        return ''
+    used, several = rays.used, len(d.lenses) > 1
+    which, other = 'the lens as given', ''
+    if d.offers_extended:
+        which = 'the extended lenses' if several else LENS_FILE
+        other = f'; of the lens as given by {rays.given["value"]:.2g} mrad'
+    words = (
+        f'Within {degrees(rays.reached):.0f} deg, rays of {which}'
+        f'{" (the worst camera)" if several else ""} are off by about {used["value"]:.2g} mrad '
+        f'at {rays.range_m:g} m (95 %: {used["low"]:.2g} to {used["high"]:.2g}), {rays.ratio:.1f} '
+        f'times the noise of a point{other}{_whichever(d)}'
+    )
+    if d.decision['lens'].say == 'undecided' and not d.adequacy.flaws:
+        words += '; meanwhile use it only where that is good enough'
+    claimed = min(lens.max_incidence for lens in d.lenses.values())
+    if claimed > _EXTRAPOLATED_RATIO * rays.reached and not d.adequacy.flaws:
+        words += f'; beyond, to {degrees(claimed):.0f} deg, it is extrapolated'
+    return '. '.join(filter(None, [words, _remains(d)]))
+
+
+def _whichever(d: Diagnosis) -> str:
+    """Return which effects of the lens are not told apart, whose ray errors are averaged."""
+    sets = [
+        ' and '.join([cause.effect, *cause.indistinguishable_from])
+        for cause in d.causes
+        if cause.stage == 'lens' and cause.indistinguishable_from
+    ]
+    return f'; this holds whichever of {"; of ".join(sets)} is there' if sets else ''
+
+
+def _remains(d: Diagnosis) -> str:
+    """Return what is left of held-out points beside noise, mostly of what; '' for nothing."""
+    remaining = remaining_error(d)
+    if remaining is None:
+        return ''
+    words = f'Single points are off by {single_points(d, remaining)}'
+    # Offsets of landmarks are predicted with either lens.
+    squares = {
+        part.name: (part.stage, 2 * part.sd_px**2 * (1 - part.named_share / part.share))
+        for part in d.components
+        if part.stage in _REMAINING_PARTS and part.share > 0
+    }
+    stages = {
+        stage: sum(square for of, square in squares.values() if of == stage)
+        for stage in _REMAINING_PARTS
+    }
+    stage = max(stages, key=stages.__getitem__)
+    if not stages[stage]:
+        return words
+    share = stages[stage] / remaining.px**2
+    how_much = f'{stages[stage] ** 0.5:.2g} px'
+    if share > _MOST:
+        how_much = 'nearly all' if share > _NEARLY_ALL else f'most ({how_much})'
+    largest = max((name for name in squares if squares[name][0] == stage), key=squares.__getitem__)
+    return f'{words}; {_REMAINING_PARTS[stage].format(how_much, COMPONENTS[largest])}'
+
+
+def single_points(d: Diagnosis, remaining: RemainingError) -> str:
+    """Return by how much single points are off, of both coordinates."""
+    focal = next(iter(d.lenses.values())).fx
+    return (
+        f'{pixels(remaining.px)} px ({1e3 * remaining.px / focal:.2g} mrad), '
+        f'{remaining.ratio:.1f} times the noise'
+    )
