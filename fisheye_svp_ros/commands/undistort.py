@@ -149,8 +149,8 @@ def run(args: argparse.Namespace) -> None:
             draw_remaining(args.output / 'rows.png', pair.left, rows, 'difference of rows')
         write_json(args.output / _RESULT, document)
     for name, side in sides.items():
-        if side.extrapolated:
-            say(points_extrapolated(name or side.lens.name, side.extrapolated))
+        if side.extrapolated_points:
+            say(points_extrapolated(name or side.lens.name, side.extrapolated_points))
         _print_camera(side, name, left.get(name))
     if pair and rows:
         print_remaining(

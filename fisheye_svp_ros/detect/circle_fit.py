@@ -225,17 +225,17 @@ def _distance(place: Array, matrix: Array) -> tuple[Array, Array]:
     """
     xx, xy, yy = matrix.T[..., None]
 
-    def turned(at: Array) -> Array:
+    def apply_matrix(at: Array) -> Array:
         return np.stack([at[0] * xx + at[1] * xy, at[0] * xy + at[1] * yy])
 
-    x = turned(place)  # on the unit circle at the edge
-    y = turned(x)
+    x = apply_matrix(place)  # on the unit circle at the edge
+    y = apply_matrix(x)
     far = np.sqrt((x * x).sum(axis=0) + 1e-12)
     steep = np.sqrt((y * y).sum(axis=0) + 1e-12)  # far over the slope of far
     by_far, by_steep = (2 * far - 1) / (steep * far), far * (1 - far) / steep**3
-    z = turned(y)
+    z = apply_matrix(y)
     derivatives = np.empty((5, *far.shape))
-    derivatives[:2] = by_far * y + by_steep * turned(z)
+    derivatives[:2] = by_far * y + by_steep * apply_matrix(z)
     for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
         both = 0.5 if i == j else 1.0
         by_x = x[i] * place[j] + x[j] * place[i]

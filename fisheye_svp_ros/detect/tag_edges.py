@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.detect.finders import Grey
 
-_ALONG = 2 * np.linspace(0.1, 0.9, 24) - 1  # from corner to corner, -1 to 1; corners are rounded
-_ACROSS = np.linspace(-1, 1, 17)  # half widths of the strip
-_STEPS = (_ACROSS[1:] + _ACROSS[:-1]) / 2
+_EDGE_SAMPLES = (
+    2 * np.linspace(0.1, 0.9, 24) - 1
+)  # from corner to corner, -1 to 1; corners are rounded
+_STRIP_SAMPLES = np.linspace(-1, 1, 17)  # half widths of the strip
+_STEPS = (_STRIP_SAMPLES[1:] + _STRIP_SAMPLES[:-1]) / 2
 _STRIP_SHARE, _MIN_STRIP, _MAX_STRIP = 0.125, 1.2, 4.0  # of a side (a cell of a tag); px
 _ROUNDS, _MEETINGS = 3, 5
 _NOISE = 0.08  # px, of an edge at one place
@@ -31,7 +33,7 @@ def _powers(place: Array) -> Array:
     return np.stack([np.ones_like(place), place, place**2 - 1], axis=-1)
 
 
-_POWERS = _powers(_ALONG)
+_POWERS = _powers(_EDGE_SAMPLES)
 
 
 class _Edges(NamedTuple):
@@ -41,7 +43,7 @@ class _Edges(NamedTuple):
     span: Array
     normal: Array
 
-    def at(self, place: Array, off: Array) -> Array:
+    def pixels_at(self, place: Array, off: Array) -> Array:
         """Return pixels at places -1 to 1 along the edges, off px outwards of their chords."""
         share = 0.5 * (place[..., None] + 1)
         extra = (slice(None), slice(None)) + (None,) * (place.ndim - 2)
@@ -79,9 +81,9 @@ def _fit_curves(
 ) -> Array:
     """Return coefficients (T, 4, 3) of _POWERS, px outwards, of the edges in strips about them."""
     middle = curve @ _POWERS.T
-    off = middle[..., None] + strip[:, None, None, None] * _ACROSS
-    place = np.broadcast_to(_ALONG[:, None], off.shape)
-    pixels = edges.at(place, off).reshape(len(strip), -1, 2).astype(np.float32)
+    off = middle[..., None] + strip[:, None, None, None] * _STRIP_SAMPLES
+    place = np.broadcast_to(_EDGE_SAMPLES[:, None], off.shape)
+    pixels = edges.pixels_at(place, off).reshape(len(strip), -1, 2).astype(np.float32)
     light = cv2.remap(
         image, pixels[..., 0], pixels[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
     )
@@ -119,5 +121,5 @@ def _meet(edges: _Edges, curve: Array) -> Array:
 def _point_and_tangent(edges: _Edges, curve: Array, place: Array) -> tuple[Array, Array]:
     """Return pixels (T, 4, 2) of curves at places (T, 4), and their derivatives."""
     slope = curve[..., 1] + 2 * curve[..., 2] * place
-    point = edges.at(place, (curve * _powers(place)).sum(axis=-1))
+    point = edges.pixels_at(place, (curve * _powers(place)).sum(axis=-1))
     return point, edges.span / 2 + slope[..., None] * edges.normal

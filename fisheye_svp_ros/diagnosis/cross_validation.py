@@ -315,7 +315,7 @@ def valid_state(
             term
             for term in state.terms
             if term.effect.holds_for(t, known)
-            and not (another_target and term.effect.place == 'target')
+            and not (another_target and term.effect.lens_field == 'target')
         ),
     )
 

@@ -254,15 +254,15 @@ class NullModel:
 
         likely: what else may be asked for; together they take little more than one alone.
         """
-        for known, found in self._left_out:
+        for known, found in self._leave_one_out_cache:
             if np.isin(at, known).all():
                 return found.select(np.searchsorted(known, at))
         columns = np.unique(at if likely is None else np.concatenate([at, likely]))
-        self._left_out.append((columns, self._leave_one_out(columns)))
+        self._leave_one_out_cache.append((columns, self._leave_one_out(columns)))
         return self.leave_one_out(at)
 
     @cached_property
-    def _left_out(self) -> list[tuple[Index, LeaveOneOut]]:
+    def _leave_one_out_cache(self) -> list[tuple[Index, LeaveOneOut]]:
         """What was asked for: columns of the border and the frames seen from all the others."""
         return []
 

@@ -252,7 +252,7 @@ def _displace_landmarks(
     """
     lenses, state = tuple(inputs.lenses.values()), simulated
 
-    def fit(rows: Observations) -> RigState:
+    def fit_state(rows: Observations) -> RigState:
         data = group_by_frame(posable_observations(rows, inputs.lenses.get('', inputs.lenses))[0])
         return adjust(data, initial_state(data, lenses[0], lenses[1:]), inputs.free)
 
@@ -260,7 +260,7 @@ def _displace_landmarks(
     wrong = find_wrong_landmarks(
         observations,
         simulated.model,
-        lambda rows: fit(rows).model if inputs.free else simulated.model,
+        lambda rows: fit_state(rows).model if inputs.free else simulated.model,
     )
     lost = [landmark for landmark in wrong if not landmark.is_displaced]
     rejected = NO_OUTLIERS.append_landmarks(observations, lost)
@@ -269,7 +269,8 @@ def _displace_landmarks(
     if wrong and inputs.free:
         numbers = [landmark.number for landmark in wrong]
         state = replace(
-            state, **_lenses(fit(observations.take(~np.isin(observations.landmark, numbers))))
+            state,
+            **_lenses(fit_state(observations.take(~np.isin(observations.landmark, numbers)))),
         )
     if moved and effect.name not in inputs.options.left_out:
         state = with_effect(state, effect, np.concatenate([landmark.offset for landmark in moved]))

@@ -204,7 +204,7 @@ class Effect(ABC):
         return values
 
     @property
-    def place(self) -> str:
+    def lens_field(self) -> str:
         """The field of a lens that holds this effect where nothing else in the lens can."""
         return 'target' if self.stage == 'target' or self.of_target else 'corrections'
 
@@ -216,16 +216,16 @@ class Effect(ABC):
         curved = self.with_curves(lens, values)
         if curved is not lens and IMAGE_HEIGHTS.name_of(type(curved.image_height)):
             return curved
-        held: Mapping[str, Any] = getattr(lens, self.place)
+        held: Mapping[str, Any] = getattr(lens, self.lens_field)
         if self.name in held:
             known, before = self.from_dict(held[self.name], lens.name)
             if known != self:
                 raise LensError(
-                    f'lens {lens.name!r} already holds {known.key} in {self.place}; '
+                    f'lens {lens.name!r} already holds {known.key} in {self.lens_field}; '
                     f'{self.key} cannot be added'
                 )
             values = values + before
-        changes: dict[str, Any] = {self.place: {**held, self.name: self.to_dict(values)}}
+        changes: dict[str, Any] = {self.lens_field: {**held, self.name: self.to_dict(values)}}
         return replace(lens, **changes)
 
     def rescale_values(self, values: Array, ratio: float) -> Array:

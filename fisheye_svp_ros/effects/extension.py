@@ -142,7 +142,7 @@ def extend_lens(
     """
     terms = (*load_effects(lens.corrections, lens.name), *terms)
     lens = replace(lens, corrections={})
-    if observations is not None and any(term.effect.place == 'target' for term in terms):
+    if observations is not None and any(term.effect.lens_field == 'target' for term in terms):
         rows = landmark_rows(observations)
         if lens.target.get(LANDMARKS) != rows:
             lens = replace(lens, target={LANDMARKS: rows})

@@ -196,9 +196,9 @@ class Rectifier(BaseNode):
         """Return what is wrong with the rectified images."""
         sides = self._setup.sides.items()
         return {}, '; '.join(
-            points_extrapolated(f'{camera}image_rect', side.extrapolated)
+            points_extrapolated(f'{camera}image_rect', side.extrapolated_points)
             for camera, side in sides
-            if side.extrapolated
+            if side.extrapolated_points
         )
 
     def _take(self, camera: str, stamp: int, image: Unread) -> None:

@@ -117,7 +117,7 @@ class Rectification:
         return Maps(image[0], image[1], mask)
 
     @cached_property
-    def extrapolated(self) -> ExtrapolatedPoints | None:
+    def extrapolated_points(self) -> ExtrapolatedPoints | None:
         """Which of its pixels lie where nothing is known of the lens; None where none does."""
         u, v = (part[self.maps.mask].astype(float) for part in self.maps[:2])
         return extrapolated_points(self.lens, np.column_stack([u, v]))

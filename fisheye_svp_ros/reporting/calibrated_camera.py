@@ -97,8 +97,8 @@ class CalibratedCamera:
 def hand_eye_rows(hand_eye: HandEye) -> list[tuple[str, ...]]:
     """Return both transforms as ROBOT_HEADER has them, each with its standard errors below it."""
     return [
-        *_rows(hand_eye.places[0], hand_eye.camera, hand_eye.stderr[:6]),
-        *_rows(hand_eye.places[1], hand_eye.target, hand_eye.stderr[6:12]),
+        *_rows(hand_eye.transform_names[0], hand_eye.camera, hand_eye.stderr[:6]),
+        *_rows(hand_eye.transform_names[1], hand_eye.target, hand_eye.stderr[6:12]),
     ]
 
 

@@ -92,7 +92,7 @@ class HandEye:
     odds: float = MAX_ODDS
 
     @property
-    def places(self) -> tuple[str, str]:
+    def transform_names(self) -> tuple[str, str]:
         """What the two transforms are called."""
         if self.fixed_camera:
             return 'camera in base', 'target in flange'
@@ -116,7 +116,7 @@ class HandEye:
                 'quaternion': quaternion_from_rotation(pose.rotation).tolist(),
             }
 
-        camera, target = (place.replace(' ', '_') for place in self.places)
+        camera, target = (place.replace(' ', '_') for place in self.transform_names)
         return {
             camera: entry(self.camera),
             target: entry(self.target),

@@ -57,7 +57,7 @@ def find_wrong_landmarks(
     rows, or raises GeometryError; starts: further models, rough ones, to start from where what
     that model leads to is worse than any detector.
     """
-    landmarks = _Landmarks.of(table)
+    landmarks = _Landmarks.from_table(table)
     if len(landmarks.ids) < _MIN_LANDMARKS:
         return ()
     if model is not None and not landmarks.is_suspicious(model):
@@ -103,7 +103,7 @@ class _Landmarks(NamedTuple):
     xyz: Array
 
     @classmethod
-    def of(cls, table: Observations) -> _Landmarks:
+    def from_table(cls, table: Observations) -> _Landmarks:
         views = group_views(table)
         views = views._replace(weight=np.where(views.used, 1 / relative_sigma(views), 0.0))
         ids, first, count = np.unique(table.landmark, return_index=True, return_counts=True)

@@ -39,7 +39,7 @@ class UsedRays(NamedTuple):
         return self.used['value'] / self.point_mrad
 
     @property
-    def bound(self) -> str:
+    def quality(self) -> str:
         """How good the lens is."""
         how = 'known only' if self.ratio > _COARSE_RATIO else 'good'
         where = f'at {self.range_m:g} m within {degrees(self.reached):.0f} deg'

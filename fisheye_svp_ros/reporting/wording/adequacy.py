@@ -131,7 +131,7 @@ def flaw_document(flaw: Flaw) -> dict[str, Any]:
 def frame_list(frames: Sequence[int], names: Sequence[str] = ()) -> str:
     """Return frames as one enumerates them, ranges as such; of many, the first ones."""
     if names:
-        return _first_of([(name, 1) for name in names], _MAX_FRAMES)
+        return _join_first([(name, 1) for name in names], _MAX_FRAMES)
     step = frames[1] - frames[0] if len(frames) > 2 else 0
     if step > 1 and [*frames] == [*range(frames[0], frames[-1] + 1, step)]:
         return f'frames {frames[0]}, {frames[1]}, … {frames[-1]}'
@@ -140,10 +140,10 @@ def frame_list(frames: Sequence[int], names: Sequence[str] = ()) -> str:
         (f'{run[0]} to {run[-1]}' if len(run) > 2 else ', '.join(map(str, run)), len(run))
         for run in runs
     ]
-    return f'frame{"s" * (len(frames) > 1)} {_first_of(words, _MAX_RUNS)}'
+    return f'frame{"s" * (len(frames) > 1)} {_join_first(words, _MAX_RUNS)}'
 
 
-def _first_of(parts: Sequence[tuple[str, int]], most: int) -> str:
+def _join_first(parts: Sequence[tuple[str, int]], most: int) -> str:
     """Return the first of some parts, how many frames the others are, and where these are."""
     more = sum(count for _, count in parts[most:])
     rest = f' and {more} more (all in diagnosis.json)' if more else ''

@@ -64,7 +64,7 @@ from fisheye_svp_ros.reporting.wording.diagnosis import (
 from fisheye_svp_ros.reporting.wording.external import travel_sentence
 from fisheye_svp_ros.scene.observations import photograph_names
 
-_AS_GIVEN = 'with the lens as given'
+_GIVEN_LENS = 'with the lens as given'
 _MAX_NAMES = 4  # photographs, and candidates, by name
 _MIN_SIGMAS = 2.0  # a size nearer to 0 stands in no headline
 _MIN_CONFIDENCE = 0.5  # what is less is no reason for what a decision says
@@ -212,9 +212,11 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
 def _facts(d: Diagnosis, source: str) -> str:
     base, named = (quality.heldout_rms_px for quality in (d.figures.base, d.figures.named))
     given, refitted = d.evaluation.as_given_px, bool(d.evaluation.intrinsics)
-    errors = [] if given is None else [f'{pixels(given)} px {_AS_GIVEN}']
+    errors = [] if given is None else [f'{pixels(given)} px {_GIVEN_LENS}']
     if given is None or pixels(given) != pixels(base):
-        errors.append(f'{pixels(base)} px {"with intrinsics refitted" if refitted else _AS_GIVEN}')
+        errors.append(
+            f'{pixels(base)} px {"with intrinsics refitted" if refitted else _GIVEN_LENS}'
+        )
     if d.causes and not d.adequacy.is_misfit:
         errors.append(f'{pixels(named)} px with the causes corrected')
     return (
@@ -355,7 +357,7 @@ def headline(d: Diagnosis) -> str:
     remaining, rays = remaining_error(d), used_rays(d)
     if d.adequacy.flaws:
         it = 'They are' if len(d.lenses) > 1 else 'It is'
-        good = f' {it} {rays.bound}.' if rays else ''
+        good = f' {it} {rays.quality}.' if rays else ''
         return f'{flaw_headline(d.adequacy.flaws[0])}. {lens}.{good}'
     more = len(d.causes) - len(_headline_causes(d))
     parts = [f'{largest_cause(d)}{_displaced_landmarks(d)}']
@@ -364,7 +366,7 @@ def headline(d: Diagnosis) -> str:
         parts.append(unconfirmed_effects(d.open_lens))
     if d.decision['lens'].say != 'recalibrate' and rays:
         undecided = d.decision['lens'].say == 'undecided'
-        lens += f'; until then it is {rays.bound}' if undecided else f': {rays.bound}'
+        lens += f'; until then it is {rays.quality}' if undecided else f': {rays.quality}'
         if remaining is not None:
             lens += f'; single points are off by {single_points(d, remaining)}'
     return f'{"; ".join(parts)}. {lens}.'
