@@ -29,7 +29,6 @@ from fisheye_svp_ros.detect.finders import (
     report_tags,
 )
 from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals, of_rig, turn_field
-from fisheye_svp_ros.detect.pairing import Pairing, pair_photographs, stamp_of
 from fisheye_svp_ros.detect.patterns import Pattern, Turn, check_of_board
 from fisheye_svp_ros.detect.photographs import Photograph, Pixels, caught_stderr, exif_turned
 from fisheye_svp_ros.detect.points import (
@@ -40,6 +39,7 @@ from fisheye_svp_ros.detect.points import (
     full_scale_share,
     goes_on,
 )
+from fisheye_svp_ros.detect.rig_photographs import Pairing, pair_photographs, stamp_of
 from fisheye_svp_ros.detect.tag_grids import common_layout
 from fisheye_svp_ros.detect.workers import TimedOut, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fisheye_svp_ros.detect.camera_names import alike_series, names_a_camera, split_names
 from fisheye_svp_ros.detect.image_messages import image_pixels
+from fisheye_svp_ros.detect.rig_photographs import alike_series, names_a_camera, split_names
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.files import read_bytes

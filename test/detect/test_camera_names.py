@@ -10,8 +10,8 @@ import pytest
 from helpers.photographs import BOARD, photograph, poses, write
 
 from fisheye_svp_ros import cli
-from fisheye_svp_ros.detect.camera_names import alike_series, split_names
 from fisheye_svp_ros.detect.photographs import doubtful_folders, find_photographs
+from fisheye_svp_ros.detect.rig_photographs import alike_series, split_names
 from fisheye_svp_ros.detect.side_by_side import looks_side_by_side
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.scene.observations import make_observations

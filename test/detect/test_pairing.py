@@ -10,7 +10,7 @@ import pytest
 from helpers.photographs import BOARD, photograph, poses, write
 
 from fisheye_svp_ros import cli
-from fisheye_svp_ros.detect.pairing import pair_photographs, stamp_of
+from fisheye_svp_ros.detect.rig_photographs import pair_photographs, stamp_of
 from fisheye_svp_ros.io.readers import read_observations
 
 BASE = 1403636579763555584
