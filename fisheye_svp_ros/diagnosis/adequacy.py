@@ -147,11 +147,6 @@ def _scatter(components: Sequence[Component]) -> float:
     return float(np.hypot.reduce(parts))
 
 
-def _frame_numbers(evaluation: Evaluation) -> Index:
-    data = evaluation.null.linear.data
-    return data.views.frame[np.unique(data.frame_of, return_index=True)[1]]
-
-
 def _camera_groups(evaluation: Evaluation, noise: float) -> tuple[tuple[int, ...], ...]:
     """Return frames by the camera that they fit, none where no few cameras fit them."""
     data = evaluation.null.linear.data
@@ -168,7 +163,7 @@ def _worst_frames(evaluation: Evaluation) -> tuple[tuple[int, ...], ...]:
     linear = evaluation.cause_fit
     squares = (linear.residual**2).sum(axis=1) / np.maximum(linear.row_mask.sum(axis=1), 1)
     worst = np.argsort(-squares)[: max(len(squares) // 2, 1)]
-    return (tuple(_frame_numbers(evaluation)[worst].tolist()),)
+    return (tuple(evaluation.null.linear.data.frame_numbers[worst].tolist()),)
 
 
 def _intrinsics_by_frame(
@@ -208,7 +203,7 @@ def _named_changes(evaluation: Evaluation, causes: Sequence[Cause]) -> tuple[Arr
     count = linear.data.frames
     focal, center = np.zeros(count), np.zeros((count, 2))
     named = {cause.effect for cause in causes}
-    first = np.unique(linear.data.frame_of, return_index=True)[1]
+    first = linear.data.first_views
     for term in linear.state.terms:
         effect, values = term.effect, term.values
         if effect.name not in named:
@@ -237,7 +232,7 @@ def _changing_intrinsics(
     evaluation: Evaluation, focal: Array, center: Array, ratio: float
 ) -> Flaw:
     """Return which of the intrinsics change more, by how much, and in which frames."""
-    numbers, radius = _frame_numbers(evaluation), _radius(evaluation)
+    numbers, radius = evaluation.null.linear.data.frame_numbers, _radius(evaluation)
     shift = float(np.sqrt(center.var(axis=0).sum()))
     values = np.column_stack([focal * radius, center])
     groups = tuple(tuple(numbers[group].tolist()) for group in _clusters(values))

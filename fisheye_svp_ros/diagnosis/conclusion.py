@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.diagnosis.adequacy import Adequacy, judge_data
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
@@ -199,7 +198,7 @@ def _check_held_out(evaluation: Evaluation) -> list[Advice]:
     """Return what to do about held-out frames that are no measure of a model."""
     test = evaluation.held_out
     if test is None:
-        alone = _frame_numbers(evaluation)[~evaluation.counted_frames]
+        alone = evaluation.null.linear.data.frame_numbers[~evaluation.counted_frames]
         return (
             [
                 _about_frames(
@@ -260,18 +259,12 @@ def _retake_frames(evaluation: Evaluation) -> list[Advice]:
             _about_frames(
                 evaluation.null.linear.data.observations,
                 Action.RETAKE,
-                _frame_numbers(evaluation)[worst].tolist(),
+                evaluation.null.linear.data.frame_numbers[worst].tolist(),
             )
         ]
         if len(bad)
         else []
     )
-
-
-def _frame_numbers(evaluation: Evaluation) -> Index:
-    """Return the numbers (F,) of the frames."""
-    data = evaluation.null.linear.data
-    return data.views.frame[np.unique(data.frame_of, return_index=True)[1]]
 
 
 def _check_photographs(

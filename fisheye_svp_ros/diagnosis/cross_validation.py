@@ -325,8 +325,7 @@ def contiguous_blocks(data: RigViews) -> tuple[Index, list[Ends]]:
 
     Views of one frame that no rig holds together are in one block.
     """
-    first = np.unique(data.frame_of, return_index=True)[1]
-    numbers, place = np.unique(data.views.frame[first], return_inverse=True)
+    numbers, place = np.unique(data.frame_numbers, return_inverse=True)
     of_number = np.arange(len(numbers)) * BLOCKS // len(numbers)
     parts = [numbers[of_number == i] for i in range(BLOCKS)]
     return of_number[place.reshape(-1)], [

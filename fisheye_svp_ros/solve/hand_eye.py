@@ -225,7 +225,7 @@ def fit_hand_eye(
         covariance,
         float(noise[0]),
         float(noise[1]),
-        _frame_numbers(data)[known],
+        data.frame_numbers[known],
         robot.residual(start, state.pose)[known],
         robot.fixed_camera,
         odds,
@@ -421,16 +421,12 @@ class _HandEyeAdjustment(Adjustment):
         return cost + (off**2).sum(), tuple(part[None] for part in added)
 
 
-def _frame_numbers(data: RigViews) -> Index:
-    return data.views.frame[np.unique(data.frame_of, return_index=True)[1]]
-
-
 def flange_poses(data: RigViews, poses: dict[int, Pose]) -> tuple[Pose, Mask]:
     """Return poses (F,) of the flange by frame number, and which frames (F,) have one.
 
     A frame that the first camera did not see, of cameras that no rig holds together, has none.
     """
-    numbers = _frame_numbers(data).tolist()
+    numbers = data.frame_numbers.tolist()
     known = np.array([number in poses for number in numbers])
     if data.frames > len(set(numbers)):
         known &= np.isin(np.arange(data.frames), data.frame_of[data.camera_of == 0])

@@ -128,5 +128,4 @@ def _sort_by_centrality(poses: Pose) -> Index:
 def _frame_poses(data: RigViews, solved: Pose, rig: Pose) -> Pose:
     """Return frame poses (F,) from those of the views, from the first camera where it saw."""
     body = solved.compose(rig.take(data.camera_of).inverse())
-    first = np.unique(data.frame_of, return_index=True)[1]
-    return body.take(first)
+    return body.take(data.first_views)

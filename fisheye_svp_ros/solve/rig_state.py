@@ -52,6 +52,16 @@ class RigViews:
     def cameras(self) -> int:
         return int(self.camera_of.max()) + 1
 
+    @property
+    def first_views(self) -> Index:
+        """The first view (F,) of each frame."""
+        return np.unique(self.frame_of, return_index=True)[1]
+
+    @property
+    def frame_numbers(self) -> Index:
+        """The numbers (F,) of the frames in the table."""
+        return self.views.frame[self.first_views]
+
     def blocks(self, values: Array) -> Array:
         """Gather (S, N, 2, ...) by frame, (F, C * N * 2, ...), zero where a view is missing."""
         shape = (self.frames, self.cameras, *values.shape[1:])

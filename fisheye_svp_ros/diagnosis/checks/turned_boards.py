@@ -207,7 +207,7 @@ def find_turned_frames(
     views, table = null.linear.data.views, null.linear.data.observations
     target = KnownTarget.from_views(views)
     turns = board_turns(Landmarks(target.landmark, target.points), target.board)
-    first = np.unique(null.linear.data.frame_of, return_index=True)[1]
+    first = null.linear.data.first_views
     alone = is_unpaired(null.linear.data)
     found = []
     for number in dict.fromkeys(turn.board.id for turn in turns):
