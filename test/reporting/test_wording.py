@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from helpers.diagnoses import TARGET
 
@@ -25,15 +27,17 @@ from fisheye_svp_ros.diagnosis import (
 )
 from fisheye_svp_ros.diagnosis.causes import Imitation
 from fisheye_svp_ros.diagnosis.decision import EffectBound, Figure, FileFigure, LensOffset
-from fisheye_svp_ros.reporting.wording.causes import finding_reason
+from fisheye_svp_ros.reporting.wording.causes import finding_reason, outlier_rows
 from fisheye_svp_ros.reporting.wording.decisions import (
     advised_action,
     decision_reason,
     separation,
     target_error,
 )
+from fisheye_svp_ros.reporting.wording.first_screen import headline_changes, provisional_headline
 from fisheye_svp_ros.reporting.wording.metrics import metric_text
-from fisheye_svp_ros.reporting.wording.poses import map_notes
+from fisheye_svp_ros.reporting.wording.poses import map_notes, wrong_landmark_notes
+from fisheye_svp_ros.solve.outliers import WrongLandmark
 
 LENS = LensFacts(
     lens_causes=['sensor_tilt'],
@@ -244,3 +248,54 @@ def test_a_map_says_where_it_cannot_be_relied_on():
     assert '3 sightings' in outside and 'field of view' in outside
     assert '0.70 px' in corners
     assert 'focal length +2.0 ± 0.1 %: calibrate the lens again' in focal
+
+
+def test_wrong_landmarks_are_named_with_what_to_do():
+    moved = WrongLandmark(3, 20, 25.3, np.array([0.0, 0.03, 0.04]))
+    other = moved._replace(number=7, offset=np.array([0.012, 0.0, 0.0]))
+    lost = WrongLandmark(9, 18, 300.2, np.full(3, np.nan))
+    assert list(wrong_landmark_notes([moved, other, lost])) == [
+        'landmarks not where x, y, z say: 3 by 50 mm and 7 by 12 mm; rejected; measure them again',
+        'landmark 9: its 18 points are 300 px off and no other place explains them; rejected; '
+        'check its number',
+    ]
+    assert moved.to_dict()['offset'] == [0.0, 0.03, 0.04] and lost.to_dict()['offset'] is None
+
+
+def test_many_outliers_of_one_view_are_one_row() -> None:
+    gross = [
+        {
+            'frame': 4,
+            'camera': 'left',
+            'photograph': 'left19.jpg',
+            'landmark': n,
+            'px': 10.0 + n,
+            'why': 'all points of the view are off',
+        }
+        for n in range(40)
+    ]
+    gross += [{'frame': 7, 'landmark': 3, 'px': 99.0, 'why': 'far from its prediction'}]
+    view, point = outlier_rows(gross)
+    assert (view.where, view.camera, view.points, view.px) == ('left19.jpg', 'left', 40, 49.0)
+    assert view.landmarks == '0, 1, 2, 3, 4, 5 and 34 more'
+    assert (point.where, point.camera, point.landmarks) == ('frame 7', '', '3')
+
+
+def answer(*names: str, candidates: tuple[Finding, ...] = ()) -> SimpleNamespace:
+    causes = [SimpleNamespace(effect=name) for name in names]
+    return SimpleNamespace(causes=causes, trace=[], candidates=[*candidates])
+
+
+def test_the_first_cause_is_the_headline() -> None:
+    assert provisional_headline(()) == 'Provisional: no model error found yet'
+    said = provisional_headline(('viewpoint_shift', 'skew', 'skew'))
+    assert said == 'Provisional: The viewpoint of the lens shifts with the angle (also skew)'
+
+
+def test_what_has_changed_since_is_said() -> None:
+    assert headline_changes(('skew',), answer('skew')) == []
+    refuted = Finding(form='skew', reason=Reason.REFUTED_BY_FRAMES, p_value=0.0, p_corrected=0.0)
+    assert headline_changes(('skew',), answer('aspect', candidates=(refuted,))) == [
+        'Since the provisional answer: found: aspect; not confirmed: skew (held-out frames refute '
+        'it).'
+    ]
