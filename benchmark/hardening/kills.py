@@ -27,6 +27,7 @@ from pathlib import Path
 import psutil
 
 from benchmark import study
+from fisheye_svp_ros.nodes import NODES as NODE_NAMES
 from fisheye_svp_ros.reporting.terminal import progress
 
 _WRITING = 0.15  # of a run: the end, where most is written
@@ -34,72 +35,31 @@ _PATIENCE = 20.0  # s to end after SIGTERM, and for children to go with their pa
 _LONGEST = 240.0  # s for the kills of one command
 _NOBODY = 65534
 _PAGE = 4096  # bytes
-_BOARD = 'chessboard:6x5:25mm'
 COMMANDS = {
-    'budget': ('budget', '--lens', 'fish180', '-o', '{out}'),
-    'calibrate': ('calibrate', '{obs}', '--model', 'kannala_brandt', '-o', '{out}/lens.yaml'),
-    'demo': ('demo', '--lenses', 'fish180', '--radii', '0.2', '-o', '{out}'),
-    'detect': (
-        'detect',
-        '{photographs}',
-        '--board',
-        _BOARD,
-        '-o',
-        '{out}/seen.csv',
-        '--overlays',
-        '{out}/overlays',
-    ),
-    'diagnose': ('diagnose', '{obs}', '--lens', '{lens}', '--quick', '-o', '{out}'),
-    'example': ('example', '-o', '{out}'),
-    'lens': ('lens', '{lens}', '--format', 'opencv', '-o', '{out}/opencv.yaml'),
-    'localize': ('localize', '{obs}', '--lens', '{lens}', '-o', '{out}'),
-    'map': (
-        'map',
-        '{room}/walk',
-        '--board',
-        'tags:36h11:300mm',
-        '--lens',
-        '{room}/lens.yaml',
-        '-o',
-        '{out}/tags.yaml',
-    ),
-    'paper': ('paper', '-o', '{out}'),
-    'plan': (
-        'plan',
-        '--lens',
-        'fish180',
-        '--board',
-        _BOARD,
-        '--room',
-        '0.1',
-        '0.5',
-        '--count',
-        '4',
-        '-o',
-        '{out}',
-    ),
-    'plot': ('plot', '{swept}', '-o', '{out}'),
-    'render': ('render', '--lens', 'fish180', '--board', _BOARD, '--count', '6', '-o', '{out}'),
-    'sweep': ('sweep', '{sweep}', '-o', '{out}', '--workers', '2', '--resume'),
-    'table': ('table', '{recording}', '-o', '{out}'),
-    'undistort': ('undistort', '{lens}', '{photographs}', '-o', '{out}'),
+    line.split()[0]: tuple(line.split())
+    for line in """\
+budget --lens fish180 -o {out}
+calibrate {obs} --model kannala_brandt -o {out}/lens.yaml
+demo --lenses fish180 --radii 0.2 -o {out}
+detect {photographs} --board chessboard:6x5:25mm -o {out}/seen.csv --overlays {out}/overlays
+diagnose {obs} --lens {lens} --quick -o {out}
+example -o {out}
+lens {lens} --format opencv -o {out}/opencv.yaml
+localize {obs} --lens {lens} -o {out}
+map {room}/walk --board tags:36h11:300mm --lens {room}/lens.yaml -o {out}/tags.yaml
+paper -o {out}
+plan --lens fish180 --board chessboard:6x5:25mm --room 0.1 0.5 --count 4 -o {out}
+plot {swept} -o {out}
+render --lens fish180 --board chessboard:6x5:25mm --count 6 -o {out}
+sweep {sweep} -o {out} --workers 2 --resume
+table {recording} -o {out}
+undistort {lens} {photographs} -o {out}
+""".splitlines()
 }
 NODES = {
     'record': ('record', '-o', '{out}/recording'),
     'watch': ('watch',),
-    **{
-        f'run {node}': ('run', node)
-        for node in (
-            'synthetic_camera',
-            'detector',
-            'rectifier',
-            'localizer',
-            'stereo_calibrator',
-            'stereo_depth',
-            'model_critic',
-            'rig_localizer',
-        )
-    },
+    **{f'run {node}': ('run', node) for node in NODE_NAMES},
     'run measured_camera': ('run', 'measured_camera', '--ros-args', '-p', 'observations:={obs}'),
 }
 _MEASURED = {'demo'}  # their tables hold times
@@ -189,23 +149,14 @@ def prepare(folder: Path) -> dict[str, Path]:
     }
     given['sweep'].write_text(_SWEEP)
     demonstration = folder / 'demonstration'
-    for words in (
-        (
-            'render',
-            '--lens',
-            'fish180',
-            '--board',
-            _BOARD,
-            '--count',
-            '12',
-            '-o',
-            str(given['photographs']),
-        ),
-        ('detect', str(given['photographs']), '--board', _BOARD, '-o', str(given['obs'])),
-        ('calibrate', str(given['obs']), '--model', 'kannala_brandt', '-o', str(given['lens'])),
-        ('sweep', str(given['sweep']), '-o', str(given['swept'])),
-        ('demo', '--lenses', 'fish180', '--radii', '0.2', '-o', str(demonstration)),
-    ):
+    for line in """\
+render --lens fish180 --board chessboard:6x5:25mm --count 12 -o {photographs}
+detect {photographs} --board chessboard:6x5:25mm -o {obs}
+calibrate {obs} --model kannala_brandt -o {lens}
+sweep {sweep} -o {swept}
+demo --lenses fish180 --radii 0.2 -o {demonstration}
+""".splitlines():
+        words = [word.format(demonstration=demonstration, **given) for word in line.split()]
         status, said = done(words)
         if status:
             raise SystemExit(f'{" ".join(words)}: {said}')
