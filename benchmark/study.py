@@ -140,9 +140,13 @@ def table(header: str, rows: Iterable[Iterable[object]], numbers: bool = False) 
     ]
 
 
-def paragraph(doc: str | None) -> list[str]:
-    """Return the paragraph of a module's docstring that says what is done, as lines, and none."""
-    return [*(doc or '').split('\n\n')[1].split('\n'), '']
+def page(title: str, doc: str | None, command: str, *parts: Iterable[str]) -> str:
+    """Return a page: what is done, by the second paragraph of a docstring, the command, parts.
+
+    parts: the lines of each; a blank line comes after.
+    """
+    lines = [f'# {title}', '', *(doc or '').split('\n\n')[1].split('\n'), '', f'`{command}`', '']
+    return '\n'.join([*lines, *(line for part in parts for line in (*part, ''))])
 
 
 def write_lines(path: Path, lines: Iterable[str]) -> None:

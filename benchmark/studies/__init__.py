@@ -1,1 +1,1 @@
-"""Studies: families of simulated sets, a measure, a page; `python -m benchmark.studies NAME`."""
+"""Studies: families of simulated sets, a measure, a page; `make study NAME=...`."""

@@ -77,19 +77,15 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
                     ),
                 ]
             )
-    return '\n'.join(
+    return study.page(
+        'Averaging over a viewpoint shift',
+        __doc__,
+        command,
         [
-            '# Averaging over a viewpoint shift',
-            '',
-            *study.paragraph(__doc__),
-            f'    {command}',
-            '',
             'Ray error over that of `calibrate`, geometric means; in brackets how many lenses are '
-            'more than 10 % worse than the one given.',
-            '',
-            *study.table('sets | number | confirmed causes alone | as written', rows),
-            '',
-        ]
+            'more than 10 % worse than the one given.'
+        ],
+        study.table('sets | number | confirmed causes alone | as written', rows),
     )
 
 

@@ -212,15 +212,7 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
         ]
         for kind, found in of.items()
     ]
-    lines = [
-        '# Decisions about lenses whose truth is known',
-        '',
-        *study.paragraph(__doc__),
-        f'`{command}`',
-        '',
-        *study.table('lens | expected | as expected | ' + ' | '.join(SAYS), rows),
-        '',
-    ]
+    lines = []
     bounded = [one for one in outcomes if np.isfinite(one.bound)]
     covered = [one.bound >= abs(one.shift) for one in bounded]
     finite = [one for one in outcomes if np.isfinite(one.true_gain)]
@@ -253,9 +245,14 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
         f'{_share([one.same_data < -0.1 for one in finite])}.',
         '- Ray error of the extended lens over that of `calibrate` on the same data, '
         f'geometric mean: {np.exp(np.mean(np.log1p([-o.same_data for o in finite]))):.2f}.',
-        '',
     ]
-    return '\n'.join(lines)
+    return study.page(
+        'Decisions about lenses whose truth is known',
+        __doc__,
+        command,
+        study.table('lens | expected | as expected | ' + ' | '.join(SAYS), rows),
+        lines,
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -69,22 +69,17 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
                     *(f'{one:.3f}' for one in ratios),
                 ]
             )
-    return '\n'.join(
+    return study.page(
+        'The image field',
+        __doc__,
+        command,
         [
-            '# The image field',
-            '',
-            *study.paragraph(__doc__),
-            f'`{command}`',
-            '',
             'Geometric means of the ray error: without the field over that of `calibrate`,',
             'with the field over that without it; the worst of the latter.',
-            '',
-            *study.table(
-                'sets | number | field written | without / calibrate | with / without | worst',
-                rows,
-            ),
-            '',
-        ]
+        ],
+        study.table(
+            'sets | number | field written | without / calibrate | with / without | worst', rows
+        ),
     )
 
 

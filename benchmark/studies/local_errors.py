@@ -155,23 +155,19 @@ def report(trials: Sequence[dict[str, Any]]) -> str:
                     *(f'{ratio:.2f}' for ratio in ratios),
                 ]
             )
-    return '\n'.join(
+    return study.page(
+        'Sets like real ones',
+        __doc__,
+        f'python -m benchmark.studies.local_errors --trials {len(trials)}',
         [
-            '# Sets like real ones',
-            '',
-            *study.paragraph(__doc__),
-            f'    python -m benchmark.studies.local_errors --trials {len(trials)}',
-            '',
             f'The true e0 lies within one standard error in {within[0]:.1%} and within 1.96 in '
-            f'{within[1]:.1%} of {len(pulls)} sets.',
-            '',
-            *study.table(
-                'e0, mm | bend, mm | sets | `viewpoint_shift` named | `target_shape` named '
-                "| held-out rms over the calibration's, `named` | `extended`",
-                rows,
-            ),
-            '',
-        ]
+            f'{within[1]:.1%} of {len(pulls)} sets.'
+        ],
+        study.table(
+            'e0, mm | bend, mm | sets | `viewpoint_shift` named | `target_shape` named '
+            "| held-out rms over the calibration's, `named` | `extended`",
+            rows,
+        ),
     )
 
 

@@ -157,18 +157,12 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
                     f'{sum(map(bool, wrong))} of {len(mine)}{names and f" ({names})"}',
                 ]
             )
-    return '\n'.join(
-        [
-            '# What is named of what an oracle sees',
-            '',
-            *study.paragraph(__doc__),
-            f'`{command}`',
-            '',
-            *study.table('hidden | oracle, standard errors | found | false', rows),
-            '',
-            f'Sets with a false name: {study.Rate.of(false)}.',
-            '',
-        ]
+    return study.page(
+        'What is named of what an oracle sees',
+        __doc__,
+        command,
+        study.table('hidden | oracle, standard errors | found | false', rows),
+        [f'Sets with a false name: {study.Rate.of(false)}.'],
     )
 
 

@@ -138,39 +138,41 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
                 )
             ]
             rows.append([name, len(some), *cells, *(f'{gain:.2f}' for gain in gains)])
-    lines = [
-        '# Coverage of ray errors',
-        '',
-        *study.paragraph(__doc__),
-        f'`{command}`',
-        '',
-        *study.table(
-            'sets | number | given: below | within | above | true / stated '
-            '| extended: below | within | above | true / stated '
-            '| given / least squares | extended / least squares',
-            rows,
-        ),
-    ]
+    sentences = []
     outside = np.mean([one.outside.any(axis=1) for one in outcomes], axis=0)
     for name, shares in zip(('given', 'extended'), outside, strict=True):
         each = ', '.join(
             f'{100 * (1 - share):.0f} % at {far:g} m'
             for far, share in zip(RANGES, shares, strict=True)
         )
-        lines += ['', f'Within, of the {name} lens: {each}.']
+        sentences.append([f'Within, of the {name} lens: {each}.'])
     for name, some in {
         'all': list(outcomes),
         'those offered': [one for one in outcomes if one.offered],
     }.items():
-        lines += [
-            '',
-            f'More than 10 % worse than the lens as calibrated, of {name}: '
-            f'{sum(one.gain < 1 / 1.1 for one in some)} of {len(some)}.',
-        ]
+        worse = sum(one.gain < 1 / 1.1 for one in some)
+        sentences.append(
+            [
+                f'More than 10 % worse than the lens as calibrated, of {name}: '
+                f'{worse} of {len(some)}.'
+            ]
+        )
     twice = [one for one in outcomes if one.gain >= 2]
     missed = sum(not one.offered for one in twice)
-    lines += ['', f'Not offered, of those at least twice as good: {missed} of {len(twice)}.']
-    return '\n'.join([*lines, '', *_boards_table(outcomes), ''])
+    sentences.append([f'Not offered, of those at least twice as good: {missed} of {len(twice)}.'])
+    head = (
+        'sets | number | given: below | within | above | true / stated '
+        '| extended: below | within | above | true / stated '
+        '| given / least squares | extended / least squares'
+    )
+    return study.page(
+        'Coverage of ray errors',
+        __doc__,
+        command,
+        study.table(head, rows),
+        *sentences,
+        _boards_table(outcomes),
+    )
 
 
 def _boards_table(outcomes: Sequence[Outcome]) -> list[str]:

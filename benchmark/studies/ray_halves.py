@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmark import study
+from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations
@@ -52,17 +53,15 @@ def diagnosed(part: Part) -> Found:
     return given, found.lens, [stated[side][at] for side in ('given', 'extended')]
 
 
-def lines(name: str, table: Observations, parts: dict[str, Found]) -> list[str]:
+def set_rows(name: str, table: Observations, parts: dict[str, Found]) -> list[list[str]]:
     """Return the rows of one set."""
     truth, uv, rows = parts['all frames'][1], typical_points(table.uv), []
     for part, (given, extended, stated) in parts.items():
-        cells = []
+        row = [name, part]
         for lens, one in zip((given, extended), stated, strict=True):
             off = '-' if lens is truth else f'{study.ray_error(lens, truth, uv, (RANGE,)):.2f}'
-            cells.append(
-                f'{1e3 * one.value:.2f} ({1e3 * one.low:.2f} to {1e3 * one.high:.2f}) | {off}'
-            )
-        rows.append(f'| {name} | {part} | {" | ".join(cells)} |')
+            row += [f'{1e3 * one.value:.2f} ({1e3 * one.low:.2f} to {1e3 * one.high:.2f})', off]
+        rows.append(row)
     return rows
 
 
@@ -76,24 +75,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = []
     for path in asked.sets:
         parts = {part: next(found) for part in PARTS}
-        rows += lines(path.parent.name, read_observations(path), parts)
+        rows += set_rows(path.parent.name, read_observations(path), parts)
     width, height = asked.image_size
     command = ' '.join([*map(str, asked.sets), '--image-size', f'{width}x{height}'])
-    study.write_lines(
-        asked.output / 'ray_halves.md',
-        [
-            '# Are rays as far off as is stated?',
-            '',
-            *study.paragraph(__doc__),
-            f'    python -m benchmark.studies.ray_halves {command}',
-            '',
-            *study.table(
-                'set | part | calibrated: stated, mrad | found | extended: stated, mrad | found',
-                [],
-            ),
-            *rows,
-        ],
+    head = 'set | part | calibrated: stated, mrad | found | extended: stated, mrad | found'
+    page = study.page(
+        'Are rays as far off as is stated?',
+        __doc__,
+        f'python -m benchmark.studies.ray_halves {command}',
+        study.table(head, rows),
     )
+    write_text(asked.output / 'ray_halves.md', page)
 
 
 if __name__ == '__main__':

@@ -78,18 +78,12 @@ def report(rows: dict[str, Array], deals: int, command: str) -> str:
         ]
         for label, values in rows.items()
     ]
-    return '\n'.join(
-        [
-            '# Do thirds of the frames agree?',
-            '',
-            *study.paragraph(__doc__),
-            f'    {command}',
-            '',
-            f'Means over {deals} deals; - where a part always leaves the number open.',
-            '',
-            *study.table(f'set | causes | {" | ".join(NAMES)}', cells),
-            '',
-        ]
+    return study.page(
+        'Do thirds of the frames agree?',
+        __doc__,
+        command,
+        [f'Means over {deals} deals; - where a part always leaves the number open.'],
+        study.table(f'set | causes | {" | ".join(NAMES)}', cells),
     )
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from benchmark import study
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector, vector_from_rotation
@@ -39,6 +40,11 @@ SIGMA = 0.5  # px
 DISTORTION = (0.03, -0.01, 0.002, -0.0005)
 LENS = Lens('made', 1280, 960, 330.0, 331.0, 640.5, 479.5, KannalaBrandt(*DISTORTION), 1.5)
 PAGE = study.RESULTS / 'pose_covariance.md'
+_LEGEND = """\
+Three columns: share of true poses within the 95 and the 99.9 % ellipsoid. chi2 per dof:
+held / linear / cv2. Time: over that of the linear solution, batch, NumPy or Numba as
+`FISHEYE_SVP_ENGINE` has it.
+"""
 
 
 class Geometry(NamedTuple):
@@ -158,20 +164,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     header = (
         'geometry | held: 95 / 99.9 %, % | linear, % | cv2, % | chi2 per dof | ambiguous, % | time'
     )
-    lines = [
-        '# Covariances of poses',
-        '',
-        *study.paragraph(__doc__),
-        f'`make study NAME=weak_geometry ARGS="--poses {args.poses}"`',
-        '',
-        *study.table(header, rows, numbers=True),
-        '',
-        'Three columns: share of true poses within the 95 and the 99.9 % ellipsoid. chi2 per dof:',
-        'held / linear / cv2. Time: over that of the linear solution, batch, NumPy or Numba as',
-        '`FISHEYE_SVP_ENGINE` has it.',
-    ]
-    study.write_lines(args.output, lines)
-    sys.stdout.write(args.output.read_text())
+    page = study.page(
+        'Covariances of poses',
+        __doc__,
+        f'make study NAME=weak_geometry ARGS="--poses {args.poses}"',
+        study.table(header, rows, numbers=True),
+        _LEGEND.splitlines(),
+    )
+    write_text(args.output, page)
+    sys.stdout.write(page)
 
 
 if __name__ == '__main__':

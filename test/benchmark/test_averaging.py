@@ -34,4 +34,4 @@ def test_the_page_has_geometric_means_and_lenses_that_got_worse() -> None:
     ]
     page = report(outcomes, 'command')
     assert '| a shift that is not named | 2 | 1.000 (1) | 0.500 (0) |' in page
-    assert 'no shift |' not in page and '    command' in page
+    assert 'no shift |' not in page and '`command`' in page
