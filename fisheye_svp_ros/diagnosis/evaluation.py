@@ -18,6 +18,7 @@ from fisheye_svp_ros.diagnosis.causes import Cause, medium_cause, selected_cause
 from fisheye_svp_ros.diagnosis.checks.medium import Medium, stated_parameters
 from fisheye_svp_ros.diagnosis.cross_validation import (
     Comparison,
+    Ends,
     HeldOut,
     HeldOutData,
     cross_validate,
@@ -49,6 +50,7 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
 )
 from fisheye_svp_ros.diagnosis.written_lens import AveragedModel, WrittenField
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.mixed_model import run_in_threads
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import initial_state
@@ -116,14 +118,19 @@ class Evaluation:
     @classmethod
     def of_selection(cls, selection: Selection, medium: Medium | None) -> Evaluation:
         """Evaluate a selection."""
-        fitted = FittedModel.solve_null_model(selection.null)
+        null, held_out = selection.null, selection.problem.inputs.held_out
+
+        def prepare_held_out() -> HeldOutData | None:
+            return None if held_out is None else HeldOutData.prepare(held_out, null.linear)
+
+        # Frames left out one by one are asked for next, and remembered.
+        test, _ = run_in_threads(prepare_held_out, lambda: cross_validate(null))
+        fitted = FittedModel.solve_null_model(null)
         views = similar_views(fitted.linear, fitted.residuals())
         offsets = fitted.predicted_offsets()._replace(views=views)
-        noise = noise_px(selection.null)
+        noise = noise_px(null)
         if views is not None:
             noise *= float(np.sqrt(1 - views.share))
-        held_out = selection.problem.inputs.held_out
-        test = None if held_out is None else HeldOutData.prepare(held_out, selection.null.linear)
         return cls(selection, fitted, offsets, noise, test, medium)
 
     @property
@@ -365,6 +372,26 @@ class Evaluation:
             'local': self._gain(named, offsets),
         }
 
+    def prepare_conclusion(self) -> None:
+        """Compute side by side what takes long, and what a conclusion asks for in turn."""
+        run_in_threads(
+            lambda: self.written_field,
+            lambda: self._component_p_values,
+            lambda: self._refuting_frames,
+            lambda: self.uncertainty,
+            lambda: self.figures,
+        )
+
+    @cached_property
+    def _component_p_values(self) -> dict[str, float]:
+        return component_significance(self.null)
+
+    @cached_property
+    def _refuting_frames(self) -> dict[str, tuple[Ends, ...]]:
+        """Contiguous frames that the others predict worse with a cause, by its name."""
+        quick = self.problem.options.quick
+        return {} if quick else refuting_blocks(self.null, self.fitted)
+
     def causes(self, components: Sequence[Component]) -> list[Cause]:
         """Return the causes that move predictions, with what each adds."""
         squares, predictions = self._squares, self._cause_predictions
@@ -378,12 +405,10 @@ class Evaluation:
         causes = selected_causes(
             EffectTests(self.null), self.selection.causes, self.errors, shares, held_out
         )
-        if not self.problem.options.quick:
-            refuting = refuting_blocks(self.null, self.fitted)
-            causes = [
-                replace(cause, refuted_by_frames=refuting.get(cause.effect, ()))
-                for cause in causes
-            ]
+        causes = [
+            replace(cause, refuted_by_frames=self._refuting_frames.get(cause.effect, ()))
+            for cause in causes
+        ]
         if self.medium is None:
             return causes
         gain = self._gain(self._given_prediction, self._base_prediction)
@@ -399,7 +424,7 @@ class Evaluation:
         """Return the variance budget; noise_causes: p-values of causes in the noise."""
         null, tests = self.null, EffectTests(self.null)
         p_values = (
-            component_significance(null)
+            self._component_p_values
             | {
                 cause.name: tests.correct(
                     cause.effect,

@@ -249,6 +249,7 @@ def _conclude(
     evaluation: Evaluation, candidates: list[Finding], cameras: list[TwoCameras]
 ) -> Diagnosis:
     """Return the diagnosis of an evaluated selection."""
+    evaluation.prepare_conclusion()
     selection, averaged = evaluation.selection, evaluation.averaged_model
     problem, observations = selection.problem, selection.problem.observations
     noise_causes = growth_cause(selection.revision.growth)

@@ -38,6 +38,7 @@ from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.ray_effects import FlatPortEffect, ViewpointShiftEffect
 from fisheye_svp_ros.mixed_model import (
     Variances,
+    map_in_threads,
     posterior_covariance,
     predict_rows,
     pseudo_inverse,
@@ -333,13 +334,15 @@ def _hold_out(fitted: FittedModel, variances: Variances, fold: Index) -> Array:
     fold (F,): that of each frame.
     """
     linear = fitted.linear
-    squares = np.zeros((int(fold.max()) + 1, 2))
-    for k in range(len(squares)):
-        out = fold == k
+
+    def hold_out(out: Mask) -> Array:
         whole, field = _predict(fitted, variances, out)
         left = linear.residual[out] - whole
-        squares[k] = misfits(linear, out, np.stack([left + field, left], axis=-1))
-    return squares
+        return misfits(linear, out, np.stack([left + field, left], axis=-1))
+
+    folds = np.arange(int(fold.max()) + 1)
+    products = len(folds) * fitted.factored.products
+    return np.array(map_in_threads(lambda k: hold_out(fold == k), folds, products))
 
 
 def _predict(fitted: FittedModel, variances: Variances, out: Mask) -> tuple[Array, Array]:

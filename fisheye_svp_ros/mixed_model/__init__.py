@@ -18,7 +18,9 @@ from fisheye_svp_ros.mixed_model.equations import (
     Variances,
     factor_equations,
     make_equations,
+    map_in_threads,
     no_variances,
+    run_in_threads,
     solve_lower,
 )
 from fisheye_svp_ros.mixed_model.model_columns import (
@@ -90,6 +92,7 @@ __all__ = [
     'is_called_for',
     'leave_groups_out',
     'make_equations',
+    'map_in_threads',
     'multiply_rows',
     'no_variances',
     'posterior_covariance',
@@ -98,6 +101,7 @@ __all__ = [
     'project_out',
     'pseudo_inverse',
     'remove_contradicted',
+    'run_in_threads',
     'satterthwaite_freedom',
     'score_columns',
     'score_components',

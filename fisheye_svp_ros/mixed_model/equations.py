@@ -51,6 +51,11 @@ def map_in_threads(function: Callable[[_T], _R], items: Iterable[_T], products: 
         return list(pool.map(function, items))
 
 
+def run_in_threads(*parts: Callable[[], Any]) -> list[Any]:
+    """Return what parts return that do not need each other, each long enough for a thread."""
+    return map_in_threads(lambda part: part(), parts, np.inf)
+
+
 def solve_lower(root: Array, right: Array, trans: Literal[0, 1] = 0) -> Array:
     """Solve triangular equations; an empty system, which LAPACK of an older SciPy refuses, too."""
     if not len(root):
