@@ -174,10 +174,9 @@ def run(args: argparse.Namespace) -> None:
     with stages('diagnosing') as progress:
 
         def show_provisional(names: tuple[str, ...]) -> None:
-            """Show on a terminal, once, what the first round has found."""
-            if not told and sys.stderr.isatty():
-                told.append(names)
-                progress.announce(provisional_headline(names))
+            """Show what a first look, and then the first round, has found."""
+            told[:] = [names]
+            progress.announce(provisional_headline(names))
 
         settings: dict[str, Any] = {
             'free_intrinsics': free,
@@ -187,8 +186,9 @@ def run(args: argparse.Namespace) -> None:
                 tuple(args.included), effects_left_out(args), args.quick, args.range_m, stated
             ),
             'progress': progress,
-            'provisional': show_provisional,
         }
+        if sys.stderr.isatty():
+            settings['provisional'] = show_provisional
         try:
             if other is None:
                 diagnosis = diagnose(observations, lens, **settings)

@@ -113,15 +113,7 @@ class _Search:
 
 def select_causes(problem: Problem, progress: Progress) -> Selection:
     """Add causes to a fitted state until none is left that is significant and predicts better."""
-    search = _Search(
-        problem.data,
-        _include_effects(problem),
-        None,
-        None,
-        False,
-        (),
-        1 if problem.options.quick else _MAX_ROUNDS,
-    )
+    search = _begin(problem)
     first: NullModel | None = None
     for turn in count():
         progress(
@@ -130,17 +122,10 @@ def select_causes(problem: Problem, progress: Progress) -> Selection:
         )
         null = search.estimate_null_model(problem)
         first, before = first or null, replace(search, variances=null.variances)
-        # How many causes may be taken in at once.
-        most = 1 if _misfit(null) > _LINEAR_LIMIT and not turn else _MAX_EFFECTS
+        most = _MAX_EFFECTS if turn else _most_causes(null)
         search = _change_effects(problem, before, null, most)
         if not turn:
-            problem.inputs.provisional(
-                tuple(
-                    term.name
-                    for term in search.state.terms
-                    if term.effect not in problem.given_effects
-                )
-            )
+            problem.inputs.provisional(_found(problem, search))
         if search.state is before.state:
             search = _revise(problem, search, null)
         changed = search.state is not before.state
@@ -158,6 +143,30 @@ def select_causes(problem: Problem, progress: Progress) -> Selection:
     search, null = _finish(problem, search, changed)
     revision = search.revision or Revision(problem.outliers, None)
     return Selection(problem, first, null, revision, search.trace)
+
+
+def first_causes(problem: Problem) -> tuple[str, ...]:
+    """Return the names of the causes that the first round finds."""
+    search = _begin(problem)
+    null = search.estimate_null_model(problem)
+    search = replace(search, variances=null.variances)
+    return _found(problem, _change_effects(problem, search, null, _most_causes(null)))
+
+
+def _begin(problem: Problem) -> _Search:
+    refits = 1 if problem.options.quick else _MAX_ROUNDS
+    return _Search(problem.data, _include_effects(problem), None, None, False, (), refits)
+
+
+def _found(problem: Problem, search: _Search) -> tuple[str, ...]:
+    """Return the names of what was found, without what the lens came with."""
+    terms = search.state.terms
+    return tuple(term.name for term in terms if term.effect not in problem.given_effects)
+
+
+def _most_causes(null: NullModel) -> int:
+    """Return how many causes the first round may take in at once."""
+    return 1 if _misfit(null) > _LINEAR_LIMIT else _MAX_EFFECTS
 
 
 def _change_effects(problem: Problem, search: _Search, null: NullModel, most: int) -> _Search:

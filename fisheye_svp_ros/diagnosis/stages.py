@@ -7,7 +7,9 @@ Before the last, causes that held-out frames refute, or another effect explains,
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from threading import Event, Thread
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,7 +60,12 @@ from fisheye_svp_ros.diagnosis.problem import (
     ignore_progress,
     prepare_problem,
 )
-from fisheye_svp_ros.diagnosis.selection import Selection, select_causes, without_cause
+from fisheye_svp_ros.diagnosis.selection import (
+    Selection,
+    first_causes,
+    select_causes,
+    without_cause,
+)
 from fisheye_svp_ros.diagnosis.variance_budget import (
     Component,
     Structure,
@@ -67,12 +74,14 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
     significant_components,
 )
 from fisheye_svp_ros.effects.base import ModelTerm
-from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.table_checks import ROUNDING, check_distinct, dither
 from fisheye_svp_ros.solve.measured_poses import rig_lenses
+
+_FIRST_LOOK, _FIRST_LOOK_FRAMES = 1000, 6  # points, or some more, and frames of a first look
 
 
 def diagnose(
@@ -94,7 +103,8 @@ def diagnose(
     poses: by frame, of the camera (of a rig: its right one), or of the flange of a robot that
     carries it, which the data tell apart; held_out: other frames of the same camera
     and target; options: effects to include or leave out; progress: told what is being done, and
-    which share is done; provisional: told the names of the causes that the first round finds.
+    which share is done; provisional: told the names of the causes that a part of many points
+    shows, from a thread of its own, and then those that the first round finds.
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
     inputs = Inputs.check(
@@ -105,11 +115,41 @@ def diagnose(
         poses=poses,
         held_out=held_out,
     )
-    inputs = replace(inputs, provisional=provisional)
+    if provisional is not ignore_progress:
+        inputs = replace(inputs, provisional=_begin_first_look(inputs, provisional))
     diagnosis = _run_stages(inputs, progress)
     if diagnosis.noise_px > ROUNDING:
         return diagnosis
     return _run_stages(replace(inputs, observations=dither(inputs.observations)), progress)
+
+
+def _begin_first_look(inputs: Inputs, provisional: Provisional) -> Provisional:
+    """Have a part of many points looked at meanwhile; return what the first round tells.
+
+    It says what will probably be found, long before a round of all points does.
+    """
+    table, told = inputs.observations, Event()
+    frames, landmarks = np.unique(table.frame), np.unique(table.landmark)
+    step = round(np.sqrt(len(table) / _FIRST_LOOK))
+    every = max(min(step, len(frames) // _FIRST_LOOK_FRAMES), 1)
+
+    def look() -> None:
+        part = np.isin(table.landmark, landmarks[::step]) & np.isin(table.frame, frames[::every])
+        some = table.take(np.flatnonzero(part))
+        # What cannot be solved has no first look; the whole says why.
+        with suppress(FisheyeSvpError, np.linalg.LinAlgError):
+            problem, _ = prepare_problem(replace(inputs, observations=some, held_out=None))
+            names = first_causes(problem)
+            if not told.is_set():
+                provisional(names)
+
+    def tell(names: tuple[str, ...]) -> None:
+        told.set()
+        provisional(names)
+
+    if step > 1:
+        Thread(target=look, daemon=True).start()
+    return tell
 
 
 def diagnose_against(

@@ -8,6 +8,7 @@ import pytest
 from helpers.scenes import lens, observe, scene
 from helpers.water import AIR
 
+from fisheye_svp_ros.diagnosis import stages
 from fisheye_svp_ros.diagnosis import EffectTests, NullModel, Reason, Rival, diagnose
 from fisheye_svp_ros.diagnosis.causes import selected_causes
 from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain
@@ -200,3 +201,15 @@ def test_p_values_are_corrected_once(false_tilt):
     assert cause.p_value == corrected > alone
     _, steps = eliminate_effects(false_tilt, ('focal_drift',), quick=True)
     assert all(one.p_corrected == corrected for one in steps)
+
+
+def test_a_part_of_the_points_says_first_what_will_probably_be_found(monkeypatch):
+    """Before the first round of all points; its thread is run at once here."""
+    told, rng = [], np.random.default_rng(0)
+    monkeypatch.setattr(stages, '_FIRST_LOOK', 360)
+    monkeypatch.setattr(stages, 'Thread', lambda target, daemon: SimpleNamespace(start=target))
+    shifted = [ModelTerm(ViewpointShiftEffect(), np.array([6e-3]))]
+    points = observe(lens(), shifted, *scene(rng), 0.05, rng)
+    found = diagnose(points, lens(), provisional=told.append)
+    assert told == [('viewpoint_shift',)] * 2
+    assert names(found) == {'viewpoint_shift'}
