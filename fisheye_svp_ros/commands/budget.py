@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from fisheye_svp_ros.commands.lenses import load_with_notes
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.io.files import write_together
 
 # Limits by quantity: option, unit, factor from the unit to SI.
@@ -70,12 +70,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             help=f'largest {what} that you allow; default: unlimited, or, without '
             'any limit, what noise alone causes',
         )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=output_folder,
-        metavar='DIR',
-        help='folder to write budget.json and budget.png to',
+    add_output_folder(
+        parser,
+        'folder to write budget.json and budget.png to',
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from fisheye_svp_ros.commands.node_sweeps import start_in_step, values
 from fisheye_svp_ros.commands.notes import note_formats
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.commands.processes import Processes, missing_rclpy
 from fisheye_svp_ros.commands.record import TOPICS
 from fisheye_svp_ros.errors import OutputError
@@ -51,14 +51,11 @@ _PATIENCE = 900.0  # s; only a hang takes this long
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=output_folder,
-        default=Path('demo'),
-        metavar='DIR',
-        help='folder to write the recording (replaces an earlier one), demo.json, '
+    add_output_folder(
+        parser,
+        'folder to write the recording (replaces an earlier one), demo.json, '
         'table.csv, table.parquet and pictures to; default: demo',
+        default='demo',
     )
     parser.add_argument(
         '--lenses',

@@ -31,7 +31,7 @@ from fisheye_svp_ros.commands.notes import (
     note_unconnected,
     note_wrong_landmarks,
 )
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.commands.plan import view_count, view_limits
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.csv_files import write_table
@@ -131,12 +131,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='with --next: nearest and furthest distance at which the board is '
         'sharp; default: slightly beyond the distances in OBS',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=output_folder,
-        metavar='DIR',
-        help='folder to write report.html and its pictures, diagnosis.json, '
+    add_output_folder(
+        parser,
+        'folder to write report.html and its pictures, diagnosis.json, '
         'extended_lens.yaml and residuals.csv to; for a rig, also rig.yaml '
         'and a subfolder for the lens of each camera',
     )

@@ -6,7 +6,7 @@ import argparse
 
 import numpy as np
 
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.commands.render import parabola, write_photographs
 from fisheye_svp_ros.io.files import keep_existing, write_text, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
@@ -33,13 +33,10 @@ fisheye-svp diagnose observations.csv --lens lens.yaml -o diagnosis
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=output_folder,
+    add_output_folder(
+        parser,
+        'folder to write the photographs, the truth and a README to',
         required=True,
-        metavar='DIR',
-        help='folder to write the photographs, the truth and a README to',
     )
 
 

@@ -26,7 +26,7 @@ from fisheye_svp_ros.commands.notes import (
     note_wrong_landmarks,
     say,
 )
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.csv_files import write_table
@@ -70,12 +70,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'folder, or a camchain; gives one pose per frame from all cameras, '
         'that of the first camera',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=output_folder,
-        metavar='DIR',
-        help='folder to write localize.json, poses.csv, residuals.csv and '
+    add_output_folder(
+        parser,
+        'folder to write localize.json, poses.csv, residuals.csv and '
         'covariance.csv to; for several cameras without --rig, one subfolder '
         'each',
     )

@@ -14,6 +14,21 @@ _PHOTOGRAPHS = ('observations', 'photographs', 'inputs')  # arguments whose fold
 _OUTPUTS = {'-o': 'output', '--overlays': 'overlays'}  # options and their arguments
 
 
+def add_output_folder(
+    parser: argparse.ArgumentParser, text: str, default: str | None = None, required: bool = False
+) -> None:
+    """Declare `-o`, the folder that a command writes to; text: what it says in `--help`."""
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=output_folder,
+        default=default and Path(default),
+        required=required,
+        metavar='DIR',
+        help=text,
+    )
+
+
 def output_folder(text: str, option: str = '-o') -> Path:
     """Return the path of a folder that exists or can be made; raise OutputError otherwise."""
     path = output_path(text, option)

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import add_output_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=output_folder,
-        default=Path('paper'),
-        metavar='DIR',
-        help='folder to write paper.json, paper.md, paper.html and the pictures '
-        'to; default: paper',
+    add_output_folder(
+        parser,
+        'folder to write paper.json, paper.md, paper.html and the pictures to; default: paper',
+        default='paper',
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from fisheye_svp_ros.commands.detect import image_size, positive_count
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import say
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
@@ -76,12 +76,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='PX',
         help='standard deviation of u and of v of a corner; default: 0.1',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=output_folder,
-        metavar='DIR',
-        help='folder to write plan.pdf (to print), plan.json and poses.csv (for `render`) to',
+    add_output_folder(
+        parser,
+        'folder to write plan.pdf (to print), plan.json and poses.csv (for `render`) to',
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fisheye_svp_ros.commands.notes import say
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.errors import OutputError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import read_table
@@ -35,13 +35,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='SOURCE',
         help='rosbag2 recording, table (.csv or .parquet), or folder of a sweep',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=output_folder,
-        default=Path('plots'),
-        metavar='DIR',
-        help='folder to write the pictures (PNG) to; default: plots',
+    add_output_folder(
+        parser,
+        'folder to write the pictures (PNG) to; default: plots',
+        default='plots',
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import say
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.errors import GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.files import keep_existing, write_together
@@ -54,14 +54,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default='board',
         help='one board, or six boards: on the faces of a cube, or on the walls of a room',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=output_folder,
-        required=True,
-        metavar='DIR',
-        help='folder to write the photographs (of a rig, one subfolder per '
+    add_output_folder(
+        parser,
+        'folder to write the photographs (of a rig, one subfolder per '
         'camera), observations.csv (the true corners) and poses.csv to',
+        required=True,
     )
     parser.add_argument(
         '--poses',

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from fisheye_svp_ros.commands.executors import completed_tasks, dask, process_pool
 from fisheye_svp_ros.commands.node_sweeps import read_sweep
 from fisheye_svp_ros.commands.notes import count_text, note_formats, say
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.errors import OutputError, ParameterError
 from fisheye_svp_ros.io.columns import TableParts
 from fisheye_svp_ros.io.files import (
@@ -55,13 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='ROS parameter file in which sweep.PARAMETER is a list, or the name '
         'of one in config/sweeps',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=output_folder,
-        default=Path('sweep'),
-        metavar='DIR',
-        help='folder to write sweep.parquet, sweep.csv and sweep.json to; default: sweep',
+    add_output_folder(
+        parser,
+        'folder to write sweep.parquet, sweep.csv and sweep.json to; default: sweep',
+        default='sweep',
     )
     where = parser.add_mutually_exclusive_group()
     where.add_argument(

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from fisheye_svp_ros.commands.notes import note_formats, say
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import plain_columns, write_table
@@ -27,12 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'bag', metavar='BAG', help='rosbag2 recording: its folder, or its .mcap or .db3 file'
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=output_folder,
-        metavar='DIR',
-        help='folder to write table.csv, table.parquet and table.json to',
+    add_output_folder(
+        parser,
+        'folder to write table.csv, table.parquet and table.json to',
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from fisheye_svp_ros.commands.detect import add_split_argument, image_size
 from fisheye_svp_ros.commands.lenses import Lenses, lenses_of, load_lenses
 from fisheye_svp_ros.commands.notes import say
-from fisheye_svp_ros.commands.outputs import output_folder
+from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.detect.photographs import (
     count_photographs,
     doubtful_folders,
@@ -72,16 +72,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='pose of the left camera in the right one: a file, or a folder with '
         'rig.yaml; if the lens files do not hold it',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=output_folder,
-        required=True,
-        metavar='DIR',
-        help='folder to write the photographs, maps.npz and maps.yml (map1 and '
+    add_output_folder(
+        parser,
+        'folder to write the photographs, maps.npz and maps.yml (map1 and '
         'map2 for cv2.remap, mask, K, R, P), mask.png, camera_info.yaml, '
         'pictures of the remaining errors and undistort.json to; for a rig, '
         'one subfolder per camera',
+        required=True,
     )
     add_split_argument(parser, '1')
     parser.add_argument(
