@@ -54,7 +54,7 @@ class Windows(NamedTuple):
     rounding: float
 
 
-class FitQuality(NamedTuple):
+class WindowFit(NamedTuple):
     """How sure fits (N,) are: sigma of u and of v, px; noise, of a smoothed pixel; settled.
 
     noise2, gain2, freedom (N,): variance of a pixel, what it is multiplied by, of how many.
@@ -187,7 +187,7 @@ class WindowProblem(ABC):
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         return (state[0] + step[0],)
 
-    def judge(self, values: Array, symmetric: bool) -> FitQuality:
+    def judge(self, values: Array, symmetric: bool) -> WindowFit:
         """Return how sure solutions (N, U) are.
 
         symmetric: of a window that looks the same from both sides of its point, only what differs
@@ -233,7 +233,7 @@ class WindowProblem(ABC):
         left = np.linalg.norm((covariance[:, :2] @ pull[..., None])[..., 0], axis=1)
         settled = np.isfinite(values).all(axis=1) & (sigma < 1) & (left < 0.1 * sigma + self.slack)
         settled &= weight.sum(axis=1) > values.shape[1]  # fewer pixels than unknowns fit anything
-        return FitQuality(sigma, np.sqrt(_NOISE_RATIO * noise2), settled, noise2, gain2, freedom)
+        return WindowFit(sigma, np.sqrt(_NOISE_RATIO * noise2), settled, noise2, gain2, freedom)
 
 
 def _clipped_mask(pixels: Pixels) -> Mask:

@@ -199,7 +199,7 @@ class FramedRig(NamedTuple):
     right: str
 
 
-class Status(NamedTuple):
+class ResultStatus(NamedTuple):
     """One status of a DiagnosticArray; level: 0 for OK."""
 
     level: int
@@ -305,10 +305,10 @@ def frames_differ(one: str, other: str) -> bool:
     return bool(one and other) and one.lstrip('/') != other.lstrip('/')
 
 
-def statuses(message: Any) -> list[Status]:
+def statuses(message: Any) -> list[ResultStatus]:
     """Return the statuses of a DiagnosticArray."""
     return [  # the level is a byte: rclpy gives bytes, a bag reader a number
-        Status(
+        ResultStatus(
             one.level[0] if isinstance(one.level, bytes) else int(one.level),
             str(one.message),
             {pair.key: pair.value for pair in one.values},

@@ -13,7 +13,7 @@ from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.quality import TRANSFORMS
-from fisheye_svp_ros.nodes.transforms import FrameListener, Transforms
+from fisheye_svp_ros.nodes.transforms import FrameListener, TransformPublisher
 from fisheye_svp_ros.pose import Pose, carried_pose
 from fisheye_svp_ros.study.settings import RobotSettings
 
@@ -54,7 +54,7 @@ class BasePose:
         topics = [topic for topic in TRANSFORMS if odom or topic == '/tf_static']
         self._frames.listen('base_frame', topics)
         self._publisher = node.announce(PoseWithCovarianceStamped, '~/base_pose')
-        self._transforms = Transforms(node, bool(odom))
+        self._transforms = TransformPublisher(node, bool(odom))
 
     def publish(
         self, camera_pose: Pose, covariance: Array, stamp: int, world: str, camera: str

@@ -24,7 +24,7 @@ from fisheye_svp_ros.nodes.base import BaseNode, NodeExit, NodeFailure
 from fisheye_svp_ros.nodes.quality import LATCHED_SETS, SENSOR
 from fisheye_svp_ros.nodes.session import RCLError
 from fisheye_svp_ros.nodes.subscriptions import LIMIT
-from fisheye_svp_ros.nodes.transforms import Transforms
+from fisheye_svp_ros.nodes.transforms import TransformPublisher
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Landmarks, Observations
@@ -107,7 +107,7 @@ class CameraNode(BaseNode):
             None if self.photographs else self.announce(PointCloud2, 'landmarks', LATCHED_SETS)
         )
         self._scenario = self.announce(DiagnosticArray, 'scenario')
-        self.transforms = Transforms(self, self.settings.publish_tf)
+        self.transforms = TransformPublisher(self, self.settings.publish_tf)
         self._cameras: dict[str, CameraTopics] = {}
         self._timer: Any = None
         self._steps: Iterator[Any] = iter(())

@@ -22,7 +22,7 @@ from fisheye_svp_ros.nodes.detections import detections_reader
 from fisheye_svp_ros.nodes.messages import camera_shape
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.solver import SolverNode, lens_of
-from fisheye_svp_ros.nodes.transforms import Transforms
+from fisheye_svp_ros.nodes.transforms import TransformPublisher
 from fisheye_svp_ros.nodes.validation import Items, KnownPoints
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -61,7 +61,7 @@ class Localizer(SolverNode):
         self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error')
         self._residuals = self.announce(PointCloud2, '~/residuals')
         self._markers = self.announce(MarkerArray, '~/markers', LATCHED)
-        self._transforms = Transforms(self, self.settings.publish_tf)
+        self._transforms = TransformPublisher(self, self.settings.publish_tf)
         self._base = BasePose(self, self.settings)
         self._latest: deque[tuple[int, Pose]] = deque(maxlen=2)  # stamps and poses, to go on from
         self._rms_before = 0.0  # px

@@ -15,7 +15,7 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base_pose import BasePose
 from fisheye_svp_ros.nodes.set_collection import make_set, table_of
 from fisheye_svp_ros.nodes.solver import SolverNode
-from fisheye_svp_ros.nodes.transforms import Transforms
+from fisheye_svp_ros.nodes.transforms import TransformPublisher
 from fisheye_svp_ros.nodes.validation import Items
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.wording.poses import rig_reason
@@ -40,7 +40,7 @@ class RigLocalizer(SolverNode):
     def __init__(self, node_name: str | None = None, **options: Any) -> None:
         super().__init__(node_name, **options)
         self._pose = self.announce(PoseWithCovarianceStamped, '~/pose')
-        self._transforms = Transforms(self, self.settings.publish_tf)
+        self._transforms = TransformPublisher(self, self.settings.publish_tf)
         self._base = BasePose(self, self.settings)
         self.start()
 

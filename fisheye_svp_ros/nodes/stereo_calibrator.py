@@ -22,7 +22,7 @@ from fisheye_svp_ros.nodes.set_collection import (
     table_of,
 )
 from fisheye_svp_ros.nodes.solver import SolverNode, exchange_reason, true_rig
-from fisheye_svp_ros.nodes.transforms import Transforms
+from fisheye_svp_ros.nodes.transforms import TransformPublisher
 from fisheye_svp_ros.nodes.validation import Items
 from fisheye_svp_ros.scene.observations import STEREO, stereo_views
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
@@ -45,7 +45,7 @@ class StereoCalibrator(SolverNode):
         self._rig = self.announce(TransformStamped, '~/rig', LATCHED)
         self._position_error = self.announce(Vector3Stamped, '~/position_error')
         self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error')
-        self._transforms = Transforms(self, self.settings.publish_tf, static=True)
+        self._transforms = TransformPublisher(self, self.settings.publish_tf, static=True)
         self._progress = Progress(self)
         self._scenario: frozenset[tuple[str, str]] = frozenset()
         self._window: list[CollectedSet] = []

@@ -24,7 +24,7 @@ _MAX_SENT = 100  # transforms by which those that come back may be late
 _MAX_LENGTH = 1000  # poses of a moving frame that are kept, 10 s at 100 Hz
 
 
-class Transforms:
+class TransformPublisher:
     """What one node tells tf2, if it is to; static: what holds until it is told anew.
 
     A frame has one parent (REP 105): where another node publishes the same child, it is said.

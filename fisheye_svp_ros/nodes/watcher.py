@@ -35,7 +35,7 @@ class MetricHistory:
 
 
 @dataclass
-class Results:
+class SolverResults:
     """What a node has told: sets it was given, sets it could not solve, its metrics."""
 
     sets: int = 0
@@ -49,7 +49,7 @@ class Watcher(Node):  # type: ignore[misc]
 
     def __init__(self) -> None:
         super().__init__('watcher')
-        self.results: dict[str, Results] = {}
+        self.results: dict[str, SolverResults] = {}
         start_timer(self, _LOOK_EVERY, self._look)
 
     def spin(self, show: Callable[[], None], signals: SignalHandler) -> None:
@@ -65,7 +65,7 @@ class Watcher(Node):  # type: ignore[misc]
         for topic, types in self.get_topic_names_and_types():
             node = topic.removesuffix('/result')
             if node != topic and node not in self.results and types == [_TYPE]:
-                self.results[node] = Results()
+                self.results[node] = SolverResults()
                 self.create_subscription(DiagnosticArray, topic, self._hear(node), RELIABLE)
 
     def _hear(self, node: str) -> Callable[[DiagnosticArray], None]:

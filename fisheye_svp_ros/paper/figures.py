@@ -16,7 +16,7 @@ from fisheye_svp_ros.paper.extensions import NOISES, Crossings
 from fisheye_svp_ros.paper.lens_evaluation import (
     LensEvaluation,
     LocalizedSpread,
-    Measurement,
+    StereoMeasurement,
     landmarks_at,
 )
 from fisheye_svp_ros.paper.results import Panel
@@ -328,7 +328,7 @@ def _caption(panel: Panel) -> str:
 
 
 def _draw_left_image(
-    axis: Any, evaluation: LensEvaluation, measured: Measurement, style: str
+    axis: Any, evaluation: LensEvaluation, measured: StereoMeasurement, style: str
 ) -> None:
     lens = evaluation.lens
     _draw_image_frame(axis, lens)
@@ -342,7 +342,7 @@ def _draw_left_image(
     axis.plot([u, u], [v, ends], color=OURS, linewidth=1.2)
 
 
-def _draw_points(axis: Any, measured: Measurement, across: int, up: int) -> None:
+def _draw_points(axis: Any, measured: StereoMeasurement, across: int, up: int) -> None:
     known = np.isfinite(measured.measured[:, 0])
     true, solved = measured.true[known], measured.measured[known]
     axis.plot(

@@ -34,7 +34,7 @@ class LocalizedSpread(NamedTuple):
     views: Views
 
 
-class Measurement(NamedTuple):
+class StereoMeasurement(NamedTuple):
     """Stereo measurement of N landmarks, NaN where a camera does not see one (section 5).
 
     uv_left, uv_right (N, 2), px; foot (N, 2), px: nearest point of the epipolar curve; distance,
@@ -63,7 +63,7 @@ class LensEvaluation(NamedTuple):
     localization: Array
     calibration: Array
     localized: tuple[LocalizedSpread, ...]
-    measured: tuple[Measurement, ...]
+    measured: tuple[StereoMeasurement, ...]
 
     def panels(self, metric: str) -> Array:
         """Return a stereo depth metric of the nine panels, (9,)."""
@@ -152,7 +152,9 @@ def calibrate_rigs(
     return table.reshape(len(RADII), len(STYLE_NAMES), -1), solved.solution
 
 
-def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -> Measurement:
+def measure(
+    lens: Lens, radius: float, style: str, solver: Lens | None = None
+) -> StereoMeasurement:
     """Measure the Whole landmarks with a rig that is known (section 5, figures 9 and 10)."""
     home = paper_pose(1)
     ahead = np.array([0.0, 0.0, RIGHT_CAMERA_Z.get(lens.name, 0.0)])
@@ -168,7 +170,7 @@ def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -
         (known, known), left_in_right.take(None), uv_left, uv_right, right.into_body(points)
     )
     calibration = solved.solution
-    return Measurement(
+    return StereoMeasurement(
         uv_left[0],
         uv_right[0],
         calibration.foot[0],

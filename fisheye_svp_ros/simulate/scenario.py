@@ -336,7 +336,7 @@ def _interpolate_poses(poses: Pose, steps: int, numbers: Index) -> Pose:
     return way
 
 
-class Batch(NamedTuple):
+class ScenarioBatch(NamedTuple):
     """S scenarios of one lens and as many cameras, with P sets of N landmarks each.
 
     row (S,): which of the scenarios; landmark (S, N); points (S, N, 3), m; rig (S,), None for
@@ -360,7 +360,7 @@ class _Scene(NamedTuple):
     poses: Pose
 
 
-def simulate_batches(scenarios: Sequence[Scenario], first: int) -> Iterator[Batch]:
+def simulate_batches(scenarios: Sequence[Scenario], first: int) -> Iterator[ScenarioBatch]:
     """Simulate scenarios, those of equal shape together; first: number of the first in its sweep.
 
     Raises FisheyeSvpError as `simulate_scenario` does.
@@ -379,7 +379,7 @@ def simulate_batches(scenarios: Sequence[Scenario], first: int) -> Iterator[Batc
         yield _simulate_batch(scenes, first)
 
 
-def _simulate_batch(scenes: Sequence[_Scene], first: int) -> Batch:
+def _simulate_batch(scenes: Sequence[_Scene], first: int) -> ScenarioBatch:
     one = scenes[0].scenario
     poses = Pose.stack([scene.poses for scene in scenes])
     rigs = [rig for scene in scenes if (rig := scenario_rig(scene.scenario)) is not None]
@@ -408,4 +408,4 @@ def _simulate_batch(scenes: Sequence[_Scene], first: int) -> Batch:
             )
         )
     row = np.array([scene.row for scene in scenes])
-    return Batch(row, one.lens, one.shift_scale, landmark, points, rig, cameras, tuple(uv))
+    return ScenarioBatch(row, one.lens, one.shift_scale, landmark, points, rig, cameras, tuple(uv))

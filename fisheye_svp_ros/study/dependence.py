@@ -18,7 +18,7 @@ _REPEATS = ('seed',)  # differ so that the noise does
 _BAND = (5.0, 95.0)  # percent
 
 
-class Curve(NamedTuple):
+class ErrorCurve(NamedTuple):
     """An error over values x (X,) of a parameter: median, low and high (5 and 95 %), (X,).
 
     key: the values of the parameters that tell this curve from the others.
@@ -65,7 +65,7 @@ def is_number(table: DataFrame, name: str) -> bool:
     return str(table[name].dtype.kind) in 'iuf'
 
 
-def curves(table: DataFrame, metric: str, x: str, by: Sequence[str]) -> list[Curve]:
+def curves(table: DataFrame, metric: str, x: str, by: Sequence[str]) -> list[ErrorCurve]:
     """Return an error over parameter x, a curve a combination of the parameters `by`."""
     values, places = _numbers(table, metric), _slots(table, x)
     groups: dict[tuple[Any, ...], Any] = {(): np.arange(len(values))}
@@ -84,7 +84,7 @@ def curves(table: DataFrame, metric: str, x: str, by: Sequence[str]) -> list[Cur
                 for cell in (cell[np.isfinite(cell)] for cell in cells)
             ]
         ).T
-        found.append(Curve(key, list(places), middle, low, high))
+        found.append(ErrorCurve(key, list(places), middle, low, high))
     return found
 
 

@@ -22,8 +22,8 @@ from fisheye_svp_ros.scene.rigs import STYLES
 from fisheye_svp_ros.simulate.scenario import (
     MONO,
     SCALARS,
-    Batch,
     Scenario,
+    ScenarioBatch,
     check_sweep,
     model_of,
     scalars,
@@ -108,7 +108,7 @@ class _Sets(NamedTuple):
         return views._replace(landmark=self.landmark[index])
 
 
-def _sets(batch: Batch) -> _Sets:
+def _sets(batch: ScenarioBatch) -> _Sets:
     scenarios, sets = batch.uv[0].shape[:2]
     of = np.repeat(np.arange(scenarios), sets)
     poses = [pose.reshape(-1) for pose in batch.poses]
@@ -116,7 +116,7 @@ def _sets(batch: Batch) -> _Sets:
     return _Sets(batch.landmark[of], batch.points[of], tuple(poses), tuple(uv))
 
 
-def _model(batch: Batch, settings: SolverSettings) -> ForwardModel:
+def _model(batch: ScenarioBatch, settings: SolverSettings) -> ForwardModel:
     if settings.lens:
         return model_of(settings.lens, 1.0, settings.solves_svp)
     return model_of(batch.lens, batch.shift_scale, settings.solves_svp)
@@ -126,7 +126,7 @@ def _chunks(index: Index) -> list[Index]:
     return [index[i : i + _SETS_PER_SOLVE] for i in range(0, len(index), _SETS_PER_SOLVE)]
 
 
-def localizer(batch: Batch, settings: LocalizerSettings) -> Outcome:
+def localizer(batch: ScenarioBatch, settings: LocalizerSettings) -> Outcome:
     """Localize the camera of every set, as the localizer does."""
     sets, model = _sets(batch), _model(batch, settings)
     outcome = Outcome(len(sets.landmark), LOCALIZATION_METRICS)
@@ -140,7 +140,7 @@ def localizer(batch: Batch, settings: LocalizerSettings) -> Outcome:
     return outcome
 
 
-def stereo_calibrator(batch: Batch, settings: StereoCalibratorSettings) -> Outcome:
+def stereo_calibrator(batch: ScenarioBatch, settings: StereoCalibratorSettings) -> Outcome:
     """Calibrate after every set from those of its scenario so far, as the stereo calibrator does.
 
     A set that cannot be used is left out of those that come after it.
@@ -171,7 +171,7 @@ def stereo_calibrator(batch: Batch, settings: StereoCalibratorSettings) -> Outco
     return outcome
 
 
-def stereo_depth(batch: Batch, settings: StereoDepthSettings) -> Outcome:
+def stereo_depth(batch: ScenarioBatch, settings: StereoDepthSettings) -> Outcome:
     """Measure every set with the true rig, as stereo depth does."""
     sets, model, rig = _sets(batch), _model(batch, settings), batch.rig
     assert rig is not None
@@ -194,7 +194,7 @@ class Solver(NamedTuple):
 
     settings: type[SolverSettings]
     metrics: Sequence[str]
-    solve: Callable[[Batch, Any], Outcome]
+    solve: Callable[[ScenarioBatch, Any], Outcome]
 
 
 SOLVERS: Mapping[str, Solver] = {
@@ -358,7 +358,7 @@ def _scenario(plan: Plan, number: int) -> Scenario:
     return replace(plan.base, **plan.sweep.point(number))
 
 
-def _rows(plan: Plan, scenarios: list[Scenario], first: int, batch: Batch) -> DataFrame:
+def _rows(plan: Plan, scenarios: list[Scenario], first: int, batch: ScenarioBatch) -> DataFrame:
     from pandas import DataFrame
 
     kinds, sets = column_types(plan), batch.uv[0].shape[1]

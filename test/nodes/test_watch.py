@@ -27,9 +27,11 @@ from fisheye_svp_ros.commands import watch
     ],
 )
 def test_a_terminal_that_is_too_narrow_is_told_so(width: int, shown: str) -> None:
-    from fisheye_svp_ros.nodes.watcher import MetricHistory, Results
+    from fisheye_svp_ros.nodes.watcher import MetricHistory, SolverResults
 
-    results = Results(sets=3, lost=1, note='few', metrics={'position_error_x_m': MetricHistory()})
+    results = SolverResults(
+        sets=3, lost=1, note='few', metrics={'position_error_x_m': MetricHistory()}
+    )
     results.metrics['position_error_x_m'].add(-1.23456789e-5)
     watcher = SimpleNamespace(results={'/here/localizer': results})
     out = Console(width=width, file=io.StringIO(), record=True)

@@ -24,7 +24,9 @@ from fisheye_svp_ros.optics.lens import Lens, field_of_view
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.observations import views_of
 
-Curve = Callable[[Array], Array]  # image height for unit focal length, of the incidence angle
+HeightFormula = Callable[
+    [Array], Array
+]  # image height for unit focal length, of the incidence angle
 
 OPENCV = ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6')  # in its order
 RADIAL_TERMS = 4  # radial coefficients that Kannala-Brandt has
@@ -36,7 +38,7 @@ _TOLERANCE = 0.01  # px, of a lens written in a form that knows fewer curves
 class Base(NamedTuple):
     """A curve, and the incidence angle, rad, up to which it holds."""
 
-    height: Curve
+    height: HeightFormula
     limit: float
 
 
@@ -291,7 +293,7 @@ def fit_curve(
     name: str,
     size: Sequence[float],
     intrinsics: Sequence[float],
-    curve: Curve,
+    curve: HeightFormula,
     limit: float,
     where: str,
     shift: ViewpointShift | None = None,

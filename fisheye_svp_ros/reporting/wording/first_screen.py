@@ -97,7 +97,7 @@ class Photo(NamedTuple):
     uri: str
 
 
-class Action(NamedTuple):
+class AnswerLine(NamedTuple):
     """One line: about what, what to do, why, what it gains and how sure that is, photographs."""
 
     about: str
@@ -118,7 +118,7 @@ class Screen(NamedTuple):
     headline: str
     facts: str
     warning: str
-    actions: tuple[Action, ...]
+    actions: tuple[AnswerLine, ...]
     causes: str
     candidates: str
     bound: str
@@ -149,7 +149,7 @@ def first_screen(
         _facts(d, source),
         _warning(d),
         tuple(
-            Action(
+            AnswerLine(
                 title,
                 do,
                 _reason(decision, d),
