@@ -26,6 +26,7 @@ from fisheye_svp_ros.diagnosis.random_effects import (
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.extension import Target
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.target_map import KnownTarget
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.mixed_model import (
     LAMBDA_ABSENT,
@@ -323,7 +324,8 @@ def _entry(
         for name, size in zip(NAMES, variances.tau, strict=True)
         if size and STAGE_OF[name] != 'target'
     }
-    modes = geometry.modes.reshape(len(geometry.points), -1)
+    target = geometry.target
+    modes = geometry.modes.reshape(len(target.points), -1)
     off = np.concatenate([geometry.alone, modes], axis=1)
     known = np.diag(covariance) > 0
     return {
@@ -338,9 +340,9 @@ def _entry(
         'landmarks': [
             [*pair, *place, *(float(f'{value:.6g}') for value in values)]
             for *pair, place, values in zip(
-                geometry.landmark.tolist(),
-                geometry.board.tolist(),
-                geometry.points.tolist(),
+                target.landmark.tolist(),
+                target.board.tolist(),
+                target.points.tolist(),
                 off,
                 strict=True,
             )
@@ -407,9 +409,7 @@ class LensErrors:
             geometry = ColumnGeometry(
                 np.array(entry['extent_px'], dtype=float).reshape(1, 2, 2),
                 np.nan if finest is None else float(finest),
-                ids,
-                boards,
-                rows[:, 2:5],
+                KnownTarget(ids, boards, rows[:, 2:5]),
                 rows[:, 8:].reshape(len(rows), 3, -1),
                 rows[:, 5:8],
                 _mean_normals(entry, boards),

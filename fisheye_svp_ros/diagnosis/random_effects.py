@@ -16,6 +16,7 @@ from scipy import sparse
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.effect_forms import bump_values, hexagons
 from fisheye_svp_ros.effects.extension import Target
+from fisheye_svp_ros.effects.target_map import KnownTarget
 from fisheye_svp_ros.mixed_model import Components, RandomColumns
 from fisheye_svp_ros.scene.boards import Board, find_boards
 from fisheye_svp_ros.solve.rig_state import Linearization
@@ -95,7 +96,7 @@ class ColumnGeometry(NamedTuple):
     """What the columns rest on, for data other than those that the variances are of.
 
     extents (C, 2, 2), px: least and largest u, v by camera; finest, px: pitch of the finest grid,
-    NaN without one; landmark, board (L,), points (L, 3), m: the target, by ascending numbers;
+    NaN without one; target: its L landmarks;
     modes (L, 3, K) and alone (L, 3), m: how far its landmarks are off along the axes of their
     boards, each as a sum of the modes, drawn once for all, and of what it has alone; normals
     (boards, 3): means over the frames, by the axes of the camera or rig.
@@ -103,9 +104,7 @@ class ColumnGeometry(NamedTuple):
 
     extents: Array
     finest: float
-    landmark: Index
-    board: Index
-    points: Array
+    target: KnownTarget
     modes: Array
     alone: Array
     normals: Array
@@ -115,7 +114,8 @@ class ColumnGeometry(NamedTuple):
         cls, linear: Linearization, finest: float, modes: Array, alone: Array, normals: Array
     ) -> ColumnGeometry:
         """Return that of a linearised state; modes, alone, normals: see above."""
-        return cls(_extents(linear), finest, *_seen_target(linear), modes, alone, normals)
+        target = KnownTarget.from_views(linear.data.views)
+        return cls(_extents(linear), finest, target, modes, alone, normals)
 
 
 class _Landmarks(NamedTuple):
@@ -130,7 +130,8 @@ class _Landmarks(NamedTuple):
     at: Array
 
     @classmethod
-    def of_target(cls, landmark: Index, board: Index, points: Array) -> _Landmarks:
+    def of_target(cls, target: KnownTarget) -> _Landmarks:
+        landmark, board, points = target
         boards = find_boards(points, board)
         board_of, at = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 2))
         for i, one in enumerate(boards):
@@ -174,25 +175,17 @@ class _Points(NamedTuple):
         weight = rows(linear.weight)
         used = shown = weight > 0
         if geometry is None:
-            extents, target = _extents(linear), _seen_target(linear)
+            extents, target = _extents(linear), KnownTarget.from_views(views)
         else:
-            extents = geometry.extents
-            target = geometry.landmark, geometry.board, geometry.points
-            shown = used & (rows(Target((), *target).landmark_mask(views)) > 0)
-        known = _Landmarks.of_target(*target)
+            extents, target = geometry.extents, geometry.target
+            shown = used & (rows(Target((), target).landmark_mask(views)) > 0)
+        known = _Landmarks.of_target(target)
         slot = np.searchsorted(known.ids, landmark).clip(max=len(known.ids) - 1)
         slot = np.where(shown, slot, -1)
         place = linear.whiten(linear.linear.d_target).reshape(*used.shape, 2, 3) * MILLIMETRE
         place = place @ np.swapaxes(known.axes[slot], -1, -2)
         uv = data.blocks(np.nan_to_num(linear.linear.uv)[..., None, :])
         return cls(used, uv, weight, camera, slot, place, extents, known)
-
-
-def _seen_target(linear: Linearization) -> tuple[Index, Index, Array]:
-    """Return numbers, boards (L,) and places (L, 3), m, of the landmarks that are seen."""
-    views = linear.data.views
-    landmark, first = np.unique(views.landmark[views.used], return_index=True)
-    return landmark, views.board[views.used][first], views.points[views.used][first]
 
 
 def _extents(linear: Linearization) -> Array:

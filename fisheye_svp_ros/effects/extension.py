@@ -18,6 +18,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.base import ModelTerm, Scene
 from fisheye_svp_ros.effects.catalogue import load_effects
+from fisheye_svp_ros.effects.target_map import KnownTarget, find_landmarks
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.lens import Lens, curve_limit, monotone_limit
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
@@ -28,15 +29,10 @@ _POSITION_TOLERANCE = 1e-5  # m; no two targets are told apart by less
 
 @dataclass(frozen=True)
 class Target:
-    """Corrections of one target and its landmarks: numbers, boards (L,) and places (L, 3), m.
-
-    Numbers ascend; None where the target is not known by its landmarks.
-    """
+    """Corrections of one target and its landmarks; None where it is not known by these."""
 
     terms: tuple[ModelTerm, ...]
-    landmark: Index | None
-    board: Index
-    points: Array
+    known: KnownTarget | None
 
     @classmethod
     def from_entries(cls, entries: Mapping[str, Any], where: str) -> Target | None:
@@ -50,7 +46,7 @@ class Target:
         terms = load_effects(effects, f'{where}: target')
         rows = entries.get(LANDMARKS)
         if rows is None:
-            return cls(terms, None, np.empty(0, dtype=np.int64), np.empty((0, 3)))
+            return cls(terms, None)
         try:
             table = np.array(rows, dtype=float).reshape(-1, 5)
         except (TypeError, ValueError) as cause:
@@ -58,7 +54,7 @@ class Target:
                 f'{where}: target.{LANDMARKS} must be a list of [landmark, board, x, y, z]'
             ) from cause
         ids, first = np.unique(table[:, 0].astype(np.int64), return_index=True)
-        return cls(terms, ids, table[first, 1].astype(np.int64), table[first, 2:])
+        return cls(terms, KnownTarget(ids, table[first, 1].astype(np.int64), table[first, 2:]))
 
     def assign_boards(self, views: Views) -> Views:
         """Return views with the target's landmarks on the boards that they belong to.
@@ -66,23 +62,24 @@ class Target:
         Those that it was found without are where the views say; where these have no boards, or
         others (as on topics), on that of the nearest landmark.
         """
-        if self.landmark is None or not len(self.landmark):
+        target = self.known
+        if target is None or not len(target.landmark):
             return views
-        slot, known, same = self._lookup(views)
-        board = np.where(same, self.board[slot], views.board)
+        slot, known, same = _find_same(target, views)
+        board = np.where(same, target.board[slot], views.board)
         new = views.used & ~known
         if new.any() and (board != views.board)[same & views.used].any():
-            away = np.linalg.norm(views.points[new][:, None] - self.points, axis=-1)
-            board[new] = self.board[away.argmin(axis=1)]
+            away = np.linalg.norm(views.points[new][:, None] - target.points, axis=-1)
+            board[new] = target.board[away.argmin(axis=1)]
         return views._replace(board=board)
 
     def landmark_mask(self, views: Views) -> Mask:
         """Return which landmarks (S, N) are the target's, or may be, in views that show it."""
-        if self.landmark is None:
+        if self.known is None:
             return np.ones(views.landmark.shape, dtype=bool)
-        if not len(self.landmark):
+        if not len(self.known.landmark):
             return np.zeros(views.landmark.shape, dtype=bool)
-        _, known, same = self._lookup(views)
+        _, known, same = _find_same(self.known, views)
         count = (same & views.used).sum(axis=1)
         shows = (count > 0) & (2 * count >= views.used.sum(axis=1))
         return np.asarray(shows[:, None] & (same | ~known))
@@ -95,13 +92,12 @@ class Target:
         parts = [term.displacement(scene) for term in terms]
         return np.asarray(np.sum(parts, axis=0) * self.landmark_mask(scene.views)[..., None])
 
-    def _lookup(self, views: Views) -> tuple[Index, Mask, Mask]:
-        """Return places in the table (S, N), whether the number is there, whether the place is."""
-        assert self.landmark is not None
-        slot = np.searchsorted(self.landmark, views.landmark).clip(max=len(self.landmark) - 1)
-        known = self.landmark[slot] == views.landmark
-        off = np.abs(self.points[slot] - views.points).max(axis=-1)
-        return slot, known, known & (off < _POSITION_TOLERANCE)
+
+def _find_same(target: KnownTarget, views: Views) -> tuple[Index, Mask, Mask]:
+    """Return places in the table (S, N), whether the number is there, whether the place is."""
+    slot, known = find_landmarks(target.landmark, views)
+    off = np.abs(target.points[slot] - views.points).max(axis=-1)
+    return slot, known, known & (off < _POSITION_TOLERANCE)
 
 
 def landmark_rows(observations: Observations) -> list[list[float]]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.base import ModelTerm, Scene
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import cross_matrix, identity
@@ -74,11 +74,16 @@ class KnownTarget(NamedTuple):
         return maps
 
 
+def find_landmarks(landmark: Index, views: Views) -> tuple[Index, Mask]:
+    """Return places (S, N) of the landmarks of views among ascending ones, and which are there."""
+    slot = np.searchsorted(landmark, views.landmark).clip(max=len(landmark) - 1)
+    return slot, np.asarray(landmark[slot] == views.landmark)
+
+
 def at_landmarks(views: Views, landmark: Index, values: Array) -> Array:
     """Return values (L, D) of landmarks (L,), ascending, where views (S, N) show them, else 0."""
-    slot = np.searchsorted(landmark, views.landmark).clip(max=len(landmark) - 1)
-    known = (landmark[slot] == views.landmark) & views.used
-    return np.where(known[..., None], values[slot], 0.0)
+    slot, known = find_landmarks(landmark, views)
+    return np.where((known & views.used)[..., None], values[slot], 0.0)
 
 
 def board_maps(views: Views, terms: Sequence[ModelTerm], lens: Lens) -> list[BoardMap]:

@@ -25,7 +25,7 @@ _SQUARE = 1e-3  # digits of a printed rotation are forgiven
 _TIME = re.compile(r'\d{4}(-\d{2}){5}$')
 
 
-class Board(NamedTuple):
+class BoardCorners(NamedTuple):
     """One board of a target: its first landmark's id and its corners (N, 3), m, target frame."""
 
     first: int
@@ -70,7 +70,7 @@ def _description(folder: Path) -> Path:
     raise ObservationError(f'{folder}: no .dsc file of the target, here or two folders above')
 
 
-def _read_boards(path: Path) -> dict[int, Board]:
+def _read_boards(path: Path) -> dict[int, BoardCorners]:
     """Read a .dsc and the .tp of the same name, which a single board can do without."""
     corners: dict[int, list[list[float]]] = {}
     number, places = -1, set()
@@ -95,7 +95,7 @@ def _read_boards(path: Path) -> dict[int, Board]:
     for number, points in corners.items():
         if number in poses and points:
             turn, place = poses[number][:, :3], poses[number][:, 3] * _MM
-            boards[number] = Board(first, np.array(points) * _CM @ turn.T + place)
+            boards[number] = BoardCorners(first, np.array(points) * _CM @ turn.T + place)
         first += len(points)
     return boards
 
@@ -118,7 +118,7 @@ def _read_board_poses(path: Path, single: bool) -> dict[float, Array]:
     return poses
 
 
-def _read_corners(path: Path, boards: dict[int, Board]) -> Array:
+def _read_corners(path: Path, boards: dict[int, BoardCorners]) -> Array:
     """Return the rows (N, 5) of one .orpc file: board, corner, 1, u, v."""
     rows, promised = [], None
     for line, fields in _lines(path):

@@ -8,8 +8,7 @@ import pytest
 from helpers.scenes import lens, observe, scene
 from helpers.water import AIR
 
-from fisheye_svp_ros.diagnosis import stages
-from fisheye_svp_ros.diagnosis import EffectTests, NullModel, Reason, Rival, diagnose
+from fisheye_svp_ros.diagnosis import EffectTests, NullModel, Reason, Rival, diagnose, stages
 from fisheye_svp_ros.diagnosis.causes import selected_causes
 from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain
 from fisheye_svp_ros.diagnosis.findings import Doubt, find_doubt

@@ -24,9 +24,7 @@ from fisheye_svp_ros.optics.lens import Lens, field_of_view
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.observations import views_of
 
-HeightFormula = Callable[
-    [Array], Array
-]  # image height for unit focal length, of the incidence angle
+HeightFormula = Callable[[Array], Array]  # image height over f of the incidence angle
 
 OPENCV = ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6')  # in its order
 RADIAL_TERMS = 4  # radial coefficients that Kannala-Brandt has
