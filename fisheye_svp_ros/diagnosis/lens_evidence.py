@@ -203,8 +203,8 @@ def find_lens_rays(
 ) -> tuple[dict[str, dict[str, list[RayError]]], LensOffset | None]:
     """Compare the rays of lenses as given, by camera, and as extended.
 
-    Returns the ray errors of both, by range (the one that the user asks for comes last), and the
-    least likely offset.
+    Returns the ray errors of both, by range (the one that the user asks for comes last), of the
+    lenses of which something is fitted, and the least likely offset.
     """
     if evaluation.medium is not None:
         return {}, None
@@ -219,6 +219,8 @@ def find_lens_rays(
         mine = views.used & ((views.camera == number) | (len(lenses) == 1))[:, None]
         uv = typical_points(views.uv[mine])
         model, there = _written_rays(evaluation, known, number, name, uv)
+        if not model.columns.any():
+            continue  # nothing of this lens is fitted: nothing is known of its errors
         off = _difference(model, points_on_rays(given, uv[there]))
         errors[name] = {'given': model.errors(off), 'extended': model.errors()}
         if asked is not None and asked not in RANGES:

@@ -212,3 +212,13 @@ def test_a_part_of_the_points_says_first_what_will_probably_be_found(monkeypatch
     found = diagnose(points, lens(), provisional=told.append)
     assert told == [('viewpoint_shift',)] * 2
     assert names(found) == {'viewpoint_shift'}
+
+
+def test_nothing_is_known_of_the_error_of_a_lens_that_is_not_fitted():
+    """It was stated as zero, with an interval of nothing, in diagnosis.json and the lens file."""
+    rng = np.random.default_rng(0)
+    points = observe(lens(), [], *scene(rng), 0.05, rng)
+    found = diagnose(points, lens(), free_intrinsics=False)
+    assert not names(found)
+    assert found.ray_error_mrad() == {}
+    assert 'ray_error_mrad' not in (found.lens.uncertainty or {})

@@ -210,13 +210,10 @@ def test_an_undecided_lens_may_be_used_where_its_error_does_no_harm(found: Diagn
     assert f'; until then it is good to {high:.2g} mrad at 1 m within ' in headline(undecided)
 
 
-def test_of_a_lens_that_is_not_fitted_no_error_is_said_to_be_zero(
+def test_of_a_lens_that_is_not_fitted_no_error_is_said(
     found: Diagnosis, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    none = {'range_m': 1.0, 'value': 0.0, 'low': 0.0, 'high': 0.0}
-    monkeypatch.setattr(
-        Diagnosis, 'ray_error_mrad', lambda _: {'given': [none], 'extended': [none]}
-    )
+    monkeypatch.setattr(Diagnosis, 'ray_error_mrad', lambda _: {})
     kept = _deciding(found, 'lens', say='keep')
     assert not first_screen(kept, 'table').accuracy
     assert headline(kept).endswith('Keep the lens.')

@@ -11,7 +11,6 @@ from fisheye_svp_ros.reporting.wording.causes import COMPONENTS, pixels
 from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE, RemainingError, remaining_error
 
 _COARSE_RATIO = 3.0  # times the noise of a point: rays known no better are no good ones
-_MIN_RAY_MRAD = 1e-6  # of a lens of which nothing is fitted, so that nothing is known of its error
 _EXTRAPOLATED_RATIO = 1.1  # of the angle that a lens claims to that of the points
 _REMAINING_PARTS = {
     'lens': '{} of that stays in the image ({})',
@@ -59,8 +58,6 @@ def used_rays(d: Diagnosis) -> UsedRays | None:
     lens = next(iter(d.evaluation.problem.inputs.lenses.values()))
     point = 1e3 * max(2**0.5 * d.noise_px, 1e-3) / lens.fx
     used = extended if d.offers_extended else given
-    if used['high'] < _MIN_RAY_MRAD:
-        return None
     return UsedRays(used, given, asked, d.adequacy.reached, point)
 
 
