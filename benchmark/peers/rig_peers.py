@@ -110,7 +110,7 @@ def by_multical(problem: dict[str, Any]) -> Any:
     points = Table.create(points=np.nan_to_num(uv)[:, :, None], valid=valid)
     board = known_board(problem['board'])
     pose_table = tables.make_pose_table(points, [board], cameras, True, 1.0)
-    start = tables.initialise_poses(pose_table)
+    start = tables.initialize_poses(pose_table)
     names = [str(i) for i in range(len(uv))]
     calibration = Calibration(
         ParamList(cameras, names),

@@ -111,7 +111,7 @@ def _steps(points: Array, source: str) -> tuple[Index, float]:
     apart = np.linalg.norm(points[:, None] - points, axis=-1)
     np.fill_diagonal(apart, np.inf)
     spacing = float(np.median(apart.min(axis=0)))
-    # Two neighbours in the middle: nominal places are rounded.
+    # Two neighbors in the middle: nominal places are rounded.
     corner = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmin())
     other = int(apart[corner].argmin())
     along = (points[other] - points[corner]) / spacing

@@ -24,7 +24,7 @@ def exact_view(lens: Lens, points: Array, uv: Array) -> View:
     model, views = ForwardModel(lens), views_of(points, uv[None])
 
     def residuals(rotation: Array, position: Array) -> tuple[Array, Array]:
-        linear = model.linearise(Pose(rotation[None], position[None]), views)
+        linear = model.linearize(Pose(rotation[None], position[None]), views)
         return (linear.uv[0] - uv).ravel(), linear.d_pose[0].reshape(-1, 6)
 
     return residuals
@@ -39,7 +39,7 @@ def fast_view(lens: Lens, points: Array, uv: Array) -> View:
     points = np.ascontiguousarray(points)
 
     def residuals(rotation: Array, position: Array) -> tuple[Array, Array]:
-        predicted, jacobian = kernel.linearise(points, rotation, position)
+        predicted, jacobian = kernel.linearize(points, rotation, position)
         return (predicted - uv).ravel(), jacobian.reshape(-1, 6)
 
     return residuals
@@ -64,7 +64,7 @@ def moved(pose: Pose, change: Array) -> tuple[Pose, Array]:
     return pose.retract(change), derivative
 
 
-def minimise(
+def minimize(
     residuals: Callable[[Array], Array],
     jacobian: Callable[[Array], Array],
     size: int,
@@ -89,7 +89,7 @@ def minimise(
 
 
 def scipy_pose(view: View, start: Pose, tolerance: float, exact: bool = False) -> Pose:
-    """Return one pose by `minimise`."""
+    """Return one pose by `minimize`."""
 
     def residuals(x: Array) -> Array:
         return view(*start.retract(x))[0]
@@ -99,4 +99,4 @@ def scipy_pose(view: View, start: Pose, tolerance: float, exact: bool = False) -
         columns: Array = view(*pose)[1] @ derivative
         return columns
 
-    return start.retract(minimise(residuals, jacobian, 6, tolerance, exact))
+    return start.retract(minimize(residuals, jacobian, 6, tolerance, exact))

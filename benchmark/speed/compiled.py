@@ -34,7 +34,7 @@ class Kernel:
         library = _kernel()
         end = 'svp' if lens.viewpoint_shift is None else 'shift'
         self._project = getattr(library, f'project_{end}')
-        self._linearise = getattr(library, f'linearise_{end}')
+        self._linearize = getattr(library, f'linearise_{end}')
         k = np.zeros(4)
         k[: len(lens.image_height.coefficients)] = lens.image_height.coefficients
         shift = lens.viewpoint_shift.coefficients if lens.viewpoint_shift else np.zeros(4)
@@ -46,11 +46,11 @@ class Kernel:
         self._project(ctypes.c_long(len(points)), *map(_at, (points, self._lens, uv)))
         return uv
 
-    def linearise(self, points: Array, rotation: Array, position: Array) -> tuple[Array, Array]:
+    def linearize(self, points: Array, rotation: Array, position: Array) -> tuple[Array, Array]:
         """Return image points (N, 2) and derivatives (N, 2, 6) of world points (N, 3)."""
         uv, jacobian = np.empty((len(points), 2)), np.empty((len(points), 2, 6))
         arrays = (points, np.ascontiguousarray(rotation), position, self._lens, uv, jacobian)
-        self._linearise(ctypes.c_long(len(points)), *map(_at, arrays))
+        self._linearize(ctypes.c_long(len(points)), *map(_at, arrays))
         return uv, jacobian
 
 

@@ -2,7 +2,7 @@
 
 Rendered images of 848 x 800 px of a board that moves slowly go to a detector and a localizer, each
 a process of its own.  What counts is the time from publishing an image, which includes what the
-camera takes to serialise and send it, until its pose has come back; camera and listener are one
+camera takes to serialize and send it, until its pose has come back; camera and listener are one
 more process, and all of them share one core.  Leave the machine alone meanwhile.
 """
 

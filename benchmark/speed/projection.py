@@ -56,19 +56,19 @@ def _project(count: int, repeats: int) -> Row:
     )
 
 
-def _linearised(lens: Lens, seen: Array) -> tuple[Callable[[], Array], Callable[[], Side], Array]:
+def _linearized(lens: Lens, seen: Array) -> tuple[Callable[[], Array], Callable[[], Side], Array]:
     """Return projection with derivatives by the pose, ours and as a kernel, and its result."""
     model, pose = ForwardModel(lens), identity(1)
     views = views_of(seen, np.zeros((1, len(seen), 2)))
-    exact = model.linearise(pose, views).uv[0]
+    exact = model.linearize(pose, views).uv[0]
 
     def ours() -> Array:
-        return model.linearise(pose, views).uv[0]
+        return model.linearize(pose, views).uv[0]
 
     def kernel() -> Side:
         compiled = Kernel(lens)
         return Side(
-            KERNEL, lambda: compiled.linearise(seen, *pose.take(0))[0], len(seen), _off(exact)
+            KERNEL, lambda: compiled.linearize(seen, *pose.take(0))[0], len(seen), _off(exact)
         )
 
     return ours, kernel, exact
@@ -76,7 +76,7 @@ def _linearised(lens: Lens, seen: Array) -> tuple[Callable[[], Array], Callable[
 
 def _project_with_pose(count: int, repeats: int) -> Row:
     lens, seen = shift_lens(), points(count, _WIDEST['shift'])
-    ours, kernel, exact = _linearised(lens, seen)
+    ours, kernel, exact = _linearized(lens, seen)
 
     def mrcal() -> Side:
         core = MrcalCore(lens)
@@ -101,7 +101,7 @@ def _project_with_pose(count: int, repeats: int) -> Row:
 
 def _svp(count: int, repeats: int) -> Row:
     lens, seen = svp_lens(), points(count, _WIDEST['svp'])
-    ours, kernel, exact = _linearised(lens, seen)
+    ours, kernel, exact = _linearized(lens, seen)
 
     def opencv() -> Side:
         require('cv2')

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmark.speed.adjustment import View, exact_view, fast_view, minimise, moved
+from benchmark.speed.adjustment import View, exact_view, fast_view, minimize, moved
 from benchmark.speed.harness import NotHereError
 from benchmark.speed.peers import (
     TOLERANCE,
@@ -32,7 +32,7 @@ _WORKER = Path(__file__).with_name('mrcal_worker.py')
 
 
 def scipy_rig(scene: StereoScene, tolerance: float, exact: bool = False) -> Pose:
-    """Return the rig by `minimise`, dense; exact: as the package's own reference projects."""
+    """Return the rig by `minimize`, dense; exact: as the package's own reference projects."""
     make = exact_view if exact else fast_view
     left, right = (
         [make(scene.lens, scene.board, uv) for uv in views.uv]
@@ -45,7 +45,7 @@ def scipy_rig(scene: StereoScene, tolerance: float, exact: bool = False) -> Pose
     def jacobian(x: Array) -> Array:
         return _residuals(scene, left, right, x.reshape(-1, 6))[1]
 
-    x = minimise(residuals, jacobian, 6 * (len(left) + 1), tolerance, exact)
+    x = minimize(residuals, jacobian, 6 * (len(left) + 1), tolerance, exact)
     return scene.rig.retract(x[-6:])
 
 

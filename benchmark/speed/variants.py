@@ -1,4 +1,4 @@
-"""Rows: the Numba engine on two cores, and compiled without vectorisation.
+"""Rows: the Numba engine on two cores, and compiled without vectorization.
 
 Both are settled when a process starts, so each side is a process of its own that times itself.
 """
@@ -99,4 +99,4 @@ def work_of(what: str, size: int) -> Callable[[], Any]:
         scene = localization(model.lens, size)
         return lambda: localize(model, scene.views, scene.start)
     views = views_of(points(size, np.radians(100.0)), np.zeros((1, size, 2)))
-    return lambda: model.linearise(identity(1), views)
+    return lambda: model.linearize(identity(1), views)

@@ -177,7 +177,7 @@ def _profile(amount: float, rng: Rng) -> World:
     return World(moved=moved)
 
 
-def _centre(amount: float, rng: Rng) -> World:
+def _center(amount: float, rng: Rng) -> World:
     du, dv = amount * _direction(rng)
     return World(lens=replace(LENS, cx=LENS.cx + du, cy=LENS.cy + dv), bumped=True)
 
@@ -210,7 +210,7 @@ HIDDEN: dict[str, Callable[[float, Rng], World]] = {
     'sensor_tilt': _tilt,
     'skew': _skew,
     'radial_profile': _profile,
-    'principal_point': _centre,
+    'principal_point': _center,
     'session_step': _step,
     'rolling_shutter': _shutter,
 }

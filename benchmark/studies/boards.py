@@ -70,12 +70,12 @@ def draw_fields(
     A field takes image points (F, N, 2) and the number (F,) of the field of each frame.
     """
     size = np.array([lens.width, lens.height])
-    centres = rng.uniform(size=(count, bumps, 2)) * size
+    centers = rng.uniform(size=(count, bumps, 2)) * size
     width = rng.uniform(*widths, (count, bumps)) * size.max()
     heights = rng.normal(size=(count, bumps, 2))
 
     def field(uv: Array, which: Index) -> Array:
-        off = uv[:, :, None] - centres[which][:, None]
+        off = uv[:, :, None] - centers[which][:, None]
         near = np.exp(-(off**2).sum(axis=-1) / 2 / width[which][:, None] ** 2)
         return np.asarray(np.einsum('fnb,fbd->fnd', near, heights[which]))
 

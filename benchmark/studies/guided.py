@@ -121,8 +121,8 @@ def hidden(rng: np.random.Generator) -> Lens:
     curve = KannalaBrandt(rng.normal(scale=0.02), rng.normal(scale=0.004), 0.0, 0.0)
     f = SIZE[0] / 2 / float(curve.value_and_slope(np.array(half))[0])
     shift = float(rng.choice([-1, 1]) * rng.uniform(0.002, 0.005))
-    centre = (np.array(SIZE) - 1) / 2 + rng.normal(scale=6, size=2)
-    return Lens('hidden', *SIZE, f, f, *centre.tolist(), curve, half, Gennery(e0=shift))
+    center = (np.array(SIZE) - 1) / 2 + rng.normal(scale=6, size=2)
+    return Lens('hidden', *SIZE, f, f, *center.tolist(), curve, half, Gennery(e0=shift))
 
 
 def camera(number: int, picture: Path | None = None) -> dict[str, Any]:

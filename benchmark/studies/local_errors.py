@@ -52,14 +52,14 @@ def draw_set(number: int) -> Taken:
     shift, bend = SHIFTS[number % 3], BENDS[number // 3 % 3]
     columns, rows, square, nearest = BOARDS[number // 9 % 3]
     focal = rng.uniform(300.0, 420.0)
-    centre = np.array(SIZE) / 2 + 10 * rng.normal(size=2)
+    center = np.array(SIZE) / 2 + 10 * rng.normal(size=2)
     curve = KannalaBrandt(*(rng.normal(size=3) * [0.03, 0.004, 0.001] - [0.02, 0.0, 0.0]))
     lens = Lens(
         'true',
         *SIZE,
         focal,
         focal * (1 + 1e-4 * rng.normal()),
-        *centre,
+        *center,
         curve,
         1.5,
         Gennery(e0=shift),
@@ -69,7 +69,7 @@ def draw_set(number: int) -> Taken:
     points = bent(printed.corners, bend, rng)
     seen = photographed(lens, printed, points, poses, rng.uniform(0.08, 0.2), rng)
     far = 2 * (rng.random((len(seen), 1)) < 0.004) * rng.normal(size=(len(seen), 2))
-    table = replace(seen, uv=seen.uv + own_errors(seen, centre, rng) + far)
+    table = replace(seen, uv=seen.uv + own_errors(seen, center, rng) + far)
     return Taken(table.take(rng.random(len(seen)) < rng.uniform(0.9, 1.0)), shift, bend, lens)
 
 
@@ -85,10 +85,10 @@ def bent(corners: Array, bend: float, rng: Rng) -> Array:
     return points
 
 
-def own_errors(seen: Observations, centre: Array, rng: Rng) -> Array:
+def own_errors(seen: Observations, center: Array, rng: Rng) -> Array:
     """Return what lens and frames have of their own (M, 2), px, at the points of a table."""
     reach = float(np.hypot(*SIZE)) / 2
-    at = (seen.uv - centre) / reach
+    at = (seen.uv - center) / reach
     x, y = at.T
     radius = np.linalg.norm(at, axis=1, keepdims=True)
     ripple = (

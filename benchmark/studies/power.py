@@ -113,7 +113,7 @@ def _choose_frames(scene: Scene, count: int, rng: Rng) -> Scene:
     rows = np.isin(scene.frame, chosen)
     return replace(
         scene,
-        track=Track(track.times[chosen], track.centres[chosen], track.turns[chosen], track.moving),
+        track=Track(track.times[chosen], track.centers[chosen], track.turns[chosen], track.moving),
         held=np.zeros(len(chosen), bool),
         frame=np.searchsorted(chosen, scene.frame[rows]),
         camera=scene.camera[rows],

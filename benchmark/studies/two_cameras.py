@@ -279,7 +279,7 @@ def reachable(seen: Pair, hidden: Hidden) -> dict[str, float]:
         model = ForwardModel(lens)
         pose = localize(model, views).pose
         for _ in range(_ROUNDS):
-            off = np.linalg.norm(views.uv - model.linearise(pose, views).uv, axis=-1)
+            off = np.linalg.norm(views.uv - model.linearize(pose, views).uv, axis=-1)
             limit = _FAR * np.nanmedian(np.where(views.used, off, np.nan), axis=1, keepdims=True)
             pose = localize(
                 model,

@@ -1,4 +1,4 @@
-"""`fisheye-svp demo`: the whole node graph as processes, recorded, summarised and plotted."""
+"""`fisheye-svp demo`: the whole node graph as processes, recorded, summarized and plotted."""
 
 from __future__ import annotations
 

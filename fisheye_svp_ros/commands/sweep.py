@@ -26,7 +26,7 @@ from fisheye_svp_ros.io.files import (
 from fisheye_svp_ros.io.share import sweep_path
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.reporting.terminal import print_table, progress
-from fisheye_svp_ros.study.solutions import summarise
+from fisheye_svp_ros.study.solutions import summarize
 from fisheye_svp_ros.study.sweep import (
     Plan,
     column_types,
@@ -178,7 +178,7 @@ def _written(
 
 def _report(path: Path, folder: Path, plan: Plan, mine: str, metrics: DataFrame) -> None:
     """Print and write what came out, metric by metric."""
-    summaries = {name: summarise(metrics[name].to_numpy()) for name in metrics}
+    summaries = {name: summarize(metrics[name].to_numpy()) for name in metrics}
     count = len(plan.sweep)
     print_table(
         f'{path}: {count_text(count, "scenario")}',

@@ -1,8 +1,8 @@
-"""Where the centre of a printed circle is in the image, and how sure that is.
+"""Where the center of a printed circle is in the image, and how sure that is.
 
-The image of a circle is a blurred ellipse, bent as a fisheye bends it: its own centre is not the
-image of the circle's centre.  How the image bends around a circle follows from where its
-neighbours are; ellipse, centre, blur, brightness, contrast and the gradient of the light are
+The image of a circle is a blurred ellipse, bent as a fisheye bends it: its own center is not the
+image of the circle's center.  How the image bends around a circle follows from where its
+neighbors are; ellipse, center, blur, brightness, contrast and the gradient of the light are
 fitted by least squares.
 """
 
@@ -32,7 +32,7 @@ from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 # Of the lens that fits one photograph, as far as that determines it
 _FREE = (('f', 'cx', 'cy', 'k1', 'k2', 'k3'), ('f', 'cx', 'cy', 'k1'), ('f', 'k1', 'k2', 'k3'))
-_ROUNDS = 2  # the neighbours' centres are fitted, too
+_ROUNDS = 2  # the neighbors' centers are fitted, too
 _WINDOW_SHARE = 0.7  # of the way from the circle's edge to the next circle's
 _MAX_CLEARANCE = 48.0  # px from a center to the next edge; beyond, the image is halved
 _MIN_HALF_AXIS = 3.0  # px, of a circle's lesser half axis
@@ -43,11 +43,11 @@ _MAX_RMS = 0.6  # px rms; rough places are off by less, as far as no lens explai
 
 @np.errstate(**IN_SILENCE)
 def fit_circles(pixels: Pixels, start: Array, points: Array, censored: bool = True) -> Corners:
-    """Fit the circles at start (N, 2), px, in an image (H, W); points (N, 3), m: their centres.
+    """Fit the circles at start (N, 2), px, in an image (H, W); points (N, 3), m: their centers.
 
     censored: light at the end of the scale may have been any beyond it.
 
-    Of what is found contrast is above 0 for dark circles; sigma is that of the centre, NaN where
+    Of what is found contrast is above 0 for dark circles; sigma is that of the center, NaN where
     nothing tells how the image bends.
     """
     distance = np.linalg.norm(points[:, None] - points, axis=-1)
@@ -172,7 +172,7 @@ class _Problem(WindowProblem):
         super().__init__(cut, np.clip((reach - far) * scale + 0.5, 0.0, 1.0) * cut.inside)
 
     def start(self, radius: float) -> Array:
-        """Return a start (N, 10): circles of a radius, m, as their neighbours have it."""
+        """Return a start (N, 10): circles of a radius, m, as their neighbors have it."""
         values = np.zeros((len(self._first), _UNKNOWNS))
         values[:, :2] = self._first
         # (A A^T)^(-1/2), A from the unit circle to the image

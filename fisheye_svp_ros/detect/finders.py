@@ -122,7 +122,7 @@ def charuco(image: Grey, pattern: Pattern) -> LocatedPoints | None:
         corners, ids, tags, tag_ids = _ARUCO.CharucoDetector(board).detectBoard(image)
         turned = pattern.rows % 2 == 0 and hasattr(board, 'setLegacyPattern')
         if ids is None and tag_ids is not None and turned:
-            # Before OpenCV 4.6 boards of an even number of rows had their colours the other way.
+            # Before OpenCV 4.6 boards of an even number of rows had their colors the other way.
             board.setLegacyPattern(True)
             corners, ids, _, _ = _ARUCO.CharucoDetector(board).detectBoard(
                 image, markerCorners=tags, markerIds=tag_ids

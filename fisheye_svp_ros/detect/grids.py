@@ -22,13 +22,13 @@ _LEAST, _LARGEST = 12.0, 0.02  # px^2; of the image: area of a circle
 _AREA_TOLERANCE = 0.1  # how far its area may be from its ellipse's
 _RING, _EVEN = 1.3, 0.4  # of its size, where all must be another brightness; of the most
 _AZIMUTHS = np.arange(16) * np.pi / 8
-_NEIGHBOUR = 1.22  # times the usual distance; diagonal neighbours are at 1.41
+_NEIGHBOR = 1.22  # times the usual distance; diagonal neighbors are at 1.41
 _MIN_STEP_COSINE = 0.8  # least cosine between a step and the one before
 _SEEDS = 8
 _SQUARE_BLOCKS = (31, 61, 121, 241)  # px, of the local threshold
 _DARKNESS_LEVELS = (10, 30, 60)  # grey levels below the mean there
 _ROUNDNESS = 0.04  # of its perimeter, what a side through a fisheye may bend
-_MAX_OFFSET = 0.3  # of the step to the next square, how far off its centre may be
+_MAX_OFFSET = 0.3  # of the step to the next square, how far off its center may be
 _GROWTH = 4.0  # of the area, from square to square
 _MIN_AREA = 40  # px^2
 
@@ -36,9 +36,9 @@ Grid = dict[tuple[int, int], int]
 
 
 class Ellipses(NamedTuple):
-    """Centres (B, 2), px, and matrices (B, 2, 2) that turn an ellipse into the unit circle."""
+    """Centers (B, 2), px, and matrices (B, 2, 2) that turn an ellipse into the unit circle."""
 
-    centre: Array
+    center: Array
     matrix: Array
 
 
@@ -47,21 +47,21 @@ def find_circles(image: NDArray[np.uint8], pattern: Pattern) -> LocatedPoints | 
     wanted = _lattice(pattern)
     for soft, bright in itertools.product(_SMOOTHING, (False, True)):
         seen = _ellipses(np.asarray(cv2.GaussianBlur(image, (0, 0), soft), np.uint8), bright)
-        if len(seen.centre) < len(wanted):
+        if len(seen.center) < len(wanted):
             continue
-        near = _neighbours(seen)
-        off = np.linalg.norm(seen.centre - np.median(seen.centre, axis=0), axis=1)
+        near = _neighbors(seen)
+        off = np.linalg.norm(seen.center - np.median(seen.center, axis=0), axis=1)
         inner = np.lexsort((off, -near.sum(axis=1)))
         for seed in inner[:_SEEDS].tolist():
             grid = _grow_grid(seen, near, seed)
             order = _assign_blobs(grid, wanted) if len(grid) >= len(wanted) else None
             if order is not None:
-                return LocatedPoints(np.arange(len(order)), seen.centre[order])
+                return LocatedPoints(np.arange(len(order)), seen.center[order])
     return None
 
 
 def _lattice(pattern: Pattern) -> Index:
-    """Return integer places (N, 2) of the points, neighbours one apart."""
+    """Return integer places (N, 2) of the points, neighbors one apart."""
     xy = np.round(pattern.points[:, :2] / pattern.size).astype(np.int64)
     if pattern.kind == 'asymmetric_circles':
         xy = np.stack([xy.sum(axis=1), xy[:, 1] - xy[:, 0]], axis=-1) // 2
@@ -82,13 +82,13 @@ def _ellipses(image: NDArray[np.uint8], bright: bool) -> Ellipses:
         )
         contours += cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
     every = _standing_out(image, _elliptic(contours, _LARGEST * image.size), bright)
-    centres, matrices = np.empty((0, 2)), np.empty((0, 2, 2))
-    for centre, matrix in zip(*every, strict=True):
-        off = np.linalg.norm(np.einsum('iab,ib->ia', matrices, centre - centres), axis=1)
+    centers, matrices = np.empty((0, 2)), np.empty((0, 2, 2))
+    for center, matrix in zip(*every, strict=True):
+        off = np.linalg.norm(np.einsum('iab,ib->ia', matrices, center - centers), axis=1)
         if off.min(initial=np.inf) > 1:
-            centres = np.vstack([centres, centre])
+            centers = np.vstack([centers, center])
             matrices = np.concatenate([matrices, [matrix]])
-    return Ellipses(centres, matrices)
+    return Ellipses(centers, matrices)
 
 
 def _elliptic(contours: list[Any], largest: float) -> Ellipses:
@@ -120,27 +120,27 @@ def _standing_out(image: NDArray[np.uint8], blobs: Ellipses, bright: bool) -> El
     height, width = image.shape
     circle = _RING * np.stack([np.cos(_AZIMUTHS), np.sin(_AZIMUTHS)], axis=-1)
     ring = circle @ np.linalg.inv(blobs.matrix)
-    places = np.concatenate([blobs.centre[:, None], blobs.centre[:, None] + ring], axis=1)
+    places = np.concatenate([blobs.center[:, None], blobs.center[:, None] + ring], axis=1)
     u, v = np.moveaxis(np.round(places).astype(np.int64), -1, 0)
     level = image[v.clip(0, height - 1), u.clip(0, width - 1)].astype(float)
     step = (level[:, 1:] - level[:, :1]) * (-1 if bright else 1)
     even = step.min(axis=1) > np.maximum(_EVEN * step.max(axis=1), _MIN_DARKNESS)
-    return Ellipses(blobs.centre[even], blobs.matrix[even])
+    return Ellipses(blobs.center[even], blobs.matrix[even])
 
 
-def _neighbours(blobs: Ellipses) -> Mask:
+def _neighbors(blobs: Ellipses) -> Mask:
     """Return which ellipses (B, B) are as far apart as most are from their nearest ones."""
-    move = blobs.centre[None] - blobs.centre[:, None]
+    move = blobs.center[None] - blobs.center[:, None]
     far = np.linalg.norm(np.einsum('iab,ijb->ija', blobs.matrix, move), axis=-1)
     far = (far + far.T) / 2
     np.fill_diagonal(far, np.inf)
     usual = np.median(np.sort(far, axis=1)[:, 1])
-    return np.asarray((far < _NEIGHBOUR * usual) & (far > usual / _NEIGHBOUR))
+    return np.asarray((far < _NEIGHBOR * usual) & (far > usual / _NEIGHBOR))
 
 
 def _grow_grid(blobs: Ellipses, near: Mask, seed: int) -> Grid:
     """Return ellipses by column and row that can be reached from a first one, step by step."""
-    move = blobs.centre[near[seed]] - blobs.centre[seed]
+    move = blobs.center[near[seed]] - blobs.center[seed]
     if len(move) < 2:
         return {}
     unit = _units(move, blobs.matrix[seed])
@@ -152,7 +152,7 @@ def _grow_grid(blobs: Ellipses, near: Mask, seed: int) -> Grid:
         place = waiting.pop(0)
         here = grid[place]
         others = np.flatnonzero(near[here])
-        units = _units(blobs.centre[others] - blobs.centre[here], blobs.matrix[here])
+        units = _units(blobs.center[others] - blobs.center[here], blobs.matrix[here])
         for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
             other = (place[0] + sign * (axis == 0), place[1] + sign * (axis == 1))
             along = units @ _units(sign * own[place][axis], blobs.matrix[here])
@@ -162,7 +162,7 @@ def _grow_grid(blobs: Ellipses, near: Mask, seed: int) -> Grid:
             if next_one in used:
                 continue
             steps = own[place].copy()
-            steps[axis] = sign * (blobs.centre[next_one] - blobs.centre[here])
+            steps[axis] = sign * (blobs.center[next_one] - blobs.center[here])
             grid[other], own[other] = next_one, steps
             used.add(next_one)
             waiting.append(other)
@@ -247,7 +247,7 @@ def _quads(image: NDArray[np.uint8], block: int, below: int) -> Array:
 def _grow_squares(quads: Array, first: int, step: float) -> dict[tuple[int, int], Array]:
     """Return the squares by column and row that can be reached from the first one."""
     grid = {(0, 0): quads[first]}
-    centres = quads.mean(axis=1)
+    centers = quads.mean(axis=1)
     used, waiting = {first}, [(0, 0)]
     while waiting:
         column, row = waiting.pop()
@@ -259,7 +259,7 @@ def _grow_squares(quads: Array, first: int, step: float) -> dict[tuple[int, int]
         for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
             place = (column + dx, row + dy)
             move = step * (dx * sides[0] + dy * sides[1])
-            distance = np.linalg.norm(centres - quad.mean(axis=0) - move, axis=1)
+            distance = np.linalg.norm(centers - quad.mean(axis=0) - move, axis=1)
             nearest = int(np.argmin(distance))
             far = distance[nearest] > _MAX_OFFSET * np.linalg.norm(move)
             growth = _area(quads[nearest]) / _area(quad)

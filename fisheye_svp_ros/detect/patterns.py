@@ -37,7 +37,7 @@ _MARKERS = {
     _APRILTAGS: 587,
 }
 _TAGS = _MARKERS[_APRILTAGS]
-_NEIGHBOURS = 6
+_NEIGHBORS = 6
 _CORNERS = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])  # of a square, sides of one
 _MAX_SPACING = 10.0  # m; a larger spacing is a slip of the unit
 
@@ -153,11 +153,11 @@ def parse_pattern(spec: str) -> Pattern:
 def local_axes(points: Array, uv: Array) -> Array:
     """Return derivatives (M, 2, 2), px/m, of uv (M, 2) by points (M, 2): rows are the axes."""
     distance = np.linalg.norm(points[:, None] - points, axis=-1)
-    nearest = np.argsort(distance, axis=1, kind='stable')[:, 1 : _NEIGHBOURS + 1]
+    nearest = np.argsort(distance, axis=1, kind='stable')[:, 1 : _NEIGHBORS + 1]
     here, there = points[nearest] - points[:, None], uv[nearest] - uv[:, None]
     weight = 1 / (here**2).sum(axis=-1, keepdims=True)
     transposed = np.swapaxes(here * weight, -1, -2)
-    # A little towards the isotropic: neighbours may lie on one line.
+    # A little towards the isotropic: neighbors may lie on one line.
     ridge = 1e-6 * np.eye(2)
     return np.asarray(np.linalg.solve(transposed @ here + ridge, transposed @ there))
 

@@ -165,7 +165,7 @@ def _complete_tags(
     """Return the points that a finder of tags found, and those of tags that it missed.
 
     Tags that are small, or bent through a fisheye, are not decoded.  A lens fitted to the points
-    of this photograph says where the next ones are; corners of the right colours are there.
+    of this photograph says where the next ones are; corners of the right colors are there.
     """
     points, (height, width) = pattern.points, pixels.shape
     fitted, where = index[:0], uv[:0]
@@ -249,7 +249,7 @@ def _off_center(corners: Corners, start: Array) -> Mask:
 
 
 def _height(axes: Array) -> Array:
-    """Distance, px, of neighbouring parallel lines a metre apart on the board."""
+    """Distance, px, of neighboring parallel lines a metre apart on the board."""
     longer = np.linalg.norm(axes, axis=-1).max(axis=-1)
     return np.asarray(np.abs(np.linalg.det(axes)) / np.maximum(longer, 1e-9))
 
@@ -314,7 +314,7 @@ def _order_points(index: Index, corners: Corners, pattern: Pattern, reach: Array
     if ok.sum() < max(_MIN_POINTS, _MIN_SHARE * len(ok)):
         return f'{int(ok.sum())} of {len(ok)} points can be fitted as corners'
     if np.isfinite(corners.sigma).all():
-        # One by the edge of the field, or half hidden, is not as its neighbours.
+        # One by the edge of the field, or half hidden, is not as its neighbors.
         ok &= corners.sigma < _OUTLIER_SIGMAS * np.median(corners.sigma[ok])
     if pattern.kind == 'chessboard' or pattern.marker:
         agreed = np.sign(tint[ok].sum())

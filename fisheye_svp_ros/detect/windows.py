@@ -163,7 +163,7 @@ class WindowProblem(ABC):
         """Return the states (N, U) of least squares, from a start."""
         return levenberg_marquardt(self, (values,), _ITERATIONS).state[0]
 
-    def linearize(self, values: Array, index: Index) -> tuple[Array, Array, Array]:
+    def linearize_windows(self, values: Array, index: Index) -> tuple[Array, Array, Array]:
         """Return residuals (A, P), derivatives of the model (A, P, U) and weights (A, P)."""
         image, jacobian = self.model(values, index)
         residual = self.cut.data[index] - image
@@ -171,9 +171,9 @@ class WindowProblem(ABC):
         known = ~(self.cut.clipped[index] & (residual < 0))
         return residual * known, jacobian * known[..., None], self.weight[index] * known
 
-    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+    def linearize(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         with np.errstate(**IN_SILENCE):
-            residual, jacobian, weight = self.linearize(state[0], index)
+            residual, jacobian, weight = self.linearize_windows(state[0], index)
         weight = weight / self._noise[index, None] ** 2
         transposed = np.swapaxes(jacobian * weight[..., None], -1, -2)
         hessian = transposed @ jacobian
@@ -194,7 +194,7 @@ class WindowProblem(ABC):
         from one to the other counts; halos of sharpening are the same on both, and move nothing.
         """
         cut = self.cut
-        residual, jacobian, weight = self.linearize(values, np.arange(len(values)))
+        residual, jacobian, weight = self.linearize_windows(values, np.arange(len(values)))
         weighted = np.swapaxes(jacobian * weight[..., None], -1, -2)
         hessian, pull = weighted @ jacobian, (weighted @ residual[..., None])[..., 0]
         scale = np.sqrt(np.maximum(np.einsum('nii->ni', hessian), 1e-30))
@@ -257,11 +257,11 @@ def _shrink_variances(noise2: Array, freedom: Array) -> tuple[Array, Mask]:
     """
     half = freedom / 2
     level = np.log(np.maximum(noise2, 1e-30)) - digamma(half) + np.log(half)
-    centre = float(np.median(level))
-    spread = (1.4826 * np.median(np.abs(level - centre))) ** 2 - polygamma(1, half).mean()
+    center = float(np.median(level))
+    spread = (1.4826 * np.median(np.abs(level - center))) ** 2 - polygamma(1, half).mean()
     # 1 / (x - 0.5) is near the trigamma of x, from above one on.
     prior = 2 * min(1 / max(float(spread), 1e-6) + 0.5, 1e6)
-    common = np.exp(centre + digamma(prior / 2) - np.log(prior / 2))
+    common = np.exp(center + digamma(prior / 2) - np.log(prior / 2))
     foreign = fdtrc(freedom, prior, noise2 / (_MUCH * common)) < _CHANCE
     return (prior * common + freedom * noise2) / (prior + freedom), np.asarray(foreign)
 

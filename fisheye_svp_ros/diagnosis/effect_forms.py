@@ -24,7 +24,7 @@ from fisheye_svp_ros.solve.rig_state import Linearization
 
 _LONGEST_PAUSES = 4
 _BUMP_REACH = 3.0  # of a bump, in its standard deviations
-_BUMP_WIDTH = 0.65  # standard deviation of a bump over the distance of its neighbours
+_BUMP_WIDTH = 0.65  # standard deviation of a bump over the distance of its neighbors
 _CURVE_DEGREE = 5  # degree of smooth curves over an angle
 _MAX_WAVES = 12
 
@@ -218,7 +218,7 @@ def smooth_fields(linear: Linearization) -> dict[str, Array]:
 
 
 def intrinsic_walks(linear: Linearization) -> tuple[Array, Array]:
-    """Smooth paths (F, M, P) of each camera's focal length and centre, in the order of time.
+    """Smooth paths (F, M, P) of each camera's focal length and center, in the order of time.
 
     Cosines over the frames, each half period of three frames at least; and the precision (P,) of
     the coefficient of each beside that of the slowest, as the square of the second derivative.
@@ -239,18 +239,18 @@ def intrinsic_walks(linear: Linearization) -> tuple[Array, Array]:
 
 
 def hexagons(low: Array, high: Array, pitch: float) -> Array:
-    """Return the centres (K, 2) of a hexagonal grid of a pitch over a rectangle."""
+    """Return the centers (K, 2) of a hexagonal grid of a pitch over a rectangle."""
     columns = np.arange(low[0] - pitch / 2, high[0] + pitch, pitch)
     rows = np.arange(low[1] - pitch / 2, high[1] + pitch, pitch * np.sqrt(0.75))
     return np.array([(x + pitch / 2 * (j % 2), y) for j, y in enumerate(rows) for x in columns])
 
 
-def bump_values(at: Array, mine: Mask, centres: Array, pitch: float) -> sparse.csr_array:
+def bump_values(at: Array, mine: Mask, centers: Array, pitch: float) -> sparse.csr_array:
     """Return Gaussian bumps (n, K) at places (..., 2), zero out of reach and not of `mine`."""
     sd = _BUMP_WIDTH * pitch
     near = cKDTree(at[mine]).sparse_distance_matrix(
-        cKDTree(centres), _BUMP_REACH * sd, output_type='ndarray'
+        cKDTree(centers), _BUMP_REACH * sd, output_type='ndarray'
     )
     row = np.flatnonzero(mine)[near['i']]
     values = np.exp(-((near['v'] / sd) ** 2) / 2)
-    return sparse.csr_array((values, (row, near['j'])), (mine.size, len(centres)))
+    return sparse.csr_array((values, (row, near['j'])), (mine.size, len(centers)))

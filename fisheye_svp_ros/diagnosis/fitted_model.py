@@ -82,7 +82,7 @@ class PredictedOffsets(NamedTuple):
         uv = views.uv.copy()
         for grid, values in self.grids:
             mine = views.used & (data.camera_of[:, None] == grid.camera)
-            shift = bump_values(views.uv, mine, grid.centres, grid.pitch) @ values
+            shift = bump_values(views.uv, mine, grid.centers, grid.pitch) @ values
             uv -= shift.reshape(uv.shape)
         return replace(data, views=views._replace(points=points, uv=uv))
 
@@ -231,7 +231,7 @@ class FittedModel:
         in_target = np.einsum('la,lab->lb', offset, random.axes) * MILLIMETRE
         shared, grids = eq.split(self.solution.e, self.solution.r)[2], []
         for grid in random.grids:
-            values, shared = np.split(shared, [2 * len(grid.centres)])
+            values, shared = np.split(shared, [2 * len(grid.centers)])
             grids.append((grid, values.reshape(-1, 2)))
         return PredictedOffsets(random.landmark, in_target, tuple(grids))
 

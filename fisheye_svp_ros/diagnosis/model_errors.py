@@ -487,7 +487,7 @@ class LensErrors:
         return parts._replace(noise=parts.noise + solved.added)
 
     def linearize(self, views: Views, pose: Pose) -> Linearization:
-        """Linearise views of this lens, with the numbers that are uncertain free."""
+        """Linearize views of this lens, with the numbers that are uncertain free."""
         model = ForwardModel(self.lens)
         views, terms = model.assign_boards(views), model.terms_for(views)
         bare = replace(self.lens, corrections={}, target={})

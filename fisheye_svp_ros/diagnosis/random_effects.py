@@ -57,11 +57,11 @@ _MIN_LANDMARKS = 12
 
 
 class ImageGrid(NamedTuple):
-    """Bumps over the image of one camera: component, camera, centres (K, 2) and pitch, px."""
+    """Bumps over the image of one camera: component, camera, centers (K, 2) and pitch, px."""
 
     name: str
     camera: int
-    centres: Array
+    centers: Array
     pitch: float
 
 
@@ -89,7 +89,7 @@ class RandomEffects(NamedTuple):
     @property
     def grid_columns(self) -> int:
         """How many of the shared columns, the first ones, belong to grids."""
-        return sum(2 * len(grid.centres) for grid in self.grids)
+        return sum(2 * len(grid.centers) for grid in self.grids)
 
 
 class ColumnGeometry(NamedTuple):
@@ -113,7 +113,7 @@ class ColumnGeometry(NamedTuple):
     def measure(
         cls, linear: Linearization, finest: float, modes: Array, alone: Array, normals: Array
     ) -> ColumnGeometry:
-        """Return that of a linearised state; modes, alone, normals: see above."""
+        """Return that of a linearized state; modes, alone, normals: see above."""
         target = KnownTarget.from_views(linear.data.views)
         return cls(_extents(linear), finest, target, modes, alone, normals)
 
@@ -289,7 +289,7 @@ def _frame_columns(points: _Points, compact: bool) -> tuple[Array, Index]:
 
 
 def _cover_points(points: _Points, mine: Mask, pitch: float) -> Array:
-    """Return centres of bumps over the extent of a camera and over all its points."""
+    """Return centers of bumps over the extent of a camera and over all its points."""
     low, high = points.extents[int(points.camera[mine][0])]
     uv = points.uv[mine]
     return hexagons(np.minimum(low, uv.min(axis=0)), np.maximum(high, uv.max(axis=0)), pitch)
@@ -341,12 +341,12 @@ def _image_grids(points: _Points, finest: bool) -> Iterator[tuple[ImageGrid, spa
             fits = max(int(np.sqrt(mine.sum() / fewest)), 16)
             cells = min(most, fits) if name == 'image_finest' else most
             pitch = max(float((high - low).max()) / cells, 1e-9)
-            centres = hexagons(low, high, pitch)
-            bumps = bump_values(points.uv, mine, centres, pitch)
+            centers = hexagons(low, high, pitch)
+            bumps = bump_values(points.uv, mine, centers, pitch)
             seen = np.asarray(bumps.sum(axis=0)) > 4.0
             # A grid finer than the points is noise by another name.
             if seen.any() and mine.sum() >= fewest * seen.sum():
-                yield ImageGrid(name, camera, centres[seen], pitch), bumps[:, seen]
+                yield ImageGrid(name, camera, centers[seen], pitch), bumps[:, seen]
 
 
 def _complete_grids(
@@ -358,15 +358,15 @@ def _complete_grids(
         for name, most, _ in _IMAGE_GRIDS if mine.any() else ():
             pitch = finest if name == 'image_finest' else float((high - low).max()) / most
             if np.isfinite(pitch):
-                centres = _cover_points(points, mine, pitch)
+                centers = _cover_points(points, mine, pitch)
                 yield (
-                    ImageGrid(name, camera, centres, pitch),
-                    bump_values(points.uv, mine, centres, pitch),
+                    ImageGrid(name, camera, centers, pitch),
+                    bump_values(points.uv, mine, centers, pitch),
                 )
 
 
 def _board_fields(landmarks: _Landmarks) -> Iterator[tuple[str, sparse.csr_array]]:
-    """Yield smooth displacements of boards, along and across them: neighbours err alike.
+    """Yield smooth displacements of boards, along and across them: neighbors err alike.
 
     As combinations (3 L, K axes) of the offsets of landmarks.  Along a board, what is linear has
     its own variance: paper stretches as a whole.  Across it, the smooth shapes that the catalogue
@@ -378,8 +378,8 @@ def _board_fields(landmarks: _Landmarks) -> Iterator[tuple[str, sparse.csr_array
             continue
         at = landmarks.at[mine]
         pitch = max(float(np.ptp(at, axis=0).max()) / _BOARD_CELLS, 1e-9)
-        centres = hexagons(at.min(axis=0), at.max(axis=0), pitch)
-        bumps = bump_values(at, np.ones(len(at), dtype=bool), centres, pitch).toarray()
+        centers = hexagons(at.min(axis=0), at.max(axis=0), pitch)
+        bumps = bump_values(at, np.ones(len(at), dtype=bool), centers, pitch).toarray()
         yield 'board_stretch', _combine_offsets(at - at.mean(axis=0), mine, [0, 1])
         smooth = ('board_in_plane', [0, 1], 1), ('board_normal', [2], board.highest_degree)
         for name, axes, degree in smooth:

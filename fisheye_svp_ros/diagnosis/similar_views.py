@@ -56,7 +56,7 @@ class LandmarkViews(NamedTuple):
 
     @classmethod
     def gather(cls, linear: Linearization) -> LandmarkViews:
-        """Gather the views of a linearisation."""
+        """Gather the views of a linearization."""
         views = linear.data.views
         used = np.flatnonzero(views.used)
         camera = np.broadcast_to(linear.data.camera_of[:, None], views.used.shape)

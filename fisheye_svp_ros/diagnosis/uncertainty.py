@@ -74,7 +74,7 @@ def standard_errors(null: NullModel, jackknife: bool = True) -> Array:
 
 
 def _reporting_matrix(null: NullModel) -> Array:
-    """Return what makes coefficients (X,), normalised, those that are reported: (X, X)."""
+    """Return what makes coefficients (X,), normalized, those that are reported: (X, X)."""
     found = np.eye(len(null.scale))
     for term in null.terms:
         columns, scale = term.columns, null.scale[term.columns]
@@ -84,7 +84,7 @@ def _reporting_matrix(null: NullModel) -> Array:
 
 
 def _estimate(information: Array, included: Index, reported: Array) -> tuple[Array, Array, Array]:
-    """Return estimates (K,), covariance (K, K) of what is included, normalised, what is open."""
+    """Return estimates (K,), covariance (K, K) of what is included, normalized, what is open."""
     if not len(included):
         return np.zeros(0), np.zeros((0, 0)), np.zeros(0, dtype=bool)
     values, vectors = np.linalg.eigh(information[np.ix_(included, included)])
@@ -147,7 +147,7 @@ def draw_models(
 ) -> Array:
     """Return by what likely models differ from the chosen one: (N, SAMPLES), each by its weight.
 
-    into (N, X): makes a richer model's parameters of the coefficients of all columns, normalised.
+    into (N, X): makes a richer model's parameters of the coefficients of all columns, normalized.
     Most samples are none where the chosen model is much the likeliest: a covariance would have all
     of them a little off.  Unlike in `model_uncertainty` every parameter counts, with what others
     do in its place: together they say how far a prediction is off.
@@ -179,7 +179,7 @@ def model_weights(models: Sequence[OtherModel]) -> Array:
 
 
 def _prior_information(null: NullModel) -> Array:
-    """Return the prior information (X, X), normalised, of effects that are not in the model."""
+    """Return the prior information (X, X), normalized, of effects that are not in the model."""
     prior = np.zeros(len(null.information))
     for form, effect in enumerate(null.fixed.forms.effects):
         prior[null.form_columns(form)] = null.prior_precision(null.form_columns(form), effect)
@@ -189,7 +189,7 @@ def _prior_information(null: NullModel) -> Array:
 def _fit_other_model(
     null: NullModel, model: OtherModel, reported: Array, prior: Array
 ) -> tuple[Array, Array]:
-    """Return estimates (m,) and their covariance (m, m), normalised, by another model."""
+    """Return estimates (m,) and their covariance (m, m), normalized, by another model."""
     at = model.included[model.included < null.column_count]
     estimate, covariance, _ = _estimate(
         null.restrict_information(null.information, at) + prior, model.included, reported

@@ -254,9 +254,9 @@ def _scatter_tests(fitted: FittedModel, known_noise: bool) -> Iterator[tuple[str
 
 def _trend_p_value(e2: Array, z: Array) -> float:
     """Koenker's studentised Breusch-Pagan test of e2 against one variable."""
-    centred = e2 - e2.mean(), z - z.mean()
-    spread = float((centred[0] ** 2).sum() * (centred[1] ** 2).sum())
-    r2 = float((centred[0] * centred[1]).sum()) ** 2 / max(spread, 1e-300)
+    centerd = e2 - e2.mean(), z - z.mean()
+    spread = float((centerd[0] ** 2).sum() * (centerd[1] ** 2).sum())
+    r2 = float((centerd[0] * centerd[1]).sum()) ** 2 / max(spread, 1e-300)
     return float(special.chdtrc(1, len(e2) * r2))
 
 

@@ -270,7 +270,7 @@ class CameraField(NamedTuple):
         """Return the values (N, Q) of its bumps at image points (N, 2), px."""
         every = np.ones(len(uv), dtype=bool)
         return np.concatenate(
-            [bump_values(uv, every, grid.centres, grid.pitch).toarray() for grid in self.grids],
+            [bump_values(uv, every, grid.centers, grid.pitch).toarray() for grid in self.grids],
             axis=1,
         )
 
@@ -381,7 +381,7 @@ def _fields(selection: Selection, fitted: FittedModel) -> dict[int, CameraField]
     shared = sigma * posterior.shared / fitted.scale[:, None]
     fields, camera_of = (
         {},
-        np.concatenate([np.full(2 * len(grid.centres), grid.camera) for grid in random.grids]),
+        np.concatenate([np.full(2 * len(grid.centers), grid.camera) for grid in random.grids]),
     )
     for camera in np.unique(camera_of).tolist():
         grids = tuple(grid for grid in random.grids if grid.camera == camera)
@@ -408,8 +408,8 @@ def _field(
 ) -> ImageField:
     """Return the field of bumps: coefficients (2 Q,), root of covariance; known: added to it."""
     finest = min(grid.pitch for grid in grids)
-    low = np.min([grid.centres.min(axis=0) - _EDGE * grid.pitch for grid in grids], axis=0)
-    high = np.max([grid.centres.max(axis=0) + _EDGE * grid.pitch for grid in grids], axis=0)
+    low = np.min([grid.centers.min(axis=0) - _EDGE * grid.pitch for grid in grids], axis=0)
+    high = np.max([grid.centers.max(axis=0) + _EDGE * grid.pitch for grid in grids], axis=0)
     if known is not None:
         low, high = np.minimum(low, known.nodes[0, 0]), np.maximum(high, known.nodes[-1, -1])
     low = np.round(low)
@@ -420,7 +420,7 @@ def _field(
     nodes = ImageField(low, pitch, np.zeros((rows, columns, 2))).nodes
     bumps = sparse.hstack(
         [
-            bump_values(nodes, np.ones(nodes.shape[:2], dtype=bool), grid.centres, grid.pitch)
+            bump_values(nodes, np.ones(nodes.shape[:2], dtype=bool), grid.centers, grid.pitch)
             for grid in grids
         ],
         format='csr',

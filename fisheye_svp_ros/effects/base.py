@@ -105,7 +105,7 @@ class Scene:
 
     @cached_property
     def twist(self) -> Array:
-        """Velocity (S, 6) of each view's camera, m/s and rad/s, from its neighbours in time.
+        """Velocity (S, 6) of each view's camera, m/s and rad/s, from its neighbors in time.
 
         Zero where it is unknown: of a view with pauses before and after it.
         """
@@ -126,8 +126,8 @@ class Scene:
         """Image points (S, N, 2) relative to the principal point, over the focal length."""
         if self.cameras:
             return gather_rows([(rows, own.normalized_uv()) for rows, _, own in self.cameras])
-        centre, focal = (self.lens.cx, self.lens.cy), (self.lens.fx, self.lens.fy)
-        return np.asarray((self.uv - np.array(centre)) / np.array(focal))
+        center, focal = (self.lens.cx, self.lens.cy), (self.lens.fx, self.lens.fy)
+        return np.asarray((self.uv - np.array(center)) / np.array(focal))
 
 
 @dataclass(frozen=True)
@@ -399,7 +399,7 @@ def require_motion(scene: Scene) -> Array:
 
 
 def _velocities(pose: Pose, t: Array) -> Array:
-    """Velocities by the parabola through each pose and its two neighbours in time.
+    """Velocities by the parabola through each pose and its two neighbors in time.
 
     Of two poses by the line through them.
     """

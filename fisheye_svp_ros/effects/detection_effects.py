@@ -38,7 +38,7 @@ class DotCentroidEffect(Effect):
     parameters = (Parameter('radius_squared', 'm^2', 1e-4, positive=True),)
 
     def is_implausible(self, values: Array, scene: Scene) -> bool:
-        """Whether the dots would reach the centres of their neighbours on every board."""
+        """Whether the dots would reach the centers of their neighbors on every board."""
         views = scene.views
         places = [
             views.points[views.used & (views.board == board.id)]
@@ -62,8 +62,8 @@ class DotCentroidEffect(Effect):
             rim = np.cos(angle)[:, None] * board.axes[0] + np.sin(angle)[:, None] * board.axes[1]
             turned = rim @ scene.pose.rotation[np.nonzero(mine)[0]]
             points = in_camera[mine][:, None] + (_RIM_SCALE * radius)[:, None, None] * turned
-            centre = project(scene.lens, in_camera[mine], limited=False).uv
-            bias = _polygon_centroid(project(scene.lens, points, limited=False).uv) - centre
+            center = project(scene.lens, in_camera[mine], limited=False).uv
+            bias = _polygon_centroid(project(scene.lens, points, limited=False).uv) - center
             column[mine] = np.nan_to_num(bias / (radius**2)[:, None])[..., None]
         return column
 

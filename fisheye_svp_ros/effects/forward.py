@@ -168,7 +168,7 @@ class ForwardModel:
         linear = self._linearize(pose, views, limited)
         return Image(linear.uv, linear.valid)
 
-    def linearise(self, pose: Pose, views: Views) -> LinearViews:
+    def linearize(self, pose: Pose, views: Views) -> LinearViews:
         """Predict and differentiate; angles past the field of view are allowed (a solver).
 
         The derivatives leave out that image and detector effects vary over the image: `d_pose` and
@@ -239,7 +239,7 @@ class ForwardModel:
         return np.asarray(np.sum(columns, axis=0))
 
     def scene(self, pose: Pose, views: Views, linear: LinearViews) -> Scene:
-        """Return what effects may look at once the views are linearised."""
+        """Return what effects may look at once the views are linearized."""
         if not self.cameras:
             return Scene(views, self.lens, pose, linear.ideal, linear.image.incidence)
         parts = tuple(
@@ -305,7 +305,7 @@ class ForwardModel:
             return self._by_camera(pose, views, limited)
         views = self.assign_boards(views)
         points = self._seen_points(pose, views)
-        ideal, valid, d_pose = engines.linearise_views(self.lens, *pose, points, limited)
+        ideal, valid, d_pose = engines.linearize_views(self.lens, *pose, points, limited)
         linear = LinearViews(ideal, valid, d_pose, ideal, ideal, self.lens, pose, points, limited)
         if not self._acts('image', 'detector'):
             return linear

@@ -13,7 +13,7 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, require_camer
 
 @dataclass(frozen=True)
 class RollingShutterEffect(Effect):
-    """The read-out time from the first row to the last; motion from neighbours without a pause."""
+    """The read-out time from the first row to the last; motion from neighbors without a pause."""
 
     name = 'rolling_shutter'
     headline = 'Rows are exposed one after the other'
@@ -43,7 +43,7 @@ class RollingShutterEffect(Effect):
 
 @dataclass(frozen=True)
 class StereoTimeOffsetEffect(Effect):
-    """A delay of every camera but the first; motion from the neighbouring frames."""
+    """A delay of every camera but the first; motion from the neighboring frames."""
 
     name = 'stereo_time_offset'
     meaning = 'The second camera of a rig exposes later than its stamp says.'

@@ -15,7 +15,7 @@ from fisheye_svp_ros.pose import cross_matrix
 from fisheye_svp_ros.scene.boards import Board, find_boards
 
 MIN_VIEWS = 3  # a landmark seen less often has no residual left to speak of
-# id, centre (3), axis a (3), axis b (3), size: what places a board in the target frame.
+# id, center (3), axis a (3), axis b (3), size: what places a board in the target frame.
 BoardAxes = tuple[float, ...]
 
 _DEGREES = (2, 3, 4, 6)
@@ -203,13 +203,13 @@ def _powers(degree: int) -> list[tuple[int, int]]:
 
 
 def _axes(board: Board) -> BoardAxes:
-    flat = (float(board.id), *board.centre, *board.axes[0], *board.axes[1], board.size)
+    flat = (float(board.id), *board.center, *board.axes[0], *board.axes[1], board.size)
     return tuple(float(x) for x in np.round(flat, 9))
 
 
 @dataclass(frozen=True)
 class BoardPoseEffect(Effect):
-    """A shift and a turn of each named board about its centre."""
+    """A shift and a turn of each named board about its center."""
 
     boards: tuple[tuple[float, ...], ...] = field(default=(), metadata={'key': False})
 
@@ -229,7 +229,7 @@ class BoardPoseEffect(Effect):
         labels, counts = np.unique(scene.views.board[scene.views.used], return_counts=True)
         reference = labels[np.argmax(counts)]
         others = [
-            (float(board.id), *(float(x) for x in np.round(board.centre, 9)))
+            (float(board.id), *(float(x) for x in np.round(board.center, 9)))
             for board in scene.boards
             if board.id != reference
         ]
@@ -254,9 +254,9 @@ class BoardPoseEffect(Effect):
 
     def columns(self, scene: Scene) -> Array:
         blocks = []
-        for number, *centre in self.boards:
+        for number, *center in self.boards:
             mine = (scene.views.board == number)[..., None, None]
-            arm = scene.views.points - np.array(centre)
+            arm = scene.views.points - np.array(center)
             shift = np.broadcast_to(np.eye(3), (*arm.shape, 3))
             blocks.append(np.concatenate([shift, -cross_matrix(arm)], axis=-1) * mine)
         return np.concatenate(blocks, axis=-1)

@@ -31,7 +31,7 @@ from fisheye_svp_ros.mixed_model.model_columns import (
 )
 
 FIXED, ABSENT = -1, -2  # labels: without a prior; not there
-_RIDGE = 1e-10  # of normalised fixed columns of a group: some may be zero
+_RIDGE = 1e-10  # of normalized fixed columns of a group: some may be zero
 _ABSENT_PRECISION = 1e12
 _ROUNDING_RIDGE = 1e-5  # of a column's own information, where rounding makes the whole indefinite
 _WORTH_THREADS = 5e7  # products of numbers: fewer take less time than threads to start

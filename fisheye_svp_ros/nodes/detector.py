@@ -291,7 +291,7 @@ class Detector(BaseNode):
                 self.drop('image', error)
 
     def _read_tags(self, message: Any, topic: str) -> tuple[str, Index, Array]:
-        """Return the points of tags; libapriltag puts pixel centres at a half."""
+        """Return the points of tags; libapriltag puts pixel centers at a half."""
         tags = [
             tag
             for tag in message.detections

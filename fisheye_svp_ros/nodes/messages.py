@@ -48,11 +48,11 @@ _HALF_BASE = 0.4 * _CAMERA_SIZE
 
 
 class Segments(NamedTuple):
-    """Lines or balls to draw: points (N, 3), m (pairs for lines); colour r, g, b, a; size, m."""
+    """Lines or balls to draw: points (N, 3), m (pairs for lines); color r, g, b, a; size, m."""
 
     name: str
     points: Array
-    colour: tuple[float, float, float, float]
+    color: tuple[float, float, float, float]
     size: float
     lines: bool = True
 
@@ -188,7 +188,7 @@ def markers_message(shapes: Iterable[Segments], stamp: int, frame: str) -> Any:
         marker.type = Marker.LINE_LIST if shape.lines else Marker.SPHERE_LIST
         marker.action = Marker.ADD
         marker.scale = _vector(Vector3, np.full(3, shape.size))
-        red, green, blue, alpha = shape.colour
+        red, green, blue, alpha = shape.color
         marker.color = ColorRGBA(r=red, g=green, b=blue, a=alpha)
         marker.points = [_vector(Point, point) for point in shape.points]
         markers.append(marker)

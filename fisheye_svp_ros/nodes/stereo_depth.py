@@ -134,7 +134,7 @@ def _shapes(
 ) -> list[messages.Segments]:
     # As markers, because RViz draws no cloud of doubles.
     place = left.compose(rig.inverse()).transform(points)
-    shape = landmarks_shape(place)._replace(name='measured points', colour=(0.8, 0.2, 0.2, 1.0))
+    shape = landmarks_shape(place)._replace(name='measured points', color=(0.8, 0.2, 0.2, 1.0))
     curves = epipolar_curves(*models, rig, uv_right)
     return [
         camera_shape(left, 'left', alpha=0.6),

@@ -161,7 +161,7 @@ def project_with_jacobian(lens: Lens, points: Array) -> LinearImage:
     """Project points (..., 3), m, and differentiate by the point and by both lens curves."""
     shape = points.shape[:-1]
     still = np.eye(3)[None], np.zeros((1, 3))
-    uv, valid, d_pose = engines.linearise_views(lens, *still, points.reshape(1, -1, 3), True)
+    uv, valid, d_pose = engines.linearize_views(lens, *still, points.reshape(1, -1, 3), True)
     d_point = -d_pose[..., :3]  # the camera moves the other way
     return LinearImage(
         lens,
@@ -174,7 +174,7 @@ def project_with_jacobian(lens: Lens, points: Array) -> LinearImage:
 
 
 def lens_columns(lens: Lens, image: LinearImage, names: Sequence[str]) -> Array:
-    """Derivatives (..., 2, K) of linearised image points by named lens parameters.
+    """Derivatives (..., 2, K) of linearized image points by named lens parameters.
 
     Raises LensError for a name the lens does not have.
     """

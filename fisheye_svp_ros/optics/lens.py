@@ -24,7 +24,7 @@ _RANGE_MARGIN = 1 - 1e-6  # of the monotone range: at its very end the curve can
 class Lens:
     """One fisheye lens on its camera; SVP is the same lens without shift and port.
 
-    fx, fy, cx, cy in px (pixel centres at whole numbers); max_incidence in rad.  viewpoint_shift
+    fx, fy, cx, cy in px (pixel centers at whole numbers); max_incidence in rad.  viewpoint_shift
     is all of it, whatever it is made of, but for what a port brings.  image_field: what moves
     image points beside curves and port.  corrections: effects of the
     lens's own that have no other place in it, by name, as `effects.base.Effect.to_dict` gives

@@ -24,7 +24,7 @@ from fisheye_svp_ros.registry import Registry
 MEDIA = {'air': 1.0, 'water': 1.333, 'sea_water': 1.340}
 _INDICES = (1.0, 3.0)
 _DISTANCES = (0.005, 0.02, 0.06, 0.15)  # m
-_OFF_CENTRE = (-0.4, 0.0, 0.4)
+_OFF_CENTER = (-0.4, 0.0, 0.4)
 _STEPS = 40  # of Newton's method, which a ray that grazes the port needs
 
 
@@ -230,7 +230,7 @@ class FlatGlass(Port):
 
 @dataclass(frozen=True)
 class DomeGlass(Port):
-    """A spherical shell: radius of its inner face, and its centre in the camera frame."""
+    """A spherical shell: radius of its inner face, and its center in the camera frame."""
 
     radius: float
     medium_index: float
@@ -243,7 +243,7 @@ class DomeGlass(Port):
     placed = ('x', 'y', 'z')
 
     def starts(self) -> list[Self]:
-        return [self.with_values(z=share * self.radius) for share in _OFF_CENTRE]
+        return [self.with_values(z=share * self.radius) for share in _OFF_CENTER]
 
     @property
     def reach(self) -> float:
@@ -254,14 +254,14 @@ class DomeGlass(Port):
         self, origin: Varying, direction: Varying, numbers: Sequence[Varying]
     ) -> tuple[Varying, Varying]:
         radius, medium, x, y, z, thickness, glass = numbers
-        centre, index = stack_vector(x, y, z), constant(1.0, len(medium.slope))
+        center, index = stack_vector(x, y, z), constant(1.0, len(medium.slope))
         for size, beyond in ((radius, glass), (radius + thickness, medium)):
-            arm = origin - centre
+            arm = origin - center
             along = arm.dot(direction)
             origin = origin + direction * (
                 (along * along - arm.dot(arm) + size * size).root() - along
             )
-            direction = refract(direction, (origin - centre) / size, index, beyond)
+            direction = refract(direction, (origin - center) / size, index, beyond)
             index = beyond
         return origin, direction
 

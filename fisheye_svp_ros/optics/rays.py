@@ -182,7 +182,7 @@ def _scan(shift: ViewpointShift, limit: float, r: Array, z: Array) -> Array:
         values, _ = _ray_equation(shift, r[:, None], z[:, None], grid)
         falls = (values[:, :-1] >= 0) & (values[:, 1:] < 0)
         found = falls.any(axis=1)
-        # Where no sign changes, two roots may hide between neighbours of the lowest value.
+        # Where no sign changes, two roots may hide between neighbors of the lowest value.
         lowest = np.clip(np.argmin(values, axis=1), 1, 63)
         first = np.argmax(falls, axis=1)
         left = np.where(found, first, lowest - 1)[:, None]

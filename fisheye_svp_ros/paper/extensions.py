@@ -53,7 +53,7 @@ def pose_sets(count: int = POSE_SETS) -> list[Pose]:
     """Return sets of ten random poses (10,) of the right camera, the same at every call.
 
     Tilts of up to some 25 degrees, rolls of some 20; the rig within 0.05 m of the axis of the
-    landmarks, 0.03 m before to 0.12 m behind their centre.
+    landmarks, 0.03 m before to 0.12 m behind their center.
     """
     rng = np.random.default_rng(0)
     sets = []

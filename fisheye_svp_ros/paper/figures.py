@@ -27,7 +27,7 @@ from fisheye_svp_ros.scene.observations import RADII, SPREADS
 from fisheye_svp_ros.scene.rigs import calibration_poses, rig
 from fisheye_svp_ros.solve.stereo_depth import epipolar_curves
 
-_COLOURS = {'fish180': OURS, 'fish214': PUBLISHED}
+_COLORS = {'fish180': OURS, 'fish214': PUBLISHED}
 _RESIDUAL_MAGNIFICATION = 100  # residuals of figure 6
 _VERTICAL_MAGNIFIED = {'fish180': 100, 'fish214': 10}
 _TRUE, _MEASURED = PUBLISHED, OURS
@@ -54,11 +54,11 @@ def draw_shift(path: Path, lenses: dict[str, Lens], family: Family) -> None:
         for name, lens in lenses.items():
             theta = np.linspace(0, lens.max_incidence, 200)
             curves = 1e3 * shift_curves(family.matching, name, theta)
-            axis.plot(np.degrees(theta), curves.T, color=_COLOURS[name], alpha=0.18, linewidth=0.8)
+            axis.plot(np.degrees(theta), curves.T, color=_COLORS[name], alpha=0.18, linewidth=0.8)
             axis.plot(
                 np.degrees(theta),
                 1e3 * lens.shift_at(theta),
-                color=_COLOURS[name],
+                color=_COLORS[name],
                 linewidth=2,
                 label=f'{NAMES[name]} (light: all {len(family.matching)} fits)',
             )
@@ -86,11 +86,11 @@ def draw_height(path: Path, lenses: dict[str, Lens]) -> None:
             axis.plot(
                 np.degrees(theta),
                 lens.fx * height,
-                color=_COLOURS[name],
+                color=_COLORS[name],
                 linewidth=2,
                 label=NAMES[name],
             )
-            axis.axhline(lens.width / 2, color=_COLOURS[name], linestyle=':', linewidth=1)
+            axis.axhline(lens.width / 2, color=_COLORS[name], linestyle=':', linewidth=1)
         axis.annotate('dotted: half the image', (2, 775), color=_INK, fontsize=8)
         axis.set(
             xlabel='incident angle / degree',
@@ -115,7 +115,7 @@ def draw_localization(path: Path, evaluations: dict[str, LensEvaluation]) -> Non
                 one = evaluations[name]
                 _draw_image_frame(axis, one.lens)
                 mean = one.localization[radius, spread, -1]
-                _draw_residuals(axis, one.localized[spread], radius, _COLOURS[name])
+                _draw_residuals(axis, one.localized[spread], radius, _COLORS[name])
                 axis.set_title(f'{NAMES[name]}: {mean:.4f} px', fontsize=9)
 
 
@@ -152,17 +152,17 @@ def draw_calibration_poses(path: Path) -> None:
         for axis, view in zip(figure.subplots(1, 2), _VIEWS, strict=True):
             (across, up), x_name, y_name = view
             axis.plot(points[:, across], points[:, up], 's', color=_INK, markersize=3)
-            for camera, colour, name in ((right, OURS, 'right'), (left, PUBLISHED, 'left')):
+            for camera, color, name in ((right, OURS, 'right'), (left, PUBLISHED, 'left')):
                 ends = camera.position + 0.12 * camera.rotation[..., 2]
                 for one, end in zip(camera.position, ends, strict=True):
                     axis.plot(
-                        [one[across], end[across]], [one[up], end[up]], color=colour, linewidth=1
+                        [one[across], end[across]], [one[up], end[up]], color=color, linewidth=1
                     )
                 axis.plot(
                     camera.position[:, across],
                     camera.position[:, up],
                     's',
-                    color=colour,
+                    color=color,
                     markersize=4,
                     label=f'{name} camera and its viewing axis',
                 )
@@ -201,7 +201,7 @@ def draw_solvers(path: Path, evaluations: Mapping[str, Mapping[str, LensEvaluati
             for k, name in enumerate(LENSES):
                 values = np.array([summary(by_lens[name]) for by_lens in evaluations.values()])
                 drawn = np.where(values > _ZERO, values, np.nan)
-                axis.plot(drawn, place, 'os'[k], color=_COLOURS[name], label=NAMES[name])
+                axis.plot(drawn, place, 'os'[k], color=_COLORS[name], label=NAMES[name])
             axis.set_title(title, fontsize=9)
             axis.set_xscale('log')
             axis.xaxis.set_major_locator(LogLocator(numticks=6))
@@ -238,7 +238,7 @@ def draw_crossings(path: Path, crossings: Sequence[Crossings]) -> None:
                         NOISES,
                         np.where(one.ranges > 0, one.ranges, np.nan),
                         line,
-                        color=_COLOURS[name],
+                        color=_COLORS[name],
                         label=f'{NAMES[name]}, {one.where}',
                         marker='o',
                         markersize=3,
@@ -309,7 +309,7 @@ def _draw_world(axis: Any, view: tuple[tuple[int, int], str, str], points: Array
     _frame_world(axis, radius, x_name, y_name)
 
 
-def _draw_residuals(axis: Any, localized: LocalizedSpread, row: int, colour: str) -> None:
+def _draw_residuals(axis: Any, localized: LocalizedSpread, row: int, color: str) -> None:
     """Draw image points as circles, residuals (measured less predicted) as lines, magnified."""
     seen = localized.views.used[row]
     uv = localized.views.uv[row][seen]
@@ -317,7 +317,7 @@ def _draw_residuals(axis: Any, localized: LocalizedSpread, row: int, colour: str
     axis.plot(
         uv[:, 0], uv[:, 1], 'o', fillstyle='none', color=_INK, markersize=3, markeredgewidth=0.6
     )
-    axis.plot([uv[:, 0], ends[:, 0]], [uv[:, 1], ends[:, 1]], color=colour, linewidth=1.2)
+    axis.plot([uv[:, 0], ends[:, 0]], [uv[:, 1], ends[:, 1]], color=color, linewidth=1.2)
 
 
 def _caption(panel: Panel) -> str:

@@ -35,7 +35,7 @@ from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 CANDIDATES = 600
 _TRIES = 12_000
 _EDGE, _SPACING = 8.0, 9.0  # px from the edge of the image and between points, to be detected
-_NEIGHBOURS = 4
+_NEIGHBORS = 4
 _SLANT = np.cos(np.radians(70.0))  # of a board to the ray, beyond which corners are not found
 _EXCHANGES = 4  # rounds
 # What a person can set: steps of angles, rad, and distances between near and far
@@ -383,7 +383,7 @@ def _resolvable(model: ForwardModel, board: FlatBoard, camera: Pose) -> Mask:
     image, local = model.predict(camera, views), camera.into_body(views.points)
     normal = np.swapaxes(camera.rotation, -1, -2) @ board.facing[2]
     slant = (local @ normal[..., None])[..., 0] / np.linalg.norm(local, axis=-1)
-    many = min(_NEIGHBOURS, len(board.points) - 1)
+    many = min(_NEIGHBORS, len(board.points) - 1)
     near = np.asarray(KDTree(board.points).query(board.points, many + 1)[1])[:, 1:]
     with np.errstate(invalid='ignore'):
         apart = np.linalg.norm(image.uv[:, near] - image.uv[:, :, None], axis=-1)

@@ -190,7 +190,7 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: BudgetReque
 
 
 def _label(bar: Any, error: Array) -> None:
-    """Write plain numbers beside a logarithmic colour bar; 1, 2, 5 where it is short."""
+    """Write plain numbers beside a logarithmic color bar; 1, 2, 5 where it is short."""
     short = error.max() < _LINEAR_AXIS_RATIO * error.min()
     bar.ax.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
     bar.ax.yaxis.set_major_formatter('{x:g}')

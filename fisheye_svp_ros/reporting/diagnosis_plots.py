@@ -123,13 +123,13 @@ def _draw_field(axes: Any, points: PointResiduals, name: str, lens: Lens) -> Non
     ]
     for kind, row in enumerate(axes):
         typical = float(np.quantile(np.linalg.norm(fields[0][kind][1], axis=1), 0.9))
-        for axis, field, (_, colour) in zip(row, fields, _SIDES, strict=True):
+        for axis, field, (_, color) in zip(row, fields, _SIDES, strict=True):
             draw_image_frame(axis, lens)
-            draw_arrows(axis, *field[kind], typical, cell, colour)
+            draw_arrows(axis, *field[kind], typical, cell, color)
             axis.label_outer()
-    for axis, (side, colour) in zip(axes[0], _SIDES, strict=True):
+    for axis, (side, color) in zip(axes[0], _SIDES, strict=True):
         rms = rms_px(getattr(points, side))
-        axis.set_title(f'{name} {side}: {rms:.3f} px rms'.strip(), color=colour)
+        axis.set_title(f'{name} {side}: {rms:.3f} px rms'.strip(), color=color)
     axes[0, 0].set_ylabel('single points\nv / px')
     axes[1, 0].set_ylabel(f'means over {cell:.0f} px\nv / px')
     for axis in axes[1]:
@@ -175,13 +175,13 @@ def draw_histogram(path: Path, shown: PlotData) -> None:
     middle = (bins[:-1] + bins[1:]) / 2
     with picture(path, _WIDTH, 3.0, tight=True) as figure:
         axes = figure.subplots(1, 2, sharex=True, sharey=True)
-        for axis, (side, colour) in zip(axes, _SIDES, strict=True):
+        for axis, (side, color) in zip(axes, _SIDES, strict=True):
             z = getattr(shown.points, side).ravel() / shown.noise
             expected = z.size * np.diff(bins)[0] * np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi)
-            axis.hist(np.clip(z, -6, 6), bins, color=colour, alpha=0.55, label='u and v')
+            axis.hist(np.clip(z, -6, 6), bins, color=color, alpha=0.55, label='u and v')
             axis.plot(middle, expected, color=INK, lw=1.4, label='noise alone')
             axis.set(yscale='log', ylim=(0.5, None), xlabel='residual / noise')
-            axis.set_title(side, color=colour)
+            axis.set_title(side, color=color)
             axis.minorticks_off()
             axis.legend(loc='upper right')
         axes[0].set_ylabel('image coordinates')
@@ -198,11 +198,11 @@ def _grid(
         axes = figure.subplots(2, 2, sharex=True, sharey='row')
         for row, (name, x, values) in zip(axes, rows, strict=True):
             highest = 2.2 * shown.noise
-            for axis, (side, colour) in zip(row, _SIDES, strict=True):
-                highest = max(highest, _plot_bins(axis, x, values[side], shown.noise, colour))
+            for axis, (side, color) in zip(row, _SIDES, strict=True):
+                highest = max(highest, _plot_bins(axis, x, values[side], shown.noise, color))
             row[0].set(ylabel=name, ylim=(-1.2 * highest, 1.2 * highest))
-        for axis, (side, colour) in zip(axes[0], _SIDES, strict=True):
-            axis.set_title(side, color=colour)
+        for axis, (side, color) in zip(axes[0], _SIDES, strict=True):
+            axis.set_title(side, color=color)
         for axis in axes[1]:
             axis.set_xlabel(label)
             if log:
@@ -210,12 +210,12 @@ def _grid(
         _legend(figure, axes[0, 1])
 
 
-def _plot_bins(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> float:
+def _plot_bins(axis: Axes, x: Array, y: Array, noise: float, color: str) -> float:
     """Draw points and bins: means, errors, scatter; return the largest mean and error, px."""
-    axis.plot(x, y, '.', ms=1.5, color=colour, alpha=0.15, zorder=1)
+    axis.plot(x, y, '.', ms=1.5, color=color, alpha=0.15, zorder=1)
     order = np.argsort(x, kind='stable')
     parts = np.array_split(order, max(min(_BINS, len(x) // 8), 1))
-    centre, mean, rms, error, count = np.array(
+    center, mean, rms, error, count = np.array(
         [
             (x[p].mean(), y[p].mean(), y[p].std(), y[p].std() / np.sqrt(p.size), p.size)
             for p in parts
@@ -223,7 +223,7 @@ def _plot_bins(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> flo
     ).T
     band = 2 * noise / np.sqrt(count)
     axis.fill_between(
-        centre,
+        center,
         -band,
         band,
         color=NOISE,
@@ -233,13 +233,13 @@ def _plot_bins(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> flo
         label='95 % of the means if there is only noise',
     )
     axis.errorbar(
-        centre,
+        center,
         mean,
         error,
         fmt='o-',
         ms=4,
         lw=1.3,
-        color=colour,
+        color=color,
         zorder=3,
         mec='white',
         mew=0.5,
@@ -247,11 +247,11 @@ def _plot_bins(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> flo
     )
     for sign in (-1, 1):
         axis.plot(
-            centre,
+            center,
             mean + sign * rms,
             ':',
             lw=1.2,
-            color=colour,
+            color=color,
             zorder=3,
             label='scatter within a bin' if sign > 0 else None,
         )
@@ -293,7 +293,7 @@ def draw_groups(
             step='mid',
             label='95 % if there is only noise',
         )
-        for side, colour in _SIDES:
+        for side, color in _SIDES:
             squares = (getattr(shown.points, side) ** 2).sum(axis=1)
             rms = np.sqrt(np.bincount(label_of, weights=squares) / count)
             axis.plot(
@@ -302,7 +302,7 @@ def draw_groups(
                 'o' if len(names) > 60 else 'o-',
                 ms=3.5,
                 lw=1,
-                color=colour,
+                color=color,
                 label=side,
             )
         axis.set(xlabel=label, ylabel='rms residual / px', ylim=(0, None))
@@ -330,7 +330,7 @@ def draw_image_frame(axis: Axes, lens: Lens) -> None:
 
 
 def draw_arrows(
-    axis: Axes, uv: Array, residual: Array, typical: float, cell: float, colour: str
+    axis: Axes, uv: Array, residual: Array, typical: float, cell: float, color: str
 ) -> None:
     """Draw residuals, the typical one (px) as long as a cell, and the key to their scale."""
     key = axis.quiver(
@@ -339,7 +339,7 @@ def draw_arrows(
         angles='xy',
         scale_units='xy',
         scale=typical / cell,
-        color=colour,
+        color=color,
         alpha=0.45 if len(uv) > 600 else 0.9,
         width=0.0018,
     )
@@ -361,8 +361,8 @@ def _cell_means(uv: Array, residual: Array, cell: float) -> tuple[Array, Array]:
 
 def _polar(shown: PlotData, residual: Array) -> Array:
     """Return residuals (K, 2) along the radius and across it."""
-    centres = np.array([(lens.cx, lens.cy) for lens in shown.lenses.values()])
-    arm = shown.points.uv - (centres[shown.points.camera] if len(centres) > 1 else centres[0])
+    centers = np.array([(lens.cx, lens.cy) for lens in shown.lenses.values()])
+    arm = shown.points.uv - (centers[shown.points.camera] if len(centers) > 1 else centers[0])
     radial = arm / np.maximum(np.linalg.norm(arm, axis=1, keepdims=True), 1e-9)
     across = np.stack([-radial[:, 1], radial[:, 0]], axis=-1)
     return np.stack([(residual * way).sum(axis=1) for way in (radial, across)], axis=-1)

@@ -36,7 +36,7 @@ def _overlay(pixels: np.ndarray, searched: SearchedPhotograph) -> np.ndarray:
     if points is None:
         cv2.putText(image, searched.reason, (20, 40), cv2.FONT_HERSHEY_SIMPLEX, 1.0, _ORANGE, 2)
         return image
-    # In sixteenths of a pixel; the centre of the first pixel is at half a pixel of the picture.
+    # In sixteenths of a pixel; the center of the first pixel is at half a pixel of the picture.
     places = np.round(((points.uv + 0.5) * zoom - 0.5) * 16).astype(int)
     cv2.polylines(image, [places.astype(np.int32)], False, _BLUE, 1, cv2.LINE_AA, 4)
     for i, (u, v) in enumerate(places.tolist()):

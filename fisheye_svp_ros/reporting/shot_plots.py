@@ -85,18 +85,18 @@ def draw_guide(pixels: Pixels, guide: Guide, board: DetectedBoard | None) -> NDA
     zoom = min(1.0, _MAX_WIDTH / max(pixels.shape))
     picture, outline = to_color(pixels, zoom), guide.outline
     if outline is not None:
-        colour = _READY if guide.score >= MIN_SCORE else _WANTED
+        color = _READY if guide.score >= MIN_SCORE else _WANTED
         wanted = _to_fixed_point(outline[np.isfinite(outline).all(axis=1)], zoom)
         hull = cv2.convexHull(wanted)
-        filled = cv2.fillConvexPoly(picture.copy(), hull, colour, cv2.LINE_AA, _FRACTION_BITS)
+        filled = cv2.fillConvexPoly(picture.copy(), hull, color, cv2.LINE_AA, _FRACTION_BITS)
         picture = np.asarray(cv2.addWeighted(filled, 0.25, picture, 0.75, 0))
-        cv2.polylines(picture, [hull], True, colour, 2, cv2.LINE_AA, _FRACTION_BITS)
-        _dots(picture, wanted, colour, 2)
+        cv2.polylines(picture, [hull], True, color, 2, cv2.LINE_AA, _FRACTION_BITS)
+        _dots(picture, wanted, color, 2)
         cv2.circle(
             picture,
             wanted[0].tolist(),
             9 << _FRACTION_BITS,
-            colour,
+            color,
             2,
             cv2.LINE_AA,
             _FRACTION_BITS,
@@ -117,10 +117,10 @@ def _to_fixed_point(uv: NDArray[np.float64], zoom: float) -> NDArray[np.int32]:
 
 
 def _dots(
-    picture: NDArray[np.uint8], places: NDArray[np.int32], colour: tuple[int, int, int], size: int
+    picture: NDArray[np.uint8], places: NDArray[np.int32], color: tuple[int, int, int], size: int
 ) -> None:
     for place in places.tolist():
-        cv2.circle(picture, place, size << _FRACTION_BITS, colour, -1, cv2.LINE_AA, _FRACTION_BITS)
+        cv2.circle(picture, place, size << _FRACTION_BITS, color, -1, cv2.LINE_AA, _FRACTION_BITS)
 
 
 def _draw_texts(picture: NDArray[np.uint8], guide: Guide) -> None:

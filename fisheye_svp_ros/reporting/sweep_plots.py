@@ -32,7 +32,7 @@ from fisheye_svp_ros.study.sweep import SCENARIO_COLUMNS, SOLVERS
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-_COLOURS = 'viridis'
+_COLORS = 'viridis'
 _HUES, _LINES = 4, ('-', '--')  # what can be told apart in one picture
 _COLUMNS = 4  # axes beside each other
 _TICKS, _LABELS = 12, 6
@@ -115,7 +115,7 @@ def _axes(path: Path, count: int, width: float, height: float) -> Iterator[Any]:
 def _draw_curves(
     table: DataFrame, metrics: Sequence[PlottedMetric], x: str, others: Sequence[str], path: Path
 ) -> None:
-    """Draw an error over x: the colour tells one other parameter, the line style a second."""
+    """Draw an error over x: the color tells one other parameter, the line style a second."""
     by = sorted(others, key=lambda name: -table[name].nunique())[-2:]
     looks = [
         _pick_evenly(table[name].dropna().unique().tolist(), most)
@@ -131,16 +131,16 @@ def _draw_curves(
             ]
             for curve in found:
                 place = [values.index(v) for values, v in zip(looks, curve.key, strict=True)]
-                colour = _hues(len(looks[0]))[place[0]] if place else OURS
+                color = _hues(len(looks[0]))[place[0]] if place else OURS
                 middle, low, high = (metric.factor * values for values in curve[2:])
                 if not merged:
-                    axis.fill_between(curve.x, low, high, color=colour, alpha=0.15, linewidth=0)
+                    axis.fill_between(curve.x, low, high, color=color, alpha=0.15, linewidth=0)
                 axis.plot(
                     curve.x,
                     middle,
                     _LINES[place[1]] if len(place) > 1 else '-',
                     marker='.',
-                    color=colour,
+                    color=color,
                     label=', '.join(
                         f'{name} {value_text(v)}' for name, v in zip(by, curve.key, strict=True)
                     ),
@@ -180,7 +180,7 @@ def _draw_grids(
             positive = values.compressed()[values.compressed() > 1e-6]
             wide = positive.size and positive.max() > 30 * positive.min()
             norm = LogNorm(positive.min(), positive.max()) if wide else None
-            mesh = axis.imshow(values, origin='lower', aspect='auto', cmap=_COLOURS, norm=norm)
+            mesh = axis.imshow(values, origin='lower', aspect='auto', cmap=_COLORS, norm=norm)
             for set_ticks, cells in ((axis.set_xticks, found.x), (axis.set_yticks, found.y)):
                 step = -(-len(cells) // _TICKS)
                 set_ticks(range(0, len(cells), step), [f'{cell:g}' for cell in cells[::step]])
@@ -222,14 +222,14 @@ def _draw_spreads(table: DataFrame, by: str | None, path: Path) -> None:
 def draw_residuals(clouds: Sequence[Points], lenses: Sequence[str], path: Path) -> None:
     """Draw residuals (io.decoding.RESIDUALS) against the incidence angle and the range.
 
-    lenses: of each cloud, told apart by colour; '' where it is not known.
+    lenses: of each cloud, told apart by color; '' where it is not known.
     """
     names = list(dict.fromkeys(lenses))
     each = max(1, _CLOUD // len(names))
     with picture(path, 8.4, 3.6) as figure:
         axes = figure.subplots(1, 2, sharey=True)
         nearest, farthest = np.inf, 0.0
-        for name, colour in zip(names, _hues(len(names)), strict=True):
+        for name, color in zip(names, _hues(len(names)), strict=True):
             points = np.concatenate(
                 [cloud for cloud, lens in zip(clouds, lenses, strict=True) if lens == name]
             )
@@ -240,7 +240,7 @@ def draw_residuals(clouds: Sequence[Points], lenses: Sequence[str], path: Path) 
                     x,
                     size,
                     '.',
-                    color=colour,
+                    color=color,
                     alpha=0.6,
                     markersize=4,
                     markeredgewidth=0,
@@ -264,7 +264,7 @@ def _hues(count: int) -> list[Any]:
 
     if count == 1:
         return [OURS]
-    return [colormaps[_COLOURS](part) for part in np.linspace(0.0, 0.85, count)]
+    return [colormaps[_COLORS](part) for part in np.linspace(0.0, 0.85, count)]
 
 
 def _scale(axis: Any, x: Sequence[float], y: Array) -> None:

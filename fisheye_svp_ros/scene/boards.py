@@ -24,14 +24,14 @@ _MIN_SHARE = 0.9  # of the landmarks that a turn carries onto others: corners ma
 
 
 class Board(NamedTuple):
-    """A board's id, centre (3,), axes (3, 3; rows a, b, normal), size (m) and flatness.
+    """A board's id, center (3,), axes (3, 3; rows a, b, normal), size (m) and flatness.
 
     size: half the extent along its longer side; flat: four or more landmarks, all in one plane;
     landmarks: how many it has.
     """
 
     id: int
-    centre: Array
+    center: Array
     axes: Array
     size: float
     flat: bool
@@ -44,11 +44,11 @@ class Board(NamedTuple):
 
     def to_board(self, points: Array) -> Array:
         """Return points (..., 3) in the board's axes, over its size."""
-        return np.asarray((points - self.centre) @ self.axes.T / self.size)
+        return np.asarray((points - self.center) @ self.axes.T / self.size)
 
 
 def spacing(points: Array) -> float:
-    """Return the median distance of points (M, 3) to their nearest neighbours."""
+    """Return the median distance of points (M, 3) to their nearest neighbors."""
     from scipy.spatial import KDTree  # not loaded for the help of a command
 
     return float(np.median(np.asarray(KDTree(points).query(points, 2)[0])[:, 1]))
@@ -67,18 +67,18 @@ def find_boards(points: Array, board: Index) -> list[Board]:
 
 def _board(label: int, points: Array) -> Board:
     distinct = np.unique(np.round(points, 9), axis=0)
-    centre = (distinct.min(axis=0) + distinct.max(axis=0)) / 2
+    center = (distinct.min(axis=0) + distinct.max(axis=0)) / 2
     local = distinct - distinct.mean(axis=0)
     axes = np.linalg.svd(local, full_matrices=True)[2] if len(distinct) > 2 else np.eye(3)
     # Axes along the target's own where the board lies square to them: readable coefficients.
     if np.abs(axes[2]).max() > 1 - 1e-9:
         axes = np.roll(np.eye(3), 2 - int(np.argmax(np.abs(axes[2]))), axis=0)
     axes[2] = np.cross(axes[0], axes[1])
-    along = (distinct - centre) @ axes.T
+    along = (distinct - center) @ axes.T
     size = float(np.abs(along).max(initial=1e-9))
     off = np.abs(along[:, 2] - along[:, 2].mean()).max(initial=0.0)
     flat = len(distinct) > 3 and bool(off < 1e-6 + 1e-3 * size)
-    return Board(label, centre, axes, size, flat, len(distinct))
+    return Board(label, center, axes, size, flat, len(distinct))
 
 
 class BoardTurn(NamedTuple):
@@ -121,7 +121,7 @@ def board_turns(landmarks: Landmarks, board_of: Index) -> list[BoardTurn]:
 
 
 def _turns(board: Board, ids: Index, points: Array) -> list[BoardTurn]:
-    place = (points - board.centre) @ board.axes.T
+    place = (points - board.center) @ board.axes.T
     reach, found = _TOLERANCE * spacing(points), dict[int, tuple[Index, Array]]()
     paired = np.ones(len(ids), dtype=bool)
     for quarter in range(1, _QUARTERS):

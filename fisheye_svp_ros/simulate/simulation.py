@@ -111,7 +111,7 @@ def predict_points(model: ForwardModel, poses: Pose, views: Views) -> tuple[Arra
     uv = model.predict(poses, views).uv
     if not model.noise_terms:
         return uv, np.ones((*uv.shape[:2], 1))
-    scene = model.scene(poses, views, model.linearise(poses, views))
+    scene = model.scene(poses, views, model.linearize(poses, views))
     return uv, np.broadcast_to(noise_scale(model.terms, scene), uv.shape[:2])[..., None]
 
 

@@ -276,7 +276,7 @@ class Adjustment:
         )
         return state.with_shared_values(self._free, values)
 
-    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+    def linearize(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         if not len(index):
             return np.zeros(0), ()
         costs, systems = zip(*(self._equations(state, i) for i in range(len(index))), strict=True)

@@ -24,7 +24,7 @@ _FLOOR = 1e-12  # relative; keeps rays that are all parallel invertible
 class _Problem(NamedTuple):
     """S sets of landmarks in their own principal axes, over their size.
 
-    local, direction (S, N, 3), zero where not seen; axes (S, 3, 3), scale (S,), centre (S, 3).
+    local, direction (S, N, 3), zero where not seen; axes (S, 3, 3), scale (S,), center (S, 3).
     form (S, 9, 9): the squared distances of landmarks from their rays are r^T form r, r = columns
     of R; pull (S, 3, 9): the best translation is pull r.
     """
@@ -33,7 +33,7 @@ class _Problem(NamedTuple):
     direction: Array
     axes: Array
     scale: Array
-    centre: Array
+    center: Array
     form: Array
     pull: Array
 
@@ -46,7 +46,7 @@ class _Problem(NamedTuple):
         more = (slice(None), *[None] * (rotation.ndim - 3))
         place = Pose(rotation @ self.axes[more], translation * self.scale[more][..., None])
         camera = place.inverse()
-        return Pose(camera.rotation, camera.position + self.centre[more])
+        return Pose(camera.rotation, camera.position + self.center[more])
 
 
 def initial_poses(points: Array, direction: Array, weight: Array, spread: bool = True) -> Pose:
@@ -79,15 +79,15 @@ def _problem(points: Array, direction: Array, weight: Array) -> _Problem:
     seen = (weight > 0) & np.isfinite(direction).all(axis=-1)
     count = np.maximum(seen.sum(1), 1)
     d = np.where(seen[..., None], direction, 0.0)
-    centre = np.where(seen[..., None], points, 0.0).sum(1) / count[:, None]
-    local = np.where(seen[..., None], points - centre[:, None], 0.0)
+    center = np.where(seen[..., None], points, 0.0).sum(1) / count[:, None]
+    local = np.where(seen[..., None], points - center[:, None], 0.0)
     # In their own principal axes: a flat target then lacks the third one exactly.
     axes = nearest_rotation(
         np.swapaxes(np.linalg.eigh(np.swapaxes(local, -1, -2) @ local)[1], -1, -2)[:, ::-1]
     )
     scale = np.maximum(np.sqrt((local**2).sum((1, 2)) / count), 1e-12)
     local = local @ np.swapaxes(axes, -1, -2) / scale[:, None, None]
-    return _Problem(local, d, axes, scale, centre, *_sum_points(local, d))
+    return _Problem(local, d, axes, scale, center, *_sum_points(local, d))
 
 
 def _sum_points(local: Array, d: Array) -> tuple[Array, Array]:

@@ -64,7 +64,7 @@ def localize_cameras(model: ForwardModel, views: Views, start: Pose | None = Non
 
 def prediction_distances(model: ForwardModel, pose: Pose, views: Views) -> Array:
     """Distances (S, N) of points from their predictions, px; NaN: padding; inf: unseen."""
-    distance = np.linalg.norm(views.uv - model.linearise(pose, views).uv, axis=-1)
+    distance = np.linalg.norm(views.uv - model.linearize(pose, views).uv, axis=-1)
     return np.where(views.used, np.nan_to_num(distance, nan=np.inf), np.nan)
 
 

@@ -40,7 +40,7 @@ class LeastSquares(Protocol):
     States, normal equations and steps are tuples of arrays whose leading axis is the system.
     """
 
-    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+    def linearize(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         """Return the costs (A,), inf outside the domain, and the normal equations."""
 
     def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
@@ -73,7 +73,7 @@ def levenberg_marquardt(
     """
     systems = start[0].shape[0]
     active: Index = np.arange(systems)
-    total, normal = problem.linearise(start, active)
+    total, normal = problem.linearize(start, active)
     state = tuple(array.copy() for array in start)
     converged, iterations = np.zeros(systems, dtype=np.bool_), np.zeros(systems, dtype=np.int64)
     damping, growth = np.full(systems, FIRST_DAMPING), np.full(systems, FIRST_GROWTH)
@@ -96,7 +96,7 @@ def levenberg_marquardt(
             trial = tuple(array[on] for array in trial)
             if not active.size:
                 break
-        cost, fresh = problem.linearise(trial, active)
+        cost, fresh = problem.linearize(trial, active)
         better = is_better(cost, before)
         accepted = active[better]
         total[accepted], moved_before[accepted] = cost[better], moved[better]
@@ -204,7 +204,7 @@ def arrow_of_views(
 
     cost (S, V); hessian (S, V, B + K, B + K), gradient (S, V, B + K): `block` = B columns of the
     view's own, then those that all views share.  Returns the costs (S,) and the fields of
-    ArrowEquations, as `least_squares.LeastSquares.linearise` does.
+    ArrowEquations, as `least_squares.LeastSquares.linearize` does.
     """
     equations = ArrowEquations(
         hessian[..., :block, :block],

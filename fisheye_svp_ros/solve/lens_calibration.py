@@ -39,7 +39,7 @@ _CANDIDATES = 4
 _START_ITERATIONS = 40
 _ROUNDS = 4
 # Incidence angles between which the farthest image corner is looked for, rad, and in how many
-# steps; neighbouring focal lengths differ by less than a fifth.
+# steps; neighboring focal lengths differ by less than a fifth.
 _CORNER_ANGLES = np.geomspace(np.radians(4.0), np.radians(160.0), 24)
 _VIEWS, _POINTS = 20, 60  # enough for a start
 _ROUGH_STEP = 3  # of those focal lengths
@@ -77,7 +77,7 @@ def calibrate(
 
     model: a name in IMAGE_HEIGHTS; image_size: width, height, px; free: parameters to fit, among
     them f, or fx and fy (fx, fy, cx, cy and the model's coefficients by default); a coefficient of
-    a viewpoint shift gives the lens that shift.  What is not freed stays neutral: the centre in
+    a viewpoint shift gives the lens that shift.  What is not freed stays neutral: the center in
     the middle of the image, coefficients at 0.  port: what the camera looked through; where it is
     is fitted too, whatever it says.
     Raises LensError for an impossible model, image size or name; ObservationError for rows of
@@ -388,7 +388,7 @@ def focal_candidates(lens: Lens, views: Views, keep: int) -> tuple[Array, Pose]:
     """Return the best focal lengths (C,), px, of a scan and the poses (C, V) under each.
 
     The image height is that of `lens` with the coefficients it has (kannala_brandt without any is
-    equidistant), the centre is the lens's.  Candidates are ranked by what their poses leave over.
+    equidistant), the center is the lens's.  Candidates are ranked by what their poses leave over.
     """
     focals, pose, rms = _scan(lens, views)
     # A sum of root mean squares forgives one lost view.
@@ -436,8 +436,8 @@ def select_points(views: Views, most: int = _VIEWS) -> Views:
     """Return the views that spread widest in the image, with a few evenly spread points each."""
     used = views.used[..., None]
     count = used.sum(axis=(1, 2))
-    centre = (views.uv * used).sum(axis=1, keepdims=True) / count[:, None, None]
-    spread = ((views.uv - centre) ** 2 * used).sum(axis=(1, 2)) / count
+    center = (views.uv * used).sum(axis=1, keepdims=True) / count[:, None, None]
+    spread = ((views.uv - center) ** 2 * used).sum(axis=(1, 2)) / count
     widest = np.sort(np.argsort(-spread, kind='stable')[:most])
     chosen = views.take(widest)
     # Multiples of the golden ratio do not fall into step with the rows of a board.

@@ -37,7 +37,7 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
     either side (Schweighofer and Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014): both are tried.
     So are all minima of views with fewer than FEW_POINTS points.
     What a lens has that follows from motion (a rolling shutter) needs times: velocities are those
-    between the poses of neighbouring views.
+    between the poses of neighboring views.
     Raises GeometryError, naming the frame, for fewer than MIN_POINTS usable points.
     """
     model = model.seeing(views)
@@ -65,10 +65,10 @@ def nearly_localize(model: ForwardModel, views: Views) -> tuple[Pose, Mask]:
         solved = localize(model, views)
         return solved.pose, solved.converged
     rough, count = start_poses(model, views), len(views.frame)
-    flat, centre, normal = _flat_targets(views)
+    flat, center, normal = _flat_targets(views)
     rows, mirrored = np.append(np.arange(count), flat), np.arange(count, count + len(flat))
     start = rough.take(rows)
-    start.put(mirrored, _mirror_image(rough.take(flat), centre, normal))
+    start.put(mirrored, _mirror_image(rough.take(flat), center, normal))
     solved, _ = _solve_from(model, views.take(rows), start, _STARTING_STEPS)
     cost = np.where(solved.converged, solved.cost, np.inf)
     best = np.arange(count)
@@ -93,9 +93,9 @@ def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localiza
         start = start_poses(model, views)
     found, some_flat = _solve_from(model, views, start)
     if some_flat:
-        flat, centre, normal = _flat_targets(views)
+        flat, center, normal = _flat_targets(views)
         if flat.size:
-            reflected = _mirror_image(found.pose.take(flat), centre, normal)
+            reflected = _mirror_image(found.pose.take(flat), center, normal)
             _improve(model, views, found, flat, reflected.reshape(len(flat), 1))
     if anywhere:
         few = np.flatnonzero((views.weight > 0).sum(axis=1) < FEW_POINTS)
@@ -180,7 +180,7 @@ def residuals(model: ForwardModel, pose: Pose, views: Views) -> Array:
 
 def sight(model: ForwardModel, pose: Pose, views: Views) -> tuple[Array, Array]:
     """Return incidence angles, rad, and ranges, m, of points (S, N) from poses (S,), as solved."""
-    image = model.linearise(pose, views).image
+    image = model.linearize(pose, views).image
     return image.incidence.theta, np.linalg.norm(image.points, axis=-1)
 
 
@@ -204,22 +204,22 @@ def start_poses(model: ForwardModel, views: Views) -> Pose:
 
 
 def _flat_targets(views: Views) -> tuple[Index, Array, Array]:
-    """Return the views (F,) of flat targets, the centres (F, 3) of these and normals (F, 3)."""
+    """Return the views (F,) of flat targets, the centers (F, 3) of these and normals (F, 3)."""
     weight = views.weight[:, None]
-    centre = weight @ views.points / weight.sum(axis=2, keepdims=True)
-    centred = views.points - centre
-    extent, axes = np.linalg.eigh((np.swapaxes(centred, -1, -2) * weight) @ centred)
+    center = weight @ views.points / weight.sum(axis=2, keepdims=True)
+    centerd = views.points - center
+    extent, axes = np.linalg.eigh((np.swapaxes(centerd, -1, -2) * weight) @ centerd)
     flat = np.flatnonzero(extent[:, 0] < PLANARITY**2 * extent[:, 2])
-    return flat, centre[flat, 0], axes[flat, :, 0]
+    return flat, center[flat, 0], axes[flat, :, 0]
 
 
-def _mirror_image(pose: Pose, centre: Array, normal: Array) -> Pose:
+def _mirror_image(pose: Pose, center: Array, normal: Array) -> Pose:
     """Reflect the target, flat across `normal` (S, 3), by the plane across its line of sight."""
-    sight = pose.inverse().transform(centre)
+    sight = pose.inverse().transform(center)
     along = sight / np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-12)
     to_camera = _mirror(along) @ np.swapaxes(pose.rotation, -1, -2) @ _mirror(normal)
     rotation = np.swapaxes(to_camera, -1, -2)
-    return Pose(rotation, centre - (rotation @ sight[..., None])[..., 0])
+    return Pose(rotation, center - (rotation @ sight[..., None])[..., 0])
 
 
 def _mirror(normal: Array) -> Array:
@@ -263,7 +263,7 @@ class _Localization:
         self._model = model
         self._views = views
 
-    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+    def linearize(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         views = self._views
         if len(index) < len(views.frame):
             views = views.take(index)
@@ -278,7 +278,7 @@ def pose_equations(model: ForwardModel, pose: Pose, views: Views) -> tuple[Array
     if model.is_lens_only and model.lens.is_bare:
         cost, *normal = engines.pose_equations(model.lens, *pose, views.solver_inputs)
         return cost, tuple(normal)
-    linear = model.linearise(pose, views)
+    linear = model.linearize(pose, views)
     return normal_equations(linear.uv, model.d_pose(linear, views), views)
 
 

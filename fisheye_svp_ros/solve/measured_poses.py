@@ -91,9 +91,9 @@ def posable_views(
     usable = usable if model is None else usable & model.back_project(views.uv).valid
     count = usable.sum(axis=1)
     inside = usable[..., None]
-    centre = (views.points * inside).sum(axis=1) / np.maximum(count, 1)[:, None]
-    centred = np.where(inside, views.points - centre[:, None], 0.0)
-    extent = np.linalg.eigvalsh(np.swapaxes(centred, -1, -2) @ centred)
+    center = (views.points * inside).sum(axis=1) / np.maximum(count, 1)[:, None]
+    centerd = np.where(inside, views.points - center[:, None], 0.0)
+    extent = np.linalg.eigvalsh(np.swapaxes(centerd, -1, -2) @ centerd)
     posable = (count >= MIN_POINTS) & (extent[:, 1] > _LINE**2 * extent[:, 2])
     if not posable.any():
         where = '' if model is None else f', inside the field of view of lens {model.lens.name!r}'

@@ -235,7 +235,7 @@ def _find_swaps(model: ForwardModel, pose: Pose, views: Views, far: Mask, gate: 
             row=np.arange(len(ids))[None],
         )
         here = pose.take(slice(view, view + 1))
-        seen = model.linearise(here, single).uv[0]
+        seen = model.linearize(here, single).uv[0]
         for point in np.flatnonzero(far[view]):
             other = ids != views.landmark[view, point]
             off = np.linalg.norm(seen - views.uv[view, point], axis=-1)

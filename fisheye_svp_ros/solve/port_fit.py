@@ -94,7 +94,7 @@ def _free_names(
 
 
 def fit_free_curve(data: RigViews, base: RigState) -> RigState:
-    """Return the fit of a lens curve and a centre of any kind, in air."""
+    """Return the fit of a lens curve and a center of any kind, in air."""
     theta = Linearization(data, base, ()).scene.theta_max
     known = [t for t in base.terms if t.name != RadialProfileEffect.name]
     effect = RadialProfileEffect(CURVE_TERMS, round(theta, 6))

@@ -2,7 +2,7 @@
 
 A view passes when its misfit is what its sigma allows (chi-square) and no residual stands out of
 the others.  One that does not is searched for a pose that most of its points agree on: the points
-that do not are outliers (Fischler and Bolles, CACM 1981; locally optimised after Chum, Matas,
+that do not are outliers (Fischler and Bolles, CACM 1981; locally optimized after Chum, Matas,
 Kittler, DAGM 2003).  Views that pass pay for no search.
 """
 

@@ -218,7 +218,7 @@ class Linearization:
         self._follows_effects = state.corrected or fixed_effects
         self.model = state.model
         pose = state.view_poses(data)
-        self.linear: LinearViews = self.model.linearise(pose, data.views)
+        self.linear: LinearViews = self.model.linearize(pose, data.views)
         self.scene: Scene = self.model.scene(pose, data.views, self.linear)
         self.weight = data.views.weight / noise_scale(state.terms, self.scene)
         with np.errstate(invalid='ignore'):
@@ -328,7 +328,7 @@ class Linearization:
 
     def _lens_columns(self) -> Array:
         columns = self.model.lens_columns(self.linear, self.state.lens_names(self.free))
-        # Corrections of the image plane go with its centre and focal lengths.
+        # Corrections of the image plane go with its center and focal lengths.
         inner = [name.rpartition('.')[2] not in ('f', *INTRINSICS) for name in self.free]
         if any(inner):
             columns[..., inner] = self._through_corrections(columns[..., inner])

@@ -119,7 +119,7 @@ class _Rigs:
         self._views = views
         self._rows = np.arange(len(views[0].frame)).reshape(systems, -1)
 
-    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+    def linearize(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         right, rig = Pose(*state[:2]), Pose(*state[2:])
         (left_cost, *left_normal), (cost, *normal) = (
             self._equations(side, pose, index)

@@ -249,7 +249,7 @@ def _linearize(
     """
     frames, count = scene.uv.shape[:2]
     views = scene.views(tags, np.ones(count, dtype=bool), np.arange(frames))
-    linear = model.linearise(cameras, views)
+    linear = model.linearize(cameras, views)
     by_camera = model.d_pose(linear, views)
     used = views.used & np.isfinite(linear.uv).all(axis=-1)
     frame, point = np.nonzero(used)

@@ -99,7 +99,7 @@ def _weak_views(views: Views, localization: Localization) -> tuple[Index, Array]
         return rows, np.zeros(0)
     some = localization.take(rows)
     # A camera that turns about the target leaves the tangent of its path.
-    distance = np.linalg.norm(some.pose.position - _centres(views.take(rows)), axis=-1)
+    distance = np.linalg.norm(some.pose.position - _centers(views.take(rows)), axis=-1)
     precision = np.linalg.eigvalsh(np.linalg.inv(some.covariance)[:, :3, :3])[:, -1]
     turn = np.linalg.eigvalsh(some.covariance[:, 3:, 3:])[:, -1]
     curvature = 0.5 * turn * distance * np.sqrt(precision)
@@ -114,13 +114,13 @@ def _integrate(
 
     nodes: around each of these.
     """
-    centre, systems = _centres(views), len(views.frame)
-    node, density = _tilted_poses(model, views, minima, scale, centre, nodes)
+    center, systems = _centers(views), len(views.frame)
+    node, density = _tilted_poses(model, views, minima, scale, center, nodes)
     count = density.shape[1]
     repeated, flat = np.repeat(np.arange(systems), count), node.reshape(-1)
     cost, (hessian, gradient) = pose_equations(model, flat, views.take(repeated))
     # The other four: a turn about the line of sight and the place of the target.
-    rest = _tilt_columns(flat, centre[repeated])[1][..., 2:]
+    rest = _tilt_columns(flat, center[repeated])[1][..., 2:]
     turned = np.swapaxes(rest, -1, -2)
     relative, unit = with_unit_diagonal(turned @ hessian @ rest, 0.0)
     inverse = never_singular(np.linalg.inv, relative) / (unit[:, :, None] * unit[:, None, :])
@@ -143,14 +143,14 @@ def _tilted_poses(
     views: Views,
     minima: Sequence[Pose],
     scale: Array,
-    centre: Array,
+    center: Array,
     nodes: int,
 ) -> tuple[Pose, Array]:
     """Return poses (S, K) tilted from some minima (S,) each, and the density (S, K) of these."""
     drawn, proposals, spiral = [], [], _spiral(nodes)
     for pose in minima:
         hessian = pose_equations(model, pose, views)[1][0]
-        axes, columns = _tilt_columns(pose, centre)
+        axes, columns = _tilt_columns(pose, center)
         relative, unit = with_unit_diagonal(np.swapaxes(columns, -1, -2) @ hessian @ columns, 0.0)
         inverse = never_singular(np.linalg.inv, relative) / (unit[:, :, None] * unit[:, None, :])
         values, vectors = np.linalg.eigh(inverse[:, :2, :2] * scale[:, None, None] ** 2)
@@ -158,8 +158,8 @@ def _tilted_poses(
         root = _INFLATION * vectors * error[:, None, :]
         turn = rotation_from_vector(spiral @ np.swapaxes(axes[..., :2] @ root, -1, -2))
         rotation = pose.rotation[:, None] @ np.swapaxes(turn, -1, -2)
-        sight = pose.into_body(centre[:, None])[:, :, :, None]
-        drawn.append(Pose(rotation, centre[:, None] - (rotation @ sight)[..., 0]))
+        sight = pose.into_body(center[:, None])[:, :, :, None]
+        drawn.append(Pose(rotation, center[:, None] - (rotation @ sight)[..., 0]))
         proposals.append((pose, axes, root))
     node = Pose(*(np.concatenate(parts, axis=1) for parts in zip(*drawn, strict=True)))
     density = np.zeros(node.shape)
@@ -212,19 +212,19 @@ def _squared_bias(
     return np.asarray(step[:, :, None] * step[:, None, :])
 
 
-def _centres(views: Views) -> Array:
+def _centers(views: Views) -> Array:
     """Return the centers (S, 3), m, of the points that count."""
     used = (views.weight > 0)[..., None]
     return np.asarray((views.points * used).sum(axis=1) / np.maximum(used.sum(axis=1), 1))
 
 
-def _tilt_columns(pose: Pose, centre: Array) -> tuple[Array, Array]:
+def _tilt_columns(pose: Pose, center: Array) -> tuple[Array, Array]:
     """Return axes (S, 3, 3) in the camera frame, and how turns and shifts of the target move it.
 
-    axes: two across the line of sight to `centre` (S, 3), and that line.  columns (S, 6, 6), of
+    axes: two across the line of sight to `center` (S, 3), and that line.  columns (S, 6, 6), of
     the change in `Pose.retract`: turns of the target about these, and shifts of it, m.
     """
-    sight = pose.into_body(centre[:, None])[:, 0]
+    sight = pose.into_body(center[:, None])[:, 0]
     along = sight / np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-12)
     side = np.where(np.abs(along[:, :1]) < 0.7, np.eye(3)[0], np.eye(3)[1])
     first = np.cross(along, side)
@@ -233,7 +233,7 @@ def _tilt_columns(pose: Pose, centre: Array) -> tuple[Array, Array]:
     turn = -pose.rotation @ axes
     columns = np.zeros((len(sight), 6, 6))
     columns[:, 3:, :3] = turn
-    columns[:, :3, :3] = np.cross(turn, (pose.position - centre)[:, :, None], axis=1)
+    columns[:, :3, :3] = np.cross(turn, (pose.position - center)[:, :, None], axis=1)
     columns[:, :3, 3:] = np.eye(3)
     return axes, columns
 

@@ -116,7 +116,7 @@ class _Landmarks(NamedTuple):
     def is_suspicious(self, model: ForwardModel) -> bool:
         """Whether displaced landmarks explain most of what is left, or one stands out."""
         pose, posed = self._poses_by(model, np.ones(len(self.ids), dtype=bool))
-        linear = model.linearise(pose, self.views)
+        linear = model.linearize(pose, self.views)
         weight = np.where(posed[:, None], self.views.weight, 0.0)
         seen = np.asarray((weight > 0) & np.isfinite(linear.uv).all(axis=-1))
         scale = self.scale_of(self._distances(model, pose, posed))
@@ -146,7 +146,7 @@ class _Landmarks(NamedTuple):
 
     def wrong(self, agreement: _Agreement) -> tuple[WrongLandmark, ...]:
         """Return the landmarks that do not agree and do not move as their neighbors do."""
-        uv = agreement.model.linearise(agreement.pose, self.views).uv
+        uv = agreement.model.linearize(agreement.pose, self.views).uv
         off = np.where(agreement.posed[:, None, None], self.views.uv - uv, np.nan)
         by_landmark = np.full((len(off), len(self.ids) + 1, 2), np.nan)
         np.put_along_axis(by_landmark, self.slot[..., None], off, axis=1)

@@ -288,7 +288,7 @@ def _nanmax(values: Array) -> Array:
     return np.asarray(np.fmax.reduce(known, axis=-1, initial=np.nan))
 
 
-def summarise(values: Array) -> Summary:
+def summarize(values: Array) -> Summary:
     """Return the summary of values (N,), NaN = missing; the largest is that of the magnitudes."""
     known = values[np.isfinite(values)]
     missing = len(values) - len(known)

@@ -94,10 +94,10 @@ def test_the_hand_written_kernel_is_right(lens):
     kernel, model = Kernel(lens), ForwardModel(lens)
     world = points(500, np.radians(80.0))
     pose = Pose(rotation_from_vector(np.array([0.1, -0.2, 0.05])), np.array([0.01, 0.02, -0.03]))
-    linear = model.linearise(
+    linear = model.linearize(
         Pose(*(array[None] for array in pose)), views_of(world, np.zeros((1, 500, 2)))
     )
-    uv, jacobian = kernel.linearise(world, *pose)
+    uv, jacobian = kernel.linearize(world, *pose)
     np.testing.assert_allclose(uv, linear.uv[0], atol=1e-7)
     np.testing.assert_allclose(jacobian, linear.d_pose[0], rtol=1e-7, atol=1e-5)
     camera = pose.into_body(world)
@@ -191,10 +191,10 @@ def test_the_report_is_markdown_with_versions_goals_and_reasons():
 def test_every_frame_of_the_board_has_its_own_pose():
     table, names = on_board(3, 32, 2)
     assert len(table) == 3 * 32 * 2 and table.cameras == names
-    centres = [
+    centers = [
         table.uv[(table.frame == frame) & (table.camera == 0)].mean(axis=0) for frame in range(3)
     ]
-    assert min(np.linalg.norm(centres[i] - centres[i - 1]) for i in range(3)) > 10.0
+    assert min(np.linalg.norm(centers[i] - centers[i - 1]) for i in range(3)) > 10.0
 
 
 def test_commands_are_timed_to_their_end_and_until_a_text(tmp_path):

@@ -67,7 +67,7 @@ def hidden(name, scene, amount):
     return departure, form(scene, [departure]) - simulated(scene)
 
 
-def from_centre(scene):
+def from_center(scene):
     return simulated(scene) - [scene.lens.cx, scene.lens.cy]
 
 
@@ -140,7 +140,7 @@ def test_flat_port_refracts_and_is_the_shift_of_a_window():
 
 def test_effects_on_the_intrinsics():
     scene = scene_of()
-    q = from_centre(scene)
+    q = from_center(scene)
     moved = {
         name: hidden(name, scene, amount)[1]
         for name, amount in (
@@ -189,7 +189,7 @@ def test_sensor_tilt_leaves_its_axis_in_place_and_lines_straight():
 def test_lens_changes_over_time(name):
     scene = scene_of()
     moved = hidden(name, scene, 0.01)[1]
-    q = from_centre(scene)
+    q = from_center(scene)
     views = [scene.frame == frame for frame in range(scene.frames)]
     zoom = np.array([np.polyfit(q[on].ravel(), moved[on].ravel(), 1)[0] for on in views])
     if name == 'session_step':

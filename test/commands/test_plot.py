@@ -166,7 +166,7 @@ def test_residuals_are_drawn_against_angle_and_range(tmp_path: Path) -> None:
         draw_residuals([cloud] * 3, lenses, tmp_path / 'a.png')
         pictures.append(imread(tmp_path / 'a.png'))
     assert pictures[0].shape[1] > 500
-    # Colours of their own and a legend tell lenses apart.
+    # Colors of their own and a legend tell lenses apart.
     assert len(np.unique(pictures[1].reshape(-1, 4), axis=0)) > (
         len(np.unique(pictures[0].reshape(-1, 4), axis=0))
     )

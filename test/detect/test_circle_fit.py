@@ -1,4 +1,4 @@
-"""Centres of circles: unbiased by the bend of a fisheye, and as sure as is stated."""
+"""Centers of circles: unbiased by the bend of a fisheye, and as sure as is stated."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from fisheye_svp_ros.simulate.render import Exposure
         ('circles:4x9:18mm:asymmetric', 3),
     ],
 )
-def test_centres_are_unbiased_and_as_sure_as_stated(spec: str, number: int) -> None:
+def test_centers_are_unbiased_and_as_sure_as_stated(spec: str, number: int) -> None:
     pattern = parse_pattern(spec)
     image, true = pattern_photograph(pattern, number)
     found = find_points(image, pattern, 'circles')
@@ -35,9 +35,9 @@ def test_centres_are_unbiased_and_as_sure_as_stated(spec: str, number: int) -> N
         (found.uv - true[order][found.ids] for order in orders),
         key=lambda error: float(np.abs(error).max()),
     )
-    # The middle of the ellipse is up to a tenth of a pixel beside the image of the centre.
+    # The middle of the ellipse is up to a tenth of a pixel beside the image of the center.
     assert np.abs(error.mean(axis=0)).max() < 0.003
-    # Centres of one photograph share what is wrong with the lens that fits it.
+    # Centers of one photograph share what is wrong with the lens that fits it.
     assert 0.6 < np.sqrt(((error / found.sigma[:, None]) ** 2).mean()) < 1.6
 
 
@@ -50,8 +50,8 @@ def test_bright_circles_are_found_as_well() -> None:
     np.testing.assert_allclose(found[0].uv, found[1].uv, atol=0.05)
 
 
-def test_centres_at_the_edge_of_the_field() -> None:
-    """A lens of too few terms bends wrong there: centres were off by 0.008 px."""
+def test_centers_at_the_edge_of_the_field() -> None:
+    """A lens of too few terms bends wrong there: centers were off by 0.008 px."""
     pattern = parse_pattern('circles:8x6:25mm')
     image, true = pattern_photograph(pattern, 3)
     found = find_points(image, pattern, 'circles')
@@ -73,7 +73,7 @@ def test_grids_are_found_in_noise(spec: str) -> None:
 
 
 def test_a_lens_that_is_off_the_middle_of_its_image() -> None:
-    """Its centre was not free, no lens fitted, and centres were off by a pixel."""
+    """Its center was not free, no lens fitted, and centers were off by a pixel."""
     pattern = parse_pattern('circles:8x6:25mm')
     lens = replace(LENS, cx=LENS.cx - 14, cy=LENS.cy + 11)
     image, true = pattern_photograph(pattern, 0, lens=lens)
@@ -100,6 +100,6 @@ def test_a_small_sheet_is_no_circle_that_holds_the_others() -> None:
 def test_paper_between_circles_is_no_bright_circle() -> None:
     """It was taken for some, and grids of circles in noise came out a row off."""
     image, true = pattern_photograph(parse_pattern('circles:4x9:18mm:asymmetric'), 1)
-    assert len(_ellipses(image, bright=True).centre) == 0
-    dark = _ellipses(cv2.GaussianBlur(image, (0, 0), 1.0), bright=False).centre
+    assert len(_ellipses(image, bright=True).center) == 0
+    dark = _ellipses(cv2.GaussianBlur(image, (0, 0), 1.0), bright=False).center
     assert len(dark) == len(true)

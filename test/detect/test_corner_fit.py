@@ -129,5 +129,5 @@ def test_wild_states_are_lost_in_silence() -> None:
     values[:, 4] = 1e200
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        cost, _ = problem.linearise((values,), np.arange(1))
+        cost, _ = problem.linearize((values,), np.arange(1))
     assert np.isinf(cost[0])

@@ -40,7 +40,7 @@ def fitted(seed, terms=(), cameras=1, free=(), simulated=None):
 
 
 @pytest.mark.parametrize('cameras', [1, 2])
-def test_linearised_columns_are_derivatives_of_the_residual(cameras):
+def test_linearized_columns_are_derivatives_of_the_residual(cameras):
     free = intrinsic_names(lens())
     data, state, linear = fitted(3, cameras=cameras, free=free)
     step = 1e-6
@@ -373,7 +373,7 @@ def test_what_the_user_knows_is_a_cause_that_the_simulation_lacked():
 
 def test_boards_are_known_by_the_landmarks_where_a_table_does_not_tell_of_them():
     model, seen = ForwardModel(lens(), ()), scene(np.random.default_rng(30))
-    shape = CATALOGUE['target_shape'].candidates(model.scene(*seen, model.linearise(*seen)))[0]
+    shape = CATALOGUE['target_shape'].candidates(model.scene(*seen, model.linearize(*seen)))[0]
     values = np.resize([0.004, -0.003, 0.005, 0.006], len(shape.parameters))
     table, other = (
         observe(lens(), [ModelTerm(shape, values)], *seen, SIGMA, np.random.default_rng(seed))

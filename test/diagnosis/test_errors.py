@@ -54,7 +54,7 @@ def test_standard_errors_hold_with_local_errors_in_the_background():
 
 
 def test_a_broad_field_of_the_image_widens_the_errors_of_the_intrinsics_it_resembles():
-    """Six bumps as wide as a quarter of the image: focal length and centre take up most of it."""
+    """Six bumps as wide as a quarter of the image: focal length and center take up most of it."""
     off, free = [], ('fx', 'fy', 'cx', 'cy')
     true = np.array([getattr(lens(), name) for name in free])
     size = np.array([lens().width, lens().height])
@@ -126,7 +126,7 @@ def test_a_plate_beside_a_shift_makes_the_shift_mean_something_else():
 
 
 def test_an_effect_that_may_be_another_one_widens_the_errors_of_what_that_would_change():
-    """Tilt named where there is decentering, which hardly differs: the centre is elsewhere."""
+    """Tilt named where there is decentering, which hardly differs: the center is elsewhere."""
     rng = np.random.default_rng(31)
     pose, views = scene(rng, frames=16)
     tilt, decentering = CATALOGUE['sensor_tilt'](), CATALOGUE['decentering']()
@@ -160,7 +160,7 @@ def test_what_no_frame_tells_of_has_no_error():
 
 
 def test_two_effects_that_hide_each_other_widen_the_errors():
-    """What tilt and decentering do to residuals cancels; what they do to the centre does not."""
+    """What tilt and decentering do to residuals cancels; what they do to the center does not."""
     rng = np.random.default_rng(31)
     pose, views = scene(rng, frames=16)
     terms = [

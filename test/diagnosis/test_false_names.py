@@ -98,7 +98,7 @@ def test_large_dots_of_large_boards_are_no_boards_out_of_place(radius, size):
     assert abs(area['value'] - radius**2) < 3 * area['stderr']
 
 
-def test_no_dot_reaches_its_neighbours():
+def test_no_dot_reaches_its_neighbors():
     points = 0.02 * np.stack(np.meshgrid(np.arange(5), np.arange(4), [0]), -1).reshape(-1, 3)
     seen = Scene(views_of(points, np.zeros((1, 20, 2))), lens(), identity(1), np.zeros(0))
     dots = CATALOGUE['dot_centroid']()
@@ -111,9 +111,9 @@ def test_a_smooth_image_field_is_not_named_after_the_effect_that_it_resembles(se
     rng = np.random.default_rng(seed)
     pose, views = scene(rng)
     table = observe(lens(), (), pose, views, SIGMA, rng)
-    centres, widths = rng.uniform(0, 1536, (12, 2)), rng.uniform(150, 600, 12)
+    centers, widths = rng.uniform(0, 1536, (12, 2)), rng.uniform(150, 600, 12)
     heights = SIGMA / 2 * rng.normal(size=(12, 2))
-    squares = ((table.uv[:, None] - centres) ** 2).sum(axis=-1)
+    squares = ((table.uv[:, None] - centers) ** 2).sum(axis=-1)
     field = np.exp(-squares / 2 / widths**2) @ heights
     found = diagnose(replace(table, uv=table.uv + field), lens())
     assert [cause.effect for cause in found.causes] == []

@@ -42,8 +42,8 @@ SIGMA = 0.2
 TESTED = ('viewpoint_shift', 'decentering', 'skew', 'target_shape')
 
 
-def linearised(seed=3, cameras=1, frames=24, offsets=0.0, free=()):
-    """Return a linearised fit to a scene whose landmarks are off by normal offsets, m."""
+def linearized(seed=3, cameras=1, frames=24, offsets=0.0, free=()):
+    """Return a linearized fit to a scene whose landmarks are off by normal offsets, m."""
     rng = np.random.default_rng(seed)
     pose, views = scene(rng, cameras, frames)
     observations = observe(lens(), (), pose, views, SIGMA, rng)
@@ -99,7 +99,7 @@ def some_variances(eq, seed=0):
 @pytest.mark.parametrize(('cameras', 'frames'), [(1, 1), (2, 4), (1, 12)])
 def test_equations_are_those_of_the_dense_matrices(cameras, frames):
     """Either order of elimination: generalised least squares with V = I + Z D Z'."""
-    linear = linearised(cameras=cameras, frames=frames)
+    linear = linearized(cameras=cameras, frames=frames)
     random = make_random_effects(linear).columns
     probe = linear.effect_columns(CATALOGUE['skew']())
     border = np.concatenate([probe, linear.residual[..., None]], axis=-1)
@@ -140,7 +140,7 @@ def test_equations_are_those_of_the_dense_matrices(cameras, frames):
     'name', ['landmark_normal', 'image_coarse', 'frame_linear', 'frame_bumps', 'board_in_plane']
 )
 def test_without_a_component_is_what_the_equations_say_that_never_had_it(frames, name):
-    linear = linearised(frames=frames, offsets=2e-3)
+    linear = linearized(frames=frames, offsets=2e-3)
     random = make_random_effects(linear).columns
     border = np.concatenate(
         [linear.effect_columns(CATALOGUE['skew']()), linear.residual[..., None]], axis=-1
@@ -170,7 +170,7 @@ def test_without_a_component_is_what_the_equations_say_that_never_had_it(frames,
 @pytest.mark.parametrize('frames', [4, 24])
 def test_variances_are_those_of_the_whole_covariance(frames, worth, monkeypatch):
     monkeypatch.setattr('fisheye_svp_ros.mixed_model.equations._WORTH_THREADS', worth)
-    linear = linearised(frames=frames, offsets=2e-3)
+    linear = linearized(frames=frames, offsets=2e-3)
     border = np.concatenate(
         [linear.effect_columns(CATALOGUE['skew']()), linear.residual[..., None]], axis=-1
     )
@@ -187,7 +187,7 @@ def test_variances_are_those_of_the_whole_covariance(frames, worth, monkeypatch)
 @pytest.mark.parametrize('frames', [4, 12])
 @pytest.mark.parametrize('there', [(), ('landmark_in_plane', 'image_broad', 'frame_focal')])
 def test_score_tests_are_those_of_the_dense_matrices(frames, there):
-    linear = linearised(frames=frames, offsets=2e-3)
+    linear = linearized(frames=frames, offsets=2e-3)
     random = make_random_effects(linear).columns
     probe = linear.effect_columns(CATALOGUE['skew']())
     eq = make_equations(
@@ -225,7 +225,7 @@ def test_score_tests_are_those_of_the_dense_matrices(frames, there):
 
 
 def test_a_bound_stands_for_p_values_above_a_limit_only():
-    linear = linearised()
+    linear = linearized()
     random = make_random_effects(linear)
     eq = make_equations(random.columns, linear.frame_columns, linear.residual[..., None])
     nothing = no_variances(len(NAMES), len(random.landmark))
@@ -242,7 +242,7 @@ def test_a_bound_stands_for_p_values_above_a_limit_only():
 @pytest.mark.parametrize('kind', ['image_broad', 'image_coarse'])
 def test_a_component_that_fixed_columns_take_up_is_not_testable(kind):
     """On a board in a plane stretches were named by the rounding of what was left of them."""
-    linear, number = linearised(), NAMES.index(kind)
+    linear, number = linearized(), NAMES.index(kind)
     random = make_random_effects(linear).columns
     random = random._replace(shared=1e4 * random.shared, fields=1e4 * random.fields)
     columns = random.shared_columns[:, random.shared_label == number].toarray()
@@ -260,7 +260,7 @@ def test_a_component_that_fixed_columns_take_up_is_not_testable(kind):
 
 
 def test_another_border_beside_the_same_variances_needs_no_other_factor():
-    linear = linearised()
+    linear = linearized()
     random, probe = make_random_effects(linear).columns, linear.residual[..., None]
 
     def equations():
@@ -285,7 +285,7 @@ def test_another_border_beside_the_same_variances_needs_no_other_factor():
 
 def test_many_frames_need_no_matrix_of_all_that_they_have_of_their_own():
     """A recording of 340 frames took 15 GB."""
-    linear, kind = linearised(frames=150), NAMES.index('frame_bumps')
+    linear, kind = linearized(frames=150), NAMES.index('frame_bumps')
     eq = make_equations(
         make_random_effects(linear).columns, linear.frame_columns, linear.residual[..., None]
     )
@@ -303,7 +303,7 @@ def test_many_frames_need_no_matrix_of_all_that_they_have_of_their_own():
 
 
 def test_a_direction_that_random_parts_have_taken_up_stays_where_it_is():
-    linear = linearised(frames=1)
+    linear = linearized(frames=1)
     eq = make_equations(
         make_random_effects(linear).columns, linear.frame_columns, linear.residual[..., None]
     )
@@ -313,7 +313,7 @@ def test_a_direction_that_random_parts_have_taken_up_stays_where_it_is():
 
 
 def test_what_the_data_determine_is_the_trace_of_the_dense_matrix():
-    linear = linearised(frames=5)
+    linear = linearized(frames=5)
     random = make_random_effects(linear).columns
     border = np.concatenate(
         [linear.effect_columns(CATALOGUE['skew']()), linear.residual[..., None]], axis=-1
@@ -344,7 +344,7 @@ def test_what_the_data_determine_is_the_trace_of_the_dense_matrix():
 
 @pytest.mark.parametrize('by_group', [False, True])
 def test_a_frame_left_out_is_as_if_it_had_never_been(by_group):
-    linear = linearised(cameras=2, frames=6)
+    linear = linearized(cameras=2, frames=6)
     random, pose = make_random_effects(linear).columns, linear.frame_columns
     if not by_group:  # what single frames have of their own makes their blocks the larger part
         random = random._replace(group=random.group[..., :2], group_label=random.group_label[:2])
@@ -382,7 +382,7 @@ def test_a_frame_left_out_is_as_if_it_had_never_been(by_group):
 
 
 def test_variances_that_were_put_in_come_out():
-    linear = linearised(seed=5, offsets=2e-4)
+    linear = linearized(seed=5, offsets=2e-4)
     null = NullModel.estimate(linear.data, linear.state, ())
     tau = dict(zip(NAMES, null.variances.tau, strict=True))
     # Of a t distribution, so the scale is below the standard deviation of the bulk, 0.2 mm.
@@ -395,7 +395,7 @@ def test_variances_that_were_put_in_come_out():
 def test_a_variance_of_zero_is_rarely_called_for():
     p_values = []
     for seed in range(8):
-        linear = linearised(seed=40 + seed, frames=12)
+        linear = linearized(seed=40 + seed, frames=12)
         border = linear.residual[..., None]
         eq = make_equations(make_random_effects(linear).columns, linear.frame_columns, border)
         nothing = Variances(1.0, np.full(len(NAMES), LAMBDA_ABSENT), np.ones(len(eq.units)))
@@ -407,7 +407,7 @@ def test_a_variance_of_zero_is_rarely_called_for():
 
 
 def test_without_variances_there_is_nothing_but_noise():
-    linear = linearised(seed=6)
+    linear = linearized(seed=6)
     null = NullModel.estimate(linear.data, linear.state, ())
     assert null.variances.sigma == pytest.approx(SIGMA, rel=0.08)
     fitted = FittedModel.of_state(null.linear, null.variances)
@@ -417,7 +417,7 @@ def test_without_variances_there_is_nothing_but_noise():
 
 
 def test_estimates_lower_the_deviance():
-    linear = linearised(seed=7, offsets=3e-4)
+    linear = linearized(seed=7, offsets=3e-4)
     border = linear.residual[..., None]
     eq = make_equations(make_random_effects(linear).columns, linear.frame_columns, border)
     first = initial_variances(eq)
@@ -432,7 +432,7 @@ def test_estimates_lower_the_deviance():
 
 
 def test_a_step_that_takes_points_out_of_sight_is_cut_short():
-    linear = linearised(seed=7)
+    linear = linearized(seed=7)
     port = CATALOGUE['flat_port']()
 
     def after(part):
@@ -449,7 +449,7 @@ def test_a_step_that_takes_points_out_of_sight_is_cut_short():
 
 def test_score_is_the_f_test_of_nested_models_where_nothing_is_random():
     free = intrinsic_names(lens())
-    linear = linearised(seed=8, free=free)
+    linear = linearized(seed=8, free=free)
     null = NullModel.estimate(linear.data, linear.state, free)
     nothing = Variances(1.0, np.full(len(NAMES), LAMBDA_ABSENT), null.variances.weight)
     bare = replace(null, variances=nothing)
@@ -476,7 +476,7 @@ def test_score_is_the_f_test_of_nested_models_where_nothing_is_random():
 
 
 def test_doubt_about_variances_has_its_degrees_of_freedom():
-    linear = linearised(seed=31, offsets=3e-4)
+    linear = linearized(seed=31, offsets=3e-4)
     null = NullModel.estimate(linear.data, linear.state, ())
     own = null.included_columns
     form = next(i for i, e in enumerate(null.fixed.forms.effects) if e.name == 'target_shape')
@@ -508,7 +508,7 @@ def test_doubt_about_variances_has_its_degrees_of_freedom():
 def test_p_values_are_uniform_without_an_effect():
     p_values = []
     for seed in range(10):
-        linear = linearised(seed=100 + seed, offsets=2e-4 * (seed % 2))
+        linear = linearized(seed=100 + seed, offsets=2e-4 * (seed % 2))
         null = NullModel.estimate(linear.data, linear.state, ())
         left, tests = eliminate(null.information, null.included_columns), EffectTests(null)
         for form, effect in enumerate(null.fixed.forms.effects):
@@ -543,7 +543,7 @@ def test_every_component_has_words():
 
 @pytest.mark.parametrize('seed', [9, 28])
 def test_a_scale_for_each_landmark_does_not_make_more_of_chance(seed):
-    linear = linearised(seed)
+    linear = linearized(seed)
     null = NullModel.estimate(linear.data, linear.state, ())
     fitted, eq = null.variances, null.equations_of(null.included_columns)
     assert fitted.weight.min() < 0.8

@@ -29,7 +29,7 @@ def photographed(spread=0.0, seed=0):
     return replace(table, uv=table.uv + errs[session[table.frame], table.landmark])
 
 
-def linearised(table):
+def linearized(table):
     data = group_by_frame(table)
     return Linearization(data, adjust(data, initial_state(data, lens()), ()), ())
 
@@ -62,7 +62,7 @@ def test_frames_in_turn_gain_by_it_too():
 
 def test_clean_data_have_nothing_of_it():
     """White residuals without any fit: the likelihood ratio raises no more alarms than it says."""
-    linear = linearised(photographed())
+    linear = linearized(photographed())
     rng = np.random.default_rng(1)
     for _ in range(30):
         white = linear.row_mask * rng.normal(size=linear.row_mask.shape)
@@ -71,13 +71,13 @@ def test_clean_data_have_nothing_of_it():
 
 
 def test_data_without_noise_have_nothing_of_it():
-    linear = linearised(photographed())
+    linear = linearized(photographed())
     assert similar_views(linear, np.zeros_like(linear.residual)) is None
 
 
 def test_each_view_is_predicted_from_the_others_of_its_landmark():
     """What `own` says of a frame is what the other frames say of it, and so by `at`."""
-    linear = linearised(photographed(0.1))
+    linear = linearized(photographed(0.1))
     process = similar_views(linear, linear.residual)
     left = 7
     known = process.known
@@ -108,7 +108,7 @@ def test_each_view_is_predicted_from_the_others_of_its_landmark():
 
 
 def test_what_was_fitted_is_predicted_at_the_same_views():
-    linear = linearised(photographed(0.3))
+    linear = linearized(photographed(0.3))
     process = similar_views(linear, linear.residual)
     rows = linear.residual.reshape(*linear.data.views.used.shape, 2)
     assert np.std(rows - process.predict(linear)) < 0.4 * np.std(rows)
@@ -116,10 +116,10 @@ def test_what_was_fitted_is_predicted_at_the_same_views():
 
 def test_views_of_unknown_time_are_like_none():
     table = photographed(0.1)
-    linear = linearised(table)
+    linear = linearized(table)
     process = similar_views(linear, linear.residual)
     assert np.isfinite(process.lasting)
-    timeless = linearised(replace(table, t=np.full(len(table), np.nan)))
+    timeless = linearized(replace(table, t=np.full(len(table), np.nan)))
     assert not process.predict(timeless).any()
     assert similar_views(timeless, timeless.residual).lasting == np.inf
 
@@ -128,7 +128,7 @@ def test_a_table_that_does_not_state_sigma_is_predicted_by_one_that_does():
     """In px: the scale of sigma is no part of what comes again."""
     table = photographed(0.1)
     stated = replace(table, sigma=np.full(len(table), NOISE))
-    linear, plain = linearised(stated), linearised(table)
+    linear, plain = linearized(stated), linearized(table)
     process = similar_views(linear, linear.residual)
     np.testing.assert_allclose(process.predict(plain), process.predict(linear), atol=1e-6)
     np.testing.assert_allclose(
@@ -141,7 +141,7 @@ def test_a_table_that_does_not_state_sigma_is_predicted_by_one_that_does():
 
 def test_landmarks_that_were_never_seen_are_left_alone():
     table = photographed(0.1)
-    linear = linearised(table)
+    linear = linearized(table)
     process = similar_views(linear, linear.residual)
-    other = linearised(replace(table, landmark=table.landmark + 1000))
+    other = linearized(replace(table, landmark=table.landmark + 1000))
     assert not process.predict(other).any()

@@ -49,12 +49,12 @@ DESIGN_NAMES = {
 
 
 @pytest.fixture(scope='module', params=['fish214', 'fish180'])
-def linearised(request):
+def linearized(request):
     """Return a model, its views from two cameras, and the scene that effects look at."""
     rng = np.random.default_rng(4)
     pose, views = scene(rng, cameras=2, frames=8)
     model = ForwardModel(lens(request.param), ())
-    linear = model.linearise(pose, views)
+    linear = model.linearize(pose, views)
     return model, pose, views, linear, model.scene(pose, views, linear)
 
 
@@ -77,8 +77,8 @@ def test_words_say_what_to_look_for_and_what_to_do(name):
 
 
 @pytest.mark.parametrize('name', sorted(CATALOGUE))
-def test_columns_are_the_derivatives_of_the_prediction(name, linearised):
-    model, pose, views, linear, scene_ = linearised
+def test_columns_are_the_derivatives_of_the_prediction(name, linearized):
+    model, pose, views, linear, scene_ = linearized
     for effect in forms(name, scene_):
         if effect.stage == 'noise':
             continue
@@ -100,8 +100,8 @@ def test_columns_are_the_derivatives_of_the_prediction(name, linearised):
 
 
 @pytest.mark.parametrize('name', sorted(CATALOGUE))
-def test_lens_file_keeps_effects(name, linearised, tmp_path):
-    model, pose, views, _, scene_ = linearised
+def test_lens_file_keeps_effects(name, linearized, tmp_path):
+    model, pose, views, _, scene_ = linearized
     rng = np.random.default_rng(1)
     for effect in forms(name, scene_):
         values = rng.normal(size=len(effect.parameters)) * 1e-4
@@ -117,8 +117,8 @@ def test_lens_file_keeps_effects(name, linearised, tmp_path):
 
 
 @pytest.mark.parametrize('normal', [0, 1, 2])
-def test_a_flat_target_is_stretched_within_its_plane(normal, linearised, tmp_path):
-    model, _, views, _, scene_ = linearised
+def test_a_flat_target_is_stretched_within_its_plane(normal, linearized, tmp_path):
+    model, _, views, _, scene_ = linearized
     views = views._replace(points=np.where(np.arange(3) == normal, 0.3, views.points))
     whole, plane = CATALOGUE['landmark_scale'].candidates(replace(scene_, views=views))
     moved = plane.displacement(replace(scene_, views=views), np.array([0.01, 0.004]))
@@ -142,8 +142,8 @@ def test_a_stretch_of_an_older_lens_file_is_read():
 
 
 @pytest.mark.parametrize('name', sorted(CATALOGUE))
-def test_no_views_are_no_trouble(name, linearised):
-    model, pose, views, _, scene_ = linearised
+def test_no_views_are_no_trouble(name, linearized):
+    model, pose, views, _, scene_ = linearized
     for effect in forms(name, scene_):
         extended = ForwardModel(
             model.lens, [ModelTerm(effect, np.full(len(effect.parameters), 1e-5))]
@@ -178,7 +178,7 @@ def test_dot_centroid_is_the_centroid_of_the_dots_image():
     rng = np.random.default_rng(7)
     pose, views = scene(rng, frames=3)
     model = ForwardModel(lens(), ())
-    linear = model.linearise(pose, views)
+    linear = model.linearize(pose, views)
     scene_ = model.scene(pose, views, linear)
     effect = CATALOGUE['dot_centroid'].candidates(scene_)[0]
     radius = 0.008
@@ -227,8 +227,8 @@ def test_a_profile_that_turns_back_past_its_data_is_used_up_to_there():
     assert model.lens.max_incidence <= curve.limit
 
 
-def test_a_drift_leaves_the_mean_focal_length_to_the_lens(linearised):
-    *_, scene_ = linearised
+def test_a_drift_leaves_the_mean_focal_length_to_the_lens(linearized):
+    *_, scene_ = linearized
     late = scene_.views.frame > 2
     paused = scene_.views._replace(t=scene_.views.t + 50.0 * late[:, None])
     scene_ = replace(scene_, views=paused)
@@ -238,8 +238,8 @@ def test_a_drift_leaves_the_mean_focal_length_to_the_lens(linearised):
         np.testing.assert_allclose(np.nanmean(growth, axis=(0, 1, 2)), 0.0, atol=1e-12)
 
 
-def test_a_drift_needs_no_times_where_frames_are_in_order(linearised):
-    *_, scene_ = linearised
+def test_a_drift_needs_no_times_where_frames_are_in_order(linearized):
+    *_, scene_ = linearized
     frame = scene_.views.frame.astype(float)
     bare, even = (
         replace(scene_, views=scene_.views._replace(t=np.broadcast_to(t, scene_.views.t.shape)))
@@ -260,8 +260,8 @@ def test_frames_taken_more_slowly_do_not_refute_motion(step, holds):
     assert CATALOGUE['viewpoint_shift']().is_refutable_by(others, known)
 
 
-def test_a_drift_stays_as_it_was_where_the_recording_ends(linearised):
-    *_, scene_ = linearised
+def test_a_drift_stays_as_it_was_where_the_recording_ends(linearized):
+    *_, scene_ = linearized
     last = np.nanargmax(scene_.times)
     later = replace(scene_, views=scene_.views._replace(t=scene_.views.t + 1000.0))
     for effect in CATALOGUE['focal_drift'].candidates(scene_):

@@ -68,7 +68,7 @@ def some(*names, size=0.3):
 def bowed(seen, height=0.01):
     """Return the table of a bowed target, and the bow."""
     shape = CATALOGUE['target_shape'].candidates(
-        ForwardModel(KB, ()).scene(*seen, ForwardModel(KB, ()).linearise(*seen))
+        ForwardModel(KB, ()).scene(*seen, ForwardModel(KB, ()).linearize(*seen))
     )[0]
     values = np.full(len(shape.parameters), height)
     term = ModelTerm(shape, values)
@@ -315,7 +315,7 @@ def test_the_library_projects_with_all_of_the_lens():
     points = rng.uniform([-0.5, -0.5, 0.3], [0.5, 0.5, 1.3], (2, 5, 3))
     image = fsvp.project(extended, points)
     assert image.uv.shape == (2, 5, 2) and image.valid.all()
-    linear = ForwardModel(extended).linearise(
+    linear = ForwardModel(extended).linearize(
         identity(1), views_of(points.reshape(1, 10, 3), np.zeros((1, 10, 2)))
     )
     np.testing.assert_array_equal(image.uv.reshape(1, 10, 2), linear.uv)

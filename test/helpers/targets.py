@@ -42,5 +42,5 @@ def poses_around(landmarks, frames, rng, *, widest, distance=(0.25, 0.8), tilt=4
     turn[:, :2] = np.radians(tilt) * rng.uniform(-1, 1, (frames, 2))
     rotation = facing @ rotation_from_vector(spin) @ rotation_from_vector(turn)
     target = Pose(rotation, rng.uniform(*distance, (frames, 1)) * gaze)
-    centred = Pose(np.broadcast_to(np.eye(3), (frames, 3, 3)), -landmarks.points.mean(axis=0))
-    return target.compose(centred).inverse()
+    centerd = Pose(np.broadcast_to(np.eye(3), (frames, 3, 3)), -landmarks.points.mean(axis=0))
+    return target.compose(centerd).inverse()

@@ -210,7 +210,7 @@ class TestObservationsCsv:
         )
 
     def test_points_at_one_place_now_and_then(self, csv):
-        """A static scene, and neighbours in whole pixels."""
+        """A static scene, and neighbors in whole pixels."""
         still = [f'{i // 4},{i % 4},{i % 4 // 2},7,{i % 4},0,0' for i in range(400)]
         assert len(read_observations(csv('\n'.join([HEADER, *still])))) == 400
 

@@ -96,7 +96,7 @@ def test_projection_and_derivatives_of_any_point(compiled, lens, limited):
     projected, expected, found = (
         numpy_engine.project(lens, points, limited),
         *(
-            [part[0] for part in engine.linearise_views(lens, *identity(1), points[None], limited)]
+            [part[0] for part in engine.linearize_views(lens, *identity(1), points[None], limited)]
             for engine in (numpy_engine, compiled)
         ),
     )
@@ -116,7 +116,7 @@ def test_derivatives_by_the_pose_whatever_the_number_of_points(compiled, count):
     local = points_on_rays(FISH214, rng, 3 * count, nearest=0.3).reshape(3, count, 3)
     points = np.stack([p.transform(x) for p, x in zip(map(Pose, *pose), local, strict=True)])
     expected, found = (
-        engine.linearise_views(FISH214, *pose, points, True) for engine in (numpy_engine, compiled)
+        engine.linearize_views(FISH214, *pose, points, True) for engine in (numpy_engine, compiled)
     )
     both_equal(expected, found, scale=1e3)
 
@@ -132,8 +132,8 @@ def test_any_number_of_threads(compiled, monkeypatch, threads):
     )
     views = *identity(1000), points[1:].reshape(1000, 100, 3)
     both_equal(
-        numpy_engine.linearise_views(FISH214, *views, True),
-        compiled.linearise_views(FISH214, *views, True),
+        numpy_engine.linearize_views(FISH214, *views, True),
+        compiled.linearize_views(FISH214, *views, True),
         scale=1e3,
     )
 
@@ -340,8 +340,8 @@ def test_a_curve_without_a_formula_goes_to_the_reference(compiled):
     both_equal(numpy_engine.project(lens, points, True), compiled.project(lens, points, True))
     views = *identity(1), points[None]
     both_equal(
-        numpy_engine.linearise_views(lens, *views, True),
-        compiled.linearise_views(lens, *views, True),
+        numpy_engine.linearize_views(lens, *views, True),
+        compiled.linearize_views(lens, *views, True),
     )
 
 

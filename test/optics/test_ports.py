@@ -44,11 +44,11 @@ def faces(port, a, b):
             port.distance * normal + a @ basis,
             (port.distance + port.thickness) * normal + b @ basis,
         )
-    centre = np.array([port.x, port.y, port.z])
+    center = np.array([port.x, port.y, port.z])
     found = []
     for place, radius in ((a, port.radius), (b, port.radius + port.thickness)):
         height = np.sqrt(max(radius**2 - place @ place, 0.0))
-        found.append(centre + np.append(place, height))
+        found.append(center + np.append(place, height))
     return found
 
 
@@ -114,7 +114,7 @@ def test_poses_are_found_through_a_port(port):
     """Derivatives by the pose too: they are what finds it."""
     lens, world = replace(AIR, port=port), points()[None]
     pose = Pose(rotation_from_vector(np.array([[0.05, 0.02, 0.3]])), np.array([[0.02, 0.1, -0.1]]))
-    uv, valid, _ = engines.linearise_views(lens, *pose, world, True)
+    uv, valid, _ = engines.linearize_views(lens, *pose, world, True)
     assert valid.all()
     found = localize(ForwardModel(lens), views_of(world, uv))
     assert found.converged.all()

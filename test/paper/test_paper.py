@@ -106,7 +106,7 @@ def test_x_y_and_axis_errors_of_tables_1_and_2(ours):
     np.testing.assert_allclose(axis, LOCALIZATION[..., 3], rtol=0.25)
     off = np.abs(ours[0] - LOCALIZATION)[..., :2]
     early = np.zeros(off.shape, dtype=bool)
-    early[0, 0, ::2] = True  # the rows of the paper that are out of line with their neighbours
+    early[0, 0, ::2] = True  # the rows of the paper that are out of line with their neighbors
     assert off[~early].max() < 0.015
     assert off[early].max() < 0.04
     same_sign = np.sign(ours[0][..., :3]) == np.sign(LOCALIZATION[..., :3])

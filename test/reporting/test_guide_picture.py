@@ -16,24 +16,24 @@ def guide():
     return Guide(session(), np.arange(len(POINTS))[None])
 
 
-def of_colour(picture, colour):
-    return int((np.abs(picture.astype(int) - colour).max(axis=-1) < 30).sum())
+def of_color(picture, color):
+    return int((np.abs(picture.astype(int) - color).max(axis=-1) < 30).sum())
 
 
 def test_orange_until_the_board_is_there_then_green(guide):
     pixels = np.full((800, 848), 90, np.uint8)
     assert guide_words(guide)[0] == 'one moment'
     blank = draw_guide(pixels, guide, None)
-    assert not of_colour(blank, ORANGE) and blank.shape == (800, 848, 3)
+    assert not of_color(blank, ORANGE) and blank.shape == (800, 848, 3)
     guide.adopt(evaluate_session(guide.session))
     assert 'off the axis' in guide_words(guide)[1] and guide_words(guide)[2] == '0 photographs'
     there = DetectedBoard(0.0, np.arange(len(POINTS)), guide.outline, np.ones(len(POINTS)))
     away = there._replace(uv=there.uv - 200)  # partly out of the picture
     cases = (away, ORANGE, GREEN, 'bring'), (there, GREEN, ORANGE, 'hold')
-    for seen, colour, other, todo in cases:
+    for seen, color, other, todo in cases:
         guide.look(0.0, seen)
         picture = draw_guide(pixels, guide, seen)
-        assert of_colour(picture, colour) > 1000 > 10 * of_colour(picture, other)
+        assert of_color(picture, color) > 1000 > 10 * of_color(picture, other)
         assert guide_words(guide)[0].startswith(todo)
 
 

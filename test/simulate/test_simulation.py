@@ -73,7 +73,7 @@ def test_what_has_no_image_is_absent():
     assert len(empty) == 0
 
 
-def test_the_image_ends_half_a_pixel_beyond_the_outer_centres():
+def test_the_image_ends_half_a_pixel_beyond_the_outer_centers():
     lens = replace(FISH214, viewpoint_shift=None, width=400, height=300, cx=200.0, cy=150.0)
     edges = np.array(
         [
@@ -170,8 +170,8 @@ def test_image_points_swapped_with_others_of_their_view():
         assert sorted(map(tuple, before)) == sorted(map(tuple, after))
 
 
-def test_the_image_ends_half_a_pixel_beyond_the_outer_pixel_centres():
-    """Pixel centres are at whole numbers: the image runs from -0.5 to width - 0.5."""
+def test_the_image_ends_half_a_pixel_beyond_the_outer_pixel_centers():
+    """Pixel centers are at whole numbers: the image runs from -0.5 to width - 0.5."""
     lens = replace(FISH214.svp(), max_incidence=np.pi / 2)
     edges = np.array([-0.51, -0.49, lens.width - 0.51, lens.width - 0.49])
     uv = np.stack([edges, np.full(4, lens.cy)], axis=-1)

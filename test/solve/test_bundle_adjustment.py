@@ -205,11 +205,11 @@ def test_a_rig_predicts_each_view_by_its_camera():
     data = observed(cameras=2)
     state = rig_state(data)
     pose, views = state.view_poses(data), data.views
-    linear = state.model.linearise(pose, views)
+    linear = state.model.linearize(pose, views)
     for camera in (0, 1):
         rows = np.flatnonzero(views.camera == camera)
         own = state.model.camera(camera)
-        alone = own.linearise(pose.take(rows), views.take(rows))
+        alone = own.linearize(pose.take(rows), views.take(rows))
         for name in ('uv', 'valid', 'd_pose', 'ideal', 'optical', 'points'):
             np.testing.assert_array_equal(getattr(linear, name)[rows], getattr(alone, name))
         columns = own.transform_columns(alone, views.take(rows), alone.d_pose)
@@ -226,7 +226,7 @@ def test_an_effect_of_single_cameras_is_asked_like_any_other():
     data = observed(cameras=2)
     state = rig_state(data)
     pose, views, effect = state.view_poses(data), data.views, state.terms[0].effect
-    linear = state.model.linearise(pose, views)
+    linear = state.model.linearize(pose, views)
     seen = state.model.scene(pose, views, linear)
     columns = state.model.effect_columns(effect, seen, linear)
     np.testing.assert_array_equal(effect.columns(seen), columns)

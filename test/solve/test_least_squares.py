@@ -58,7 +58,7 @@ class Curves:
         self.function = function
         self.asked = []
 
-    def linearise(self, state, index):
+    def linearize(self, state, index):
         self.asked.append(len(index))
         residual, jacobian = self.function(*state, index)
         hessian = np.einsum('smi,smj->sij', jacobian, jacobian)

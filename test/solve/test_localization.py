@@ -88,7 +88,7 @@ def test_derivatives_by_pose_and_target_equal_high_order_differences():
     for lens in (LENSES['fish214'], LENSES['fish214'].svp()):
         model = ForwardModel(lens)
         views = seen(lens, points, pose)
-        linear = model.linearise(pose, views)
+        linear = model.linearize(pose, views)
         derivatives = np.concatenate([linear.d_pose, linear.d_target], axis=-1)
         for axis, step in zip(np.eye(9), [1e-3] * 3 + [2e-3] * 3 + [1e-3] * 3, strict=True):
 
@@ -205,7 +205,7 @@ def test_a_solvers_derivatives_have_how_corrections_vary_over_the_image(name):
     )
     pose = scattered_poses(rng, 10, 0.5)
     views = seen(LENSES['fish180'], environment('inner', 0.5).points, pose)
-    found = model.d_pose(model.linearise(pose, views), views)
+    found = model.d_pose(model.linearize(pose, views), views)
     for axis in np.eye(6):
 
         def moved(size, axis=axis):
@@ -312,7 +312,7 @@ def test_points_that_do_not_fix_a_pose_are_reported(points):
     assert np.abs(solved.pose.take([1]).difference(paper_pose(1))).max() < 1e-9
 
 
-def test_a_rolling_shutter_in_a_lens_follows_from_neighbouring_poses():
+def test_a_rolling_shutter_in_a_lens_follows_from_neighboring_poses():
     """Velocities that changed with every step of the poses lost a third of the frames."""
     rng = np.random.default_rng(4)
     pose, views = scenes.scene(rng, frames=30)

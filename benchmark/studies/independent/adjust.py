@@ -106,9 +106,9 @@ def fit_lens(scene: Scene, uv: Array, start: Lens) -> tuple[Lens, float]:
         held=scene.held[~scene.held],
     )
     world, uv = scene.target.points[used.landmark], uv[kept]
-    centres = scene.track.centres[~scene.held]
+    centers = scene.track.centers[~scene.held]
     turns, rig, lens = scene.track.turns[~scene.held].inv(), scene.rig, start
-    shifts = -turns.apply(centres)
+    shifts = -turns.apply(centers)
     for _ in range(12):
         points = turns[renumbered].apply(world) + shifts[renumbered]
         if rig is not None:

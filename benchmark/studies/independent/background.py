@@ -45,7 +45,7 @@ def per_frame(scene: Scene, fields: Sequence[Field], amount: float) -> Field:
 
 
 def board_errors(rng: Rng, scene: Scene) -> Callable[[float], Departure]:
-    """Landmarks are off on their own and along with their neighbours, in and out of the plane."""
+    """Landmarks are off on their own and along with their neighbors, in and out of the plane."""
     target, count = scene.target, len(scene.target.points)
     share = rng.uniform(0.2, 0.8)
     own = rng.normal(size=(count, 3))

@@ -41,7 +41,7 @@ class Effect:
     direct: bool = False
 
 
-def centre_of(scene: Scene) -> Array:
+def center_of(scene: Scene) -> Array:
     return np.array([scene.lens.cx, scene.lens.cy])
 
 
@@ -93,7 +93,7 @@ def principal_point(rng: Rng, scene: Scene) -> Form:
     """The axis meets the sensor elsewhere."""
     phi = rng.uniform(0, 2 * np.pi)
     return lambda a: Departure(
-        centre=np.broadcast_to(a * np.array([np.cos(phi), np.sin(phi)]), (len(scene.frame), 2))
+        center=np.broadcast_to(a * np.array([np.cos(phi), np.sin(phi)]), (len(scene.frame), 2))
     )
 
 
@@ -107,7 +107,7 @@ def aspect(rng: Rng, scene: Scene) -> Form:
 
 def skew(rng: Rng, scene: Scene) -> Form:
     """Rows and columns of the sensor are not at right angles."""
-    sign, middle = rng.choice([-1, 1]), centre_of(scene)
+    sign, middle = rng.choice([-1, 1]), center_of(scene)
     return lambda a: Departure(
         field=lambda uv: sign * a * (uv[:, 1:] - middle[1]) * np.array([1.0, 0.0])
     )
@@ -115,7 +115,7 @@ def skew(rng: Rng, scene: Scene) -> Form:
 
 def decentering(rng: Rng, scene: Scene) -> Form:
     """A lens element is off the axis: thrice as much along the radius as across (Conrady)."""
-    phi, middle, radius = rng.uniform(0, 2 * np.pi), centre_of(scene), image_radius(scene)
+    phi, middle, radius = rng.uniform(0, 2 * np.pi), center_of(scene), image_radius(scene)
     p = np.array([np.cos(phi), np.sin(phi)])
 
     def field(uv: Array) -> Array:
@@ -127,7 +127,7 @@ def decentering(rng: Rng, scene: Scene) -> Form:
 
 def sensor_tilt(rng: Rng, scene: Scene) -> Form:
     """The sensor is turned about a line through the principal point; exit pupil 1 to 3 f away."""
-    phi, middle = rng.uniform(0, 2 * np.pi), centre_of(scene)
+    phi, middle = rng.uniform(0, 2 * np.pi), center_of(scene)
     away = scene.lens.fx * rng.uniform(1, 3)
     axis = np.array([np.cos(phi), np.sin(phi), 0.0])
 
@@ -169,11 +169,11 @@ def thermal_drift(rng: Rng, scene: Scene) -> Form:
 
 
 def session_step(rng: Rng, scene: Scene) -> Form:
-    """From some frame on the lens sits differently: focal length and centre have jumped."""
+    """From some frame on the lens sits differently: focal length and center have jumped."""
     after = (np.arange(scene.frames) >= scene.frames * rng.uniform(0.3, 0.7))[scene.frame]
     zoom, move = rng.normal(), rng.normal(size=2) * image_radius(scene) / 2
     return lambda a: Departure(
-        focal=1 + a * zoom * after[:, None] * np.ones(2), centre=a * after[:, None] * move
+        focal=1 + a * zoom * after[:, None] * np.ones(2), center=a * after[:, None] * move
     )
 
 
@@ -225,7 +225,7 @@ def board_pose(rng: Rng, scene: Scene) -> Form:
 
 
 def dot_centroid(rng: Rng, scene: Scene) -> Form:
-    """Targets are discs; the detector takes the centre of gravity of their images."""
+    """Targets are discs; the detector takes the center of gravity of their images."""
     return lambda a: Departure(dot=a * scene.target.spacing)
 
 
@@ -264,7 +264,7 @@ def rig_flex(rng: Rng, scene: Scene) -> Form:
 
 
 def wrong_ids(rng: Rng, scene: Scene) -> Form:
-    """Neighbours in some views exchange their names."""
+    """Neighbors in some views exchange their names."""
 
     def swap(size: float) -> Departure:
         rows: list[tuple[int, int]] = []
@@ -289,7 +289,7 @@ def wrong_ids(rng: Rng, scene: Scene) -> Form:
 
 def noise_vs_angle(rng: Rng, scene: Scene) -> Form:
     """The detector is worse towards the edge of the picture, by 1 + size·(θ-dependent, rms 1)."""
-    points = scene.target.points[scene.landmark] - scene.track.centres[scene.frame]
+    points = scene.target.points[scene.landmark] - scene.track.centers[scene.frame]
     axis = scene.track.turns[scene.frame].apply([0, 0, 1])
     cosine = np.einsum('ij,ij->i', points, axis) / np.linalg.norm(points, axis=1)
     growth = np.arccos(cosine.clip(-1, 1)) ** rng.uniform(2, 4)

@@ -28,7 +28,7 @@ class Departure:
     landmarks (N, 3): displacement, m.  flex (F, 6): twist of the right camera, rad and m.
     delay: s per observation, from image points (M, 2) and camera.  pupil: entrance of rays, m.
     window: thickness, m, and index.  profile: px added to h(θ).  focal (M, 2): factors of fx, fy.
-    centre (M, 2): px.  field: px added at image points (M, 2).  dot: radius of dots, m.
+    center (M, 2): px.  field: px added at image points (M, 2).  dot: radius of dots, m.
     lock: px added by the detector at image points.  spread: factor of the noise (M,).
     lattice: step of the written coordinates, px.  swaps (K, 2): rows that change landmarks.
     noise: draws noise of unit spread (M, 2).
@@ -41,7 +41,7 @@ class Departure:
     window: tuple[float, float] | None = None
     profile: Callable[[Array], Array] | None = None
     focal: Array | None = None
-    centre: Array | None = None
+    center: Array | None = None
     field: Field | None = None
     dot: float = 0.0
     lock: Field | None = None
@@ -91,8 +91,8 @@ def _lens(scene: Scene, points: Array, departures: Sequence[Departure]) -> Array
         if d.focal is not None:
             uv *= d.focal
     for d in departures:
-        if d.centre is not None:
-            uv += d.centre
+        if d.center is not None:
+            uv += d.center
     uv += [lens.cx, lens.cy]
     return uv + sum(d.field(uv) for d in departures if d.field is not None)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmark.studies.independent.background import per_frame, smooth
 from benchmark.studies.independent.camera import Array
-from benchmark.studies.independent.effects import Effect, Form, Rng, centre_of, image_radius
+from benchmark.studies.independent.effects import Effect, Form, Rng, center_of, image_radius
 from benchmark.studies.independent.formation import Departure
 from benchmark.studies.independent.scene import Scene
 
@@ -22,7 +22,7 @@ def ripple(rng: Rng, scene: Scene) -> Form:
 
 def dent(rng: Rng, scene: Scene) -> Form:
     """A local dent of the lens: rays are bent towards one place, or away from it."""
-    radius, middle = image_radius(scene), centre_of(scene)
+    radius, middle = image_radius(scene), center_of(scene)
     width = radius * rng.uniform(0.12, 0.25)
     angle, away = rng.uniform(0, 2 * np.pi), radius * rng.uniform(0.15, 0.45)
     place, sign = middle + away * np.array([np.cos(angle), np.sin(angle)]), rng.choice([-1, 1])
@@ -50,7 +50,7 @@ def walk(rng: Rng, scene: Scene) -> Form:
 
 def trefoil(rng: Rng, scene: Scene) -> Form:
     """A pinched element: three-fold astigmatism."""
-    middle, radius, phi = centre_of(scene), image_radius(scene), rng.uniform(0, 2 * np.pi)
+    middle, radius, phi = center_of(scene), image_radius(scene), rng.uniform(0, 2 * np.pi)
 
     def field(uv: Array) -> Array:
         q = ((uv - middle) / radius) @ np.array([1, 1j])
@@ -84,7 +84,7 @@ def stabilizer(rng: Rng, scene: Scene) -> Form:
     times = scene.track.times - scene.track.times[0]
     swing = np.sin(rng.uniform(3, 8) * times + rng.uniform(0, 2 * np.pi))[scene.frame]
     towards = rng.normal(size=2)
-    return lambda a: Departure(centre=a * swing[:, None] * towards)
+    return lambda a: Departure(center=a * swing[:, None] * towards)
 
 
 OUTSIDE: dict[str, Effect] = {

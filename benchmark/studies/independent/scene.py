@@ -18,7 +18,7 @@ Index = NDArray[np.int64]
 class Target(NamedTuple):
     """Landmarks (N, 3), m; of boards also board (N,), its axes (N, 3, 3) and local (N, 2) in ±1.
 
-    Axes are rows: along, down, and into the board; `spacing` is that of neighbours, m.
+    Axes are rows: along, down, and into the board; `spacing` is that of neighbors, m.
     """
 
     kind: str
@@ -32,20 +32,20 @@ class Target(NamedTuple):
 
 @dataclass(frozen=True)
 class Track:
-    """Where the (left) camera is: centres (F, 3) and rotations camera to world, at times (F,)."""
+    """Where the (left) camera is: centers (F, 3) and rotations camera to world, at times (F,)."""
 
     times: Array
-    centres: Array
+    centers: Array
     turns: Rotation
     moving: bool
 
     def pose(self, frame: Index, delay: Array) -> tuple[Array, Rotation]:
-        """Return centres (M, 3) and rotations of frames (M,), `delay` (M,) s later."""
+        """Return centers (M, 3) and rotations of frames (M,), `delay` (M,) s later."""
         if not self.moving or not np.any(delay):
-            return self.centres[frame], self.turns[frame]
+            return self.centers[frame], self.turns[frame]
         when = self.times[frame] + delay
         return (
-            CubicSpline(self.times, self.centres)(when),
+            CubicSpline(self.times, self.centers)(when),
             RotationSpline(self.times, self.turns)(when),
         )
 
@@ -76,8 +76,8 @@ def in_camera(scene: Scene, points: Array, delay: Array, flex: Array | None = No
 
     `flex` (F, 6) turns (rad) and moves (m) the right camera in each frame.
     """
-    centres, turns = scene.track.pose(scene.frame, delay)
-    local = turns.inv().apply(points - centres)
+    centers, turns = scene.track.pose(scene.frame, delay)
+    local = turns.inv().apply(points - centers)
     if scene.rig is not None:
         right = scene.camera == 1
         turned = scene.rig[0].apply(local[right]) + scene.rig[1]
@@ -89,7 +89,7 @@ def in_camera(scene: Scene, points: Array, delay: Array, flex: Array | None = No
 
 
 def draw_board(rng: np.random.Generator) -> Target:
-    """Return one flat board with its origin at the centre, facing -z."""
+    """Return one flat board with its origin at the center, facing -z."""
     columns, rows = rng.integers(8, 13), rng.integers(6, 10)
     spacing = float(np.round(rng.uniform(0.02, 0.09), 4))
     local = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 2)
@@ -121,8 +121,8 @@ def draw_cube(rng: np.random.Generator) -> Target:
         along = np.cross([0, 1, 0], normal) if abs(normal[1]) < 0.5 else np.array([1.0, 0, 0])
         frame = np.stack([along, np.cross(normal, along), normal])
         # Inner faces lie ahead along their normal; those of a solid cube face the other way.
-        centre = normal * half if inside else -normal * half
-        points.append(centre + half * local @ frame[:2])
+        center = normal * half if inside else -normal * half
+        points.append(center + half * local @ frame[:2])
         axes.append(np.broadcast_to(frame, (len(local), 3, 3)))
     board = np.repeat(np.arange(len(into)), len(local))
     return Target(
@@ -159,29 +159,29 @@ TARGETS = {'board': draw_board, 'cube': draw_cube, 'world': draw_world}
 def _view(
     rng: np.random.Generator, target: Target, lens: Lens, calm: float
 ) -> tuple[Array, Rotation]:
-    """Return one random camera centre and rotation to world that sees the target."""
+    """Return one random camera center and rotation to world that sees the target."""
     half = target.half
     if target.kind == 'board':
         tilt = Rotation.from_rotvec([*rng.uniform(-0.75, 0.75, 2), 0])
         distance = 2 * half * np.exp(rng.uniform(np.log(0.3), np.log(1.2)))
-        centre = -distance * tilt.apply([0, 0, 1])
-        aim = Rotation.align_vectors([-centre / distance], [[0, 0, 1]])[0]
+        center = -distance * tilt.apply([0, 0, 1])
+        aim = Rotation.align_vectors([-center / distance], [[0, 0, 1]])[0]
         off = 0.5 * lens.theta_max * rng.normal(0, 0.6, 2).clip(-1, 1)
     elif target.kind == 'inner cube':
-        centre = half * rng.uniform(-0.4, 0.4, 3)
+        center = half * rng.uniform(-0.4, 0.4, 3)
         aim, off = Rotation.identity(), rng.uniform(-0.6, 0.6, 2)
     elif target.kind == 'outer cube':
         towards = -np.ones(3) + rng.uniform(-0.5, 0.5, 3)
         towards /= np.linalg.norm(towards)
-        centre = half * np.exp(rng.uniform(np.log(2.0), np.log(4.0))) * towards
+        center = half * np.exp(rng.uniform(np.log(2.0), np.log(4.0))) * towards
         aim = Rotation.align_vectors([-towards], [[0, 0, 1]])[0]
         off = 0.5 * lens.theta_max * rng.normal(0, 0.6, 2).clip(-1, 1)
     else:
-        centre = rng.uniform(-0.25, 0.25, 3)
+        center = rng.uniform(-0.25, 0.25, 3)
         aim = Rotation.identity() if calm < 1 else Rotation.random(random_state=rng)
         off = rng.uniform(-1, 1, 2)
     roll = Rotation.from_rotvec([0, 0, calm * rng.uniform(-np.pi, np.pi)])
-    return centre, aim * Rotation.from_rotvec([*off, 0]) * roll
+    return center, aim * Rotation.from_rotvec([*off, 0]) * roll
 
 
 def draw_track(
@@ -192,15 +192,15 @@ def draw_track(
         _view(rng, target, lens, 0.15 if moving else 1.0)
         for _ in range(frames if not moving else frames // 5 + 3)
     ]
-    centres = np.array([centre for centre, _ in views])
+    centers = np.array([center for center, _ in views])
     turns = Rotation.concatenate([turn for _, turn in views])
     if not moving:
         times = np.cumsum(rng.uniform(2, 6, frames))
-        return Track(times, centres, turns, moving)
+        return Track(times, centers, turns, moving)
     knots = np.arange(len(views)) * rng.uniform(0.8, 1.6)
     times = np.linspace(0.3 * knots[1], knots[-1] - 0.3 * knots[1], frames)
     return Track(
-        times, CubicSpline(knots, centres)(times), RotationSpline(knots, turns)(times), moving
+        times, CubicSpline(knots, centers)(times), RotationSpline(knots, turns)(times), moving
     )
 
 
@@ -235,7 +235,7 @@ def draw_scene(
     index = np.indices((wanted, cameras, count)).reshape(3, -1)
     scene = Scene(lens, fitted, noise, target, track, rig, np.zeros(wanted, bool), *index)
     local = in_camera(scene, target.points[index[2]], np.zeros(index.shape[1]))
-    sight = target.points[index[2]] - track.centres[index[0]]
+    sight = target.points[index[2]] - track.centers[index[0]]
     cosine = np.einsum('ij,ij->i', sight, target.axes[index[2], 2])
     facing = cosine / np.linalg.norm(sight, axis=1) if kind != 'world' else np.ones(len(local))
     return _keep_seen(rng, scene, visible(lens, local, facing))
@@ -253,7 +253,7 @@ def _keep_seen(rng: np.random.Generator, scene: Scene, seen: NDArray[np.bool_]) 
     if count < 16 or not 900 <= seen.sum() <= 4500:
         return None
     new, track = np.cumsum(good) - 1, scene.track
-    kept = Track(track.times[good], track.centres[good], track.turns[good], track.moving)
+    kept = Track(track.times[good], track.centers[good], track.turns[good], track.moving)
     held = np.arange(count) % 4 == rng.integers(4)
     return Scene(
         scene.lens,

@@ -101,7 +101,7 @@ class _TableFit:
         tables, _ = self._tables(x)
         return tables, float((self._whitened(tables) ** 2).sum())
 
-    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+    def linearize(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         x = state[0][0]
         try:
             tables, localized = self._tables(x)
@@ -147,7 +147,7 @@ class _TableFit:
     def _cell_columns(
         self, x: Array, tables: Array, localized: list[list[LocalizedSpread]]
     ) -> Array:
-        """Differentiate the whitened misfits (90, 76), each solve starting from its neighbour."""
+        """Differentiate the whitened misfits (90, 76), each solve starting from its neighbor."""
         moved = x[: 2 * _COUNT] + _STEP * np.eye(2 * _COUNT)
         moved_directions = _directions(moved.reshape(-1, _COUNT, 2))
         directions = _directions(x[: 2 * _COUNT].reshape(1, _COUNT, 2))

@@ -310,7 +310,7 @@ def _gather(
         np.where((slot >= 0)[..., None, None], columns.offset[at], 0.0),
         slot,
         fixed,
-        (where - board.centre) @ board.axes.T / MILLIMETRE,
+        (where - board.center) @ board.axes.T / MILLIMETRE,
         np.array(partner),
         np.array([np.eye(3), *(turn.matrix for turn in turns)]),
     )

@@ -190,9 +190,9 @@ def _read_splined(model: str, values: Sequence[float], size: Sequence[int], wher
         raise LensError(
             f'{where}: {model} with {len(values)} values; it needs {4 + 2 * rows * columns}'
         )
-    focal, centre = np.array(values[:2]), np.array(values[2:4])
+    focal, center = np.array(values[:2]), np.array(values[2:4])
     pitch = focal * _spacing(columns, degrees)
-    low = centre - pitch * (np.array([columns, rows]) - 1) / 2
+    low = center - pitch * (np.array([columns, rows]) - 1) / 2
     field = ImageField(low, pitch, focal * np.reshape(values[4:], (rows, columns, 2)))
     # The spline holds between the second node and the last but one.
     steps = (np.arange(1.0, count - 1.75, 0.25) for count in (columns, rows))
@@ -202,7 +202,7 @@ def _read_splined(model: str, values: Sequence[float], size: Sequence[int], wher
     )
     if not shown.any():
         raise LensError(f'{where}: {model}: no point of it is in the image')
-    reach = np.linalg.norm((ideal[shown] - centre) / focal, axis=-1).max()
+    reach = np.linalg.norm((ideal[shown] - center) / focal, axis=-1).max()
     theta = float(Stereographic().angle(np.asarray(reach)))
     fx, fy, cx, cy = values[:4]
     lens = Lens(
@@ -250,10 +250,10 @@ def _fit_nodes(lens: Lens, columns: int) -> tuple[str, ImageField, float]:
         )
     spacing = _spacing(columns, degrees)
     rows = int(np.ceil(2 * edge[1] / spacing)) + _MARGIN_NODES
-    focal, centre = np.array([lens.fx, lens.fy]), np.array([lens.cx, lens.cy])
-    low = centre - focal * spacing * (np.array([columns, rows]) - 1) / 2
+    focal, center = np.array([lens.fx, lens.fy]), np.array([lens.cx, lens.cy])
+    low = center - focal * spacing * (np.array([columns, rows]) - 1) / 2
     empty = ImageField(low, focal * spacing, np.zeros((rows, columns, 2)))
-    ideal = focal * plane + centre
+    ideal = focal * plane + center
     weight, node = empty.weights(ideal)
     design: Any = sparse.csr_array(
         (weight.ravel(), (np.repeat(np.arange(len(uv)), weight.shape[1]), node.ravel())),

@@ -90,7 +90,7 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     return uv if lens.image_field is None else lens.image_field.apply(uv), valid
 
 
-def linearise_views(
+def linearize_views(
     lens: Lens, rotation: Array, position: Array, points: Array, limited: bool
 ) -> tuple[Array, Mask, Array]:
     """Return image points (S, N, 2) of points (S, N, 3) in the world, validity, derivatives.
@@ -99,7 +99,7 @@ def linearise_views(
     by the small changes of `pose.Pose.retract`, px/m and px/rad.
     """
     engine = _running() if lens.port is None else port_projection
-    uv, valid, d_pose = engine.linearise_views(lens, rotation, position, points, limited)
+    uv, valid, d_pose = engine.linearize_views(lens, rotation, position, points, limited)
     if lens.image_field is not None:
         d_pose, uv = lens.image_field.carry(uv, d_pose), lens.image_field.apply(uv)
     return uv, valid, d_pose

@@ -32,7 +32,7 @@ POSE, NORMAL = (4, 3), (13, 6)
 
 @njit(**OPTIONS)
 def workspace(views):
-    """Return what `minimise` works in: two states and equations each, a step, and some room."""
+    """Return what `minimize` works in: two states and equations each, a step, and some room."""
     rows = views + 1
     return (
         np.empty((2, rows, *POSE)),
@@ -185,7 +185,7 @@ def _squared_image_step(normal, cameras, step):
 
 
 @njit(**BARE)
-def minimise(w, left, right, cameras, work, limit):
+def minimize(w, left, right, cameras, work, limit):
     """Move the first state to the minimum; return cost, iterations, how it ended, and where.
 
     limit: of the iterations.  How: 1: converged; 0: not; -1: given up for the reference, wherever

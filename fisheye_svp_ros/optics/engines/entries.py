@@ -8,7 +8,7 @@ import numpy as np
 from numba import config, njit, types
 
 from fisheye_svp_ros.optics.engines import cache
-from fisheye_svp_ros.optics.engines.adjustment import copy, minimise, normal_of, pose_of, workspace
+from fisheye_svp_ros.optics.engines.adjustment import copy, minimize, normal_of, pose_of, workspace
 from fisheye_svp_ros.optics.engines.kernels import (
     BACKWARD_ANGLE,
     BARE,
@@ -154,7 +154,7 @@ def project(points, lens, edge, uv, state):
 
 
 @_entry(types.void, _arg(3), _arg(2), _arg(3), *_LENS, _dest(3), _dest(2), _dest(4))
-def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
+def linearize_views(rotation, position, points, lens, edge, uv, state, d_pose):
     """Write image points (S, N, 2), states (S, N) and derivatives (S, 2, 6, N)."""
     w = np.empty(SCRATCH)
     for s in range(len(points)):
@@ -224,7 +224,7 @@ def localize(
             copy(rotation[s], pose[0])
             copy(position[s], pose[1])
             seen = (points[s : s + 1], uv[s : s + 1], weight[s : s + 1], lens)
-            cost[s], iterations[s], ended, at, known = minimise(w, seen, seen, 1, work, limit)
+            cost[s], iterations[s], ended, at, known = minimize(w, seen, seen, 1, work, limit)
             pose = pose_of(states[at, 0])
             copy(pose[0], rotation[s])
             copy(pose[1], position[s])
@@ -272,7 +272,7 @@ def adjust_rigs(
     for s in range(len(state)):
         mine = slice(s * views, (s + 1) * views)
         copy(state[s], work[0][0])
-        cost[s], iterations[s], ended, at, known = minimise(
+        cost[s], iterations[s], ended, at, known = minimize(
             w,
             (left_points[mine], left_uv[mine], left_weight[mine], left_lens),
             (points[mine], uv[mine], weight[mine], lens),

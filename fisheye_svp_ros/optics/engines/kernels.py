@@ -1,7 +1,7 @@
-"""The formulas compiled by Numba, in loops over flat scratch memory that vectorise.
+"""The formulas compiled by Numba, in loops over flat scratch memory that vectorize.
 
 A block of points is a set of rows of `B` numbers in one flat array: separate arrays would make the
-compiler check them for overlap, and calls of libm would end vectorisation.  So would an index that
+compiler check them for overlap, and calls of libm would end vectorization.  So would an index that
 might be negative: what starts at a variable place is a slice first.  A lens is one array, see
 `numba_engine.pack_lens`.
 """
@@ -23,7 +23,7 @@ from fisheye_svp_ros.optics.rays import (
     ZERO_CLEARANCE,
 )
 
-# Division must not raise for a loop to vectorise; sums may be reordered, NaN keep their meaning.
+# Division must not raise for a loop to vectorize; sums may be reordered, NaN keep their meaning.
 OPTIONS = {'error_model': 'numpy', 'fastmath': {'reassoc', 'contract', 'arcp'}}
 # What allocates nothing need not count who holds an array either, which would take a third of its
 # time.  Numba has its own runtime's switch under a private name.

@@ -51,20 +51,20 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     return uv, state > 0
 
 
-def linearise_views(
+def linearize_views(
     lens: Lens, rotation: Array, position: Array, points: Array, limited: bool
 ) -> tuple[Array, Mask, Array]:
-    """See `engines.linearise_views`."""
+    """See `engines.linearize_views`."""
     numbers = pack_lens(lens)
     if numbers is None:
-        return numpy_engine.linearise_views(lens, rotation, position, points, limited)
+        return numpy_engine.linearize_views(lens, rotation, position, points, limited)
     systems, count = points.shape[:2]
     rotation, position, points = _contiguous(rotation, position, points)
     uv, state = np.empty((systems, count, 2)), np.empty((systems, count))
     d_pose, limit = np.empty((systems, 2, 6, count)), edge(lens, limited)
 
     def run(part: slice) -> None:
-        entries.linearise_views(
+        entries.linearize_views(
             rotation[part],
             position[part],
             points[part],
@@ -80,7 +80,7 @@ def linearise_views(
     unsettled = _rays_to_repeat(state, numbers)
     if unsettled is not None:
         rows, _ = unsettled
-        again = numpy_engine.linearise_views(
+        again = numpy_engine.linearize_views(
             lens, rotation[rows], position[rows], points[unsettled][:, None], limited
         )
         uv[unsettled], state[unsettled], by_pose[unsettled] = (part[:, 0] for part in again)

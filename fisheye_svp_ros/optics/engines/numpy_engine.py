@@ -65,16 +65,16 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
         np.multiply(met.x, ratio, out=uv[0, part])
         np.multiply(met.y, ratio, out=uv[1, part])
         uv[:, part] *= _pair(lens.fx, lens.fy, 2)
-        _centre(lens, met.valid, uv[:, part])
+        _center(lens, met.valid, uv[:, part])
         valid[part] = met.valid
     return uv.T, valid
 
 
 @_quiet
-def linearise_views(
+def linearize_views(
     lens: Lens, rotation: Array, position: Array, points: Array, limited: bool
 ) -> tuple[Array, Mask, Array]:
-    """See `engines.linearise_views`."""
+    """See `engines.linearize_views`."""
     shape = points.shape[:2]
     uv, valid = np.empty((2, *shape)), np.empty(shape, dtype=bool)
     d_pose, sums = np.empty((12, *shape)), _sums(lens, rotation)
@@ -83,7 +83,7 @@ def linearise_views(
         met = _solved_incidence(lens, local, limited)
         out = (rows[:, *part].swapaxes(0, 1) for rows in (d_pose, uv))
         _add_up(sums[part[0]], met, met.height(lens.image_height), *out)
-        _centre(lens, met.valid, uv[:, *part])
+        _center(lens, met.valid, uv[:, *part])
         valid[part] = met.valid
     d_pose = d_pose.reshape(6, 2, *shape)
     return uv.transpose(1, 2, 0), valid, d_pose.transpose(2, 3, 1, 0)
@@ -101,7 +101,7 @@ def pose_equations(
     points, uv, weight = seen
     systems, count = weight.shape
     cost, gram = np.zeros(systems), np.zeros((systems, 6, 7))
-    sums, centre = _sums(lens, rotation), _pair(lens.cx, lens.cy, 3)
+    sums, center = _sums(lens, rotation), _pair(lens.cx, lens.cy, 3)
     for part in _tiles(systems, count):
         own, weights = part[0], weight[part]
         local = _to_cameras(rotation, position, points, part)
@@ -114,7 +114,7 @@ def pose_equations(
         rows = np.empty((len(weights), 14, weights.shape[1]))
         _add_up(sums[own], met, (height, slope), rows[:, :12], rows[:, 12:])
         off = rows[:, 12:].transpose(1, 0, 2)
-        off -= (uv[part].transpose(2, 0, 1) - centre) * weights
+        off -= (uv[part].transpose(2, 0, 1) - center) * weights
         if np.count_nonzero(met.valid) < met.valid.size:
             off[:, ~met.valid] = np.nan
         cost[own] += np.einsum('usn,usn->s', off, off)
@@ -171,7 +171,7 @@ def _to_cameras(
     return local
 
 
-def _centre(lens: Lens, valid: Mask, uv: Array) -> None:
+def _center(lens: Lens, valid: Mask, uv: Array) -> None:
     """Move image points (2, ...), px, from around the origin; NaN where there is none."""
     uv += _pair(lens.cx, lens.cy, uv.ndim)
     if np.count_nonzero(valid) < valid.size:

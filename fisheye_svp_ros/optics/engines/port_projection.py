@@ -93,10 +93,10 @@ def columns(lens: Lens, sight: Sight) -> tuple[Array, Array]:
     return (by_direction @ sight.d_shift[..., None])[..., 0], by_direction @ sight.d_port
 
 
-def linearise_views(
+def linearize_views(
     lens: Lens, rotation: Array, position: Array, points: Array, limited: bool
 ) -> tuple[Array, Mask, Array]:
-    """See `engines.linearise_views`."""
+    """See `engines.linearize_views`."""
     shape = points.shape[:2]
     arm = points - position[:, None]
     seen = sight(lens, (arm @ rotation).reshape(-1, 3))
@@ -110,7 +110,7 @@ def linearise_views(
 def _image(lens: Lens, sight: Sight, limited: bool) -> tuple[Array, Mask, Array]:
     """Return image points (M, 2), validity, and derivatives (M, 2, 3) by the direction."""
     still = np.eye(3)[None], np.zeros((1, 3))
-    uv, valid, d_pose = numpy_engine.linearise_views(
+    uv, valid, d_pose = numpy_engine.linearize_views(
         lens.svp(), *still, sight.direction[None], limited
     )
     valid = valid[0] & sight.valid
