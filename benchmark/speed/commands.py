@@ -23,11 +23,12 @@ from fisheye_svp_ros.optics.engines import VARIABLE
 
 ONE_CORE = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS')
 _SHARED = Path(__file__).parents[3] / 'shared' / 'data'
-_CORNERS = ('ov_plane', 'ov_cube')
+_CORNERS = {'ov_plane': 13.0, 'ov_cube': 10.0}  # and goals of their diagnosis, s
 _PHOTOGRAPHS = _SHARED / 'photos' / 'chessboard'
 _BOARD, _OTHER_BOARD = 'chessboard:6x4:30mm', 'chessboard:11x8:30mm'
 _COMMAND = (sys.executable, '-m', 'fisheye_svp_ros.cli')
 _THERE = b'fx '  # of the progress line, once the lens is fitted
+_PROVISIONAL = b'Provisional: '
 _IN_A_SCRIPT = """
 import sys
 import numpy as np
@@ -36,7 +37,8 @@ np.ones((500, 500)) @ np.ones((500, 500))  # BLAS starts its threads
 fsvp.calibrate(sys.argv[1], 'kannala_brandt', (1280, 800))
 """
 _TEXT = """Each once, with all cores, on the clock. A goal with × is a multiple of the row before.
-"Until the lens is printed": `calibrate` computes its errors and the report after that."""
+"Until the lens is printed": `calibrate` computes its errors and the report after that. "Until a
+provisional headline": of a part of the points, on a terminal."""
 
 
 class _Work(NamedTuple):
@@ -102,22 +104,28 @@ def _measured_corners(folder: Path, name: str) -> Iterator[_Work]:
         lambda: _seconds_until(line, folder, _THERE),
         1,
     )
-    yield _command(folder, line, f', {name}', 2)
+    yield _command(folder, line, f', {name}', 3)
     yield _Work(
         f'`fsvp.calibrate` with threads of BLAS, {name}',
         lambda: _seconds([sys.executable, '-c', _IN_A_SCRIPT, str(train)], folder),
         times=1.2,
     )
-    yield _command(
-        folder,
-        f'diagnose {train} --lens {name}.yaml --held-out {test} -o diagnosis',
-        f', {name}',
-        10,
+    answer = f'diagnose {train} --lens {name}.yaml --held-out {test} -o diagnosis'
+    yield _command(folder, answer, f', {name}', _CORNERS[name])
+    yield _command(folder, f'{answer} --quick', f', {name}', 4)
+    yield _Work(
+        f'{_shown(answer)}, {name}, until a provisional headline',
+        lambda: _seconds_until(answer, folder, _PROVISIONAL),
+        4,
     )
 
 
 def _simulated_corners(folder: Path) -> Iterator[_Work]:
-    """Yield diagnoses of more points, and of a rig."""
+    """Yield the calibration of few points, and diagnoses of many and of a rig."""
+    table, _ = on_board(17, 64, 1)
+    write_observations(folder / 'few.csv', table)
+    line = 'calibrate few.csv -o few.yaml --model kannala_brandt --image-size 1536x1536'
+    yield _command(folder, line, ', 1 088 points', 1.5)
     for what, frames, landmarks, cameras, goal in (
         ('20 000 points', 20, 1024, 1, 30.0),
         ('2 cameras of 29 views', 29, 64, 2, 10.0),
