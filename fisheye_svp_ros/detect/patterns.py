@@ -16,7 +16,7 @@ from fisheye_svp_ros.detect.tag_grids import GridReading, TagLayout
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import read_yaml
 
-_UNITS = {'mm': 1e-3, 'cm': 1e-2, 'm': 1.0}
+LENGTH_UNITS = {'mm': 1e-3, 'cm': 1e-2, 'm': 1.0}
 _LENGTH = re.compile(r'([0-9.]+(?:e-?[0-9]+)?) *(mm|cm|m)', re.IGNORECASE)
 _SIZE = re.compile(r'([0-9]{1,9})x([0-9]{1,9})', re.IGNORECASE)
 _MAX_POINTS = 10_000  # points
@@ -312,7 +312,7 @@ def _numbers(
 def _length(spec: str, word: str) -> float:
     match = _LENGTH.fullmatch(word)
     try:
-        value = float(match[1]) * _UNITS[match[2].lower()] if match else 0.0
+        value = float(match[1]) * LENGTH_UNITS[match[2].lower()] if match else 0.0
     except ValueError:
         value = 0.0
     if not 0 < value < _MAX_SPACING:

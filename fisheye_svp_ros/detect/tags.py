@@ -11,7 +11,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.finders import Grey, detect_markers, need_markers
-from fisheye_svp_ros.detect.patterns import LOOSE_TAGS, Pattern
+from fisheye_svp_ros.detect.patterns import LENGTH_UNITS, LOOSE_TAGS, Pattern
 from fisheye_svp_ros.detect.photographs import Photograph, Pixels
 from fisheye_svp_ros.detect.points import Points, eight_bit
 from fisheye_svp_ros.detect.tag_edges import fit_quads
@@ -24,7 +24,6 @@ from fisheye_svp_ros.scene.observations import Landmarks
 _ORDER = [1, 0, 3, 2]
 _MIN_SIDE = 12.0  # px; the corners of a smaller tag run into its code
 _SPEC = re.compile(r'tags:(?:36h11:)?([0-9.]+) *(mm|cm|m)', re.IGNORECASE)
-_UNITS = {'mm': 1e-3, 'cm': 1e-2, 'm': 1.0}
 
 
 class TagViews(NamedTuple):
@@ -41,7 +40,7 @@ def tag_size(spec: str) -> float:
     """Return the side of loose tags, m, from `tags:36h11:160mm`; raise ParameterError."""
     need_markers(spec)
     match = _SPEC.fullmatch(spec)
-    size = float(match[1]) * _UNITS[match[2].lower()] if match else 0.0
+    size = float(match[1]) * LENGTH_UNITS[match[2].lower()] if match else 0.0
     if not 0 < size < 10:
         raise ParameterError(
             f'board {spec!r}: loose tags are given as tags:36h11:160mm (side of the black square)'

@@ -14,7 +14,7 @@ Other rooms import what stands here, and nothing else.
 """
 
 from fisheye_svp_ros.diagnosis.adequacy import Adequacy
-from fisheye_svp_ros.diagnosis.causes import CONFOUNDED_P, Cause
+from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.two_cameras import Transfer, TwoCameras, deviations
 from fisheye_svp_ros.diagnosis.checks.two_datasets import Travel, TwoDatasets, predict_board
 from fisheye_svp_ros.diagnosis.conclusion import (
@@ -45,7 +45,7 @@ from fisheye_svp_ros.diagnosis.decision import (
     TargetReason,
 )
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
-from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
+from fisheye_svp_ros.diagnosis.effect_tests import CONFOUNDED_P, SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import MAX_RMS_RATIO
 from fisheye_svp_ros.diagnosis.findings import (
     CONFIRMED_PROBABILITY,

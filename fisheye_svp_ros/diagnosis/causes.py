@@ -12,7 +12,12 @@ from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index, flat_rows
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
-from fisheye_svp_ros.diagnosis.effect_tests import RARITY_ODDS, SIGNIFICANCE, EffectTests
+from fisheye_svp_ros.diagnosis.effect_tests import (
+    CONFOUNDED_P,
+    RARITY_ODDS,
+    SIGNIFICANCE,
+    EffectTests,
+)
 from fisheye_svp_ros.diagnosis.findings import Status, probability_of, status_of
 from fisheye_svp_ros.diagnosis.random_effects import SAG
 from fisheye_svp_ros.diagnosis.sagging import SagOdds, bend_over_sag
@@ -26,8 +31,6 @@ from fisheye_svp_ros.scene.observations import Observations, photograph_entry
 from fisheye_svp_ros.solve.outliers import Outliers
 from fisheye_svp_ros.solve.port_fit import MEDIUM_INDEX, THICKNESS
 
-# An effect is confounded with another unless, with it in the model, the other is still needed.
-CONFOUNDED_P = 0.002
 _CONFOUNDED_SHARE = 0.3  # of the statistic, that the other explains by itself
 _PORT_UNITS = {
     MEDIUM_INDEX: '',

@@ -34,6 +34,7 @@ from fisheye_svp_ros.mixed_model import (
 
 # False alarms: this much for all effects together, the same again for the random components.
 SIGNIFICANCE = 0.01
+CONFOUNDED_P = 0.002  # of an effect beside another: above, the two are not told apart
 _DOUBTFUL_P, _CERTAIN_STATISTIC = 0.01, 200.0  # between them more is asked
 _TURN_SIZES = (0.5, 2.0, 8.0, 32.0, 128.0, 512.0)  # variance over noise of a coefficient
 # Standard errors by which held-out frames must be predicted better to take an effect in, and to

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
+from fisheye_svp_ros.diagnosis.effect_tests import CONFOUNDED_P, EffectTests
 from fisheye_svp_ros.diagnosis.null_model import NullModel, border_of
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, SAG
 from fisheye_svp_ros.mixed_model import (
@@ -24,7 +24,6 @@ from fisheye_svp_ros.mixed_model import (
 )
 
 _SIZES = (3e-5, 1e-4, 3e-4, 1e-3, 3e-3)  # m: standard deviations of a coefficient of a bend
-_CONFOUNDED_P = 0.002  # of a bend beside a sag: below it, both are told apart
 
 
 class SagOdds(NamedTuple):
@@ -60,7 +59,7 @@ def bend_over_sag(tests: EffectTests, columns: Index) -> SagOdds | None:
 
     alone, sag = gain(bend), gain(whole)
     both = gain(bend, centered)
-    confounded = bool(special.chdtrc(1, max(both - sag, 0.0)) > _CONFOUNDED_P)
+    confounded = bool(special.chdtrc(1, max(both - sag, 0.0)) > CONFOUNDED_P)
     if not (confounded or null.variances.alive[NAMES.index(SAG)]):
         return None
     both -= tests.parameter_cost + tests.prior_log_odds

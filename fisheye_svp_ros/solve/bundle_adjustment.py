@@ -19,6 +19,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, log_derivative
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.least_squares import (
+    UNDETERMINED_EIGENVALUE,
     Arrays,
     ArrowEquations,
     Minimum,
@@ -30,7 +31,6 @@ from fisheye_svp_ros.solve.least_squares import (
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, is_shared
 
 MAX_LENS_ITERATIONS = 200
-_UNDETERMINED_EIGENVALUE = 1e-13  # of the information, relative; rounding leaves about 1e-15
 _STEP_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.0)
 # Of the sum of squares in a Gauss-Newton step: random effects may take up as much, and more where
 # the columns say so and predictions move as they say, but for this share of the squares.
@@ -383,7 +383,7 @@ def _check_determined(normal: Arrays, names: Sequence[str]) -> None:
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     relative = arrow_information(normal)[0] / (scale[:, None] * scale)
     values, vectors = np.linalg.eigh(relative - np.diag(diagonal == 0))
-    if len(names) and values[0] < _UNDETERMINED_EIGENVALUE:
+    if len(names) and values[0] < UNDETERMINED_EIGENVALUE:
         name = names[int(np.argmax(np.abs(vectors[:, 0])))]
         raise GeometryError(
             f'{name} is confounded with the poses in these views; fix it, or add views in which '

@@ -27,6 +27,7 @@ from fisheye_svp_ros.optics.engines.marquardt import (
 
 Arrays = tuple[Array, ...]
 
+UNDETERMINED_EIGENVALUE = 1e-13  # of the information, relative; rounding leaves about 1e-15
 _RIDGE = 2e-14  # beyond rounding, and less than what counts as determined
 _FLOOR = 1e-15  # keeps an exactly singular system solvable; far below any data's weight
 # Of the cost: what a step promises where derivatives that are not exact end

@@ -15,6 +15,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.initial_pose import candidate_poses, initial_poses
 from fisheye_svp_ros.solve.least_squares import (
+    UNDETERMINED_EIGENVALUE,
     Arrays,
     dense_step,
     levenberg_marquardt,
@@ -26,7 +27,6 @@ MIN_POINTS, FEW_POINTS = 4, 6
 _STARTING_STEPS = 4  # from rough poses to ones that a joint solution can begin with
 _MOTIONS = 3  # times that velocities and poses follow from each other
 _MIN_SEPARATION = 0.01  # squared Mahalanobis distance of two minima
-_UNDETERMINED_EIGENVALUE = 1e-13  # of the information, relative; rounding leaves about 1e-15
 
 
 def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Localization:
@@ -251,7 +251,7 @@ def _covariance(hessian: Array) -> tuple[Array, Mask]:
     # The trace of the inverse is the reciprocal of the smallest eigenvalue, up to a factor of 6.
     spread = np.trace(inverse, axis1=-2, axis2=-1)
     outer = scale[..., :, None] * scale[..., None, :]
-    return inverse / outer, (spread > 0) & (spread < 1 / _UNDETERMINED_EIGENVALUE)
+    return inverse / outer, (spread > 0) & (spread < 1 / UNDETERMINED_EIGENVALUE)
 
 
 class _Localization:
