@@ -21,7 +21,7 @@ from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.model_critic import ModelCritic
 from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
-from fisheye_svp_ros.nodes.transforms import Transforms
+from fisheye_svp_ros.nodes.transforms import TransformPublisher
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 
@@ -123,7 +123,7 @@ class TransformMessage:
 @pytest.mark.parametrize(('static', 'sent'), [(True, [0.0, 0.1, 0.0]), (False, [0.0] * 2)])
 def test_a_static_transform_is_sent_when_it_changes(static: bool, sent: list[float]) -> None:
     told: list[Any] = []
-    transforms = Transforms.__new__(Transforms)
+    transforms = TransformPublisher.__new__(TransformPublisher)
     transforms._node, transforms._static = None, static
     transforms._sent, transforms._children = [], set()  # type: ignore[assignment]
     transforms._kind = TransformMessage
