@@ -118,6 +118,7 @@ class ModelCritic(SolverNode):
         self._judged = False
         self._running: _Running | None = None
         self._verdict: Diagnosis | None = None
+        self._refusal = ''
         for name, answer in (
             ('~/write_extended_lens', self._write_extended_lens),
             ('~/save', self._write_extended_lens),
@@ -197,12 +198,13 @@ class ModelCritic(SolverNode):
 
     def _restart(self) -> None:
         self._question += 1
-        self._judged, self._verdict = False, None
+        self._judged, self._verdict, self._refusal = False, None, ''
 
     def _tick(self) -> None:
         if self._running is not None:
             if self._running.future.done():
                 done, self._running = self._running, None
+                self._tell_progress(done.stamp)
                 if done.question == self._question:
                     self._finish(done)
             return
@@ -213,6 +215,7 @@ class ModelCritic(SolverNode):
             free = self.settings.free_intrinsics or lens.calibration is not None
             work = in_background(lambda: judge(table, lens, free))
             self._running = _Running(work, self._latest[0], self._question)
+            self._tell_progress(self._latest[0])
 
     def _table(self) -> Observations:
         window = list(self._frames.values())[-self.settings.max_frames :]
@@ -224,6 +227,7 @@ class ModelCritic(SolverNode):
         try:
             diagnosis = done.future.result()
         except FisheyeSvpError as error:
+            self._refusal = f'not diagnosed: {error}'
             self._complain(error, 'not diagnosed: ')
             self.publish_result(done.stamp, {}, str(error))
             return
@@ -289,15 +293,18 @@ class ModelCritic(SolverNode):
         path = Path(self.settings.output).absolute()
         try:
             if self._verdict is None:
-                raise ObservationError(
-                    f'no diagnosis yet: {len(self._frames)} of {self.settings.min_frames} frames'
-                )
+                raise ObservationError(self._refusal or self._what_is_missing())
             save_lens(self._verdict.lens, path, refusal_reason(self._verdict))
         except FisheyeSvpError as error:
             response.success, response.message = False, str(error)
         else:
             response.success, response.message = True, str(path)
         return response
+
+    def _what_is_missing(self) -> str:
+        frames, least = len(self._frames), self.settings.min_frames
+        missing = f'no diagnosis yet: {frames} of {least} frames'
+        return missing if frames < least else f'{missing}; it is under way, ask again'
 
 
 def judge(table: Observations, lens: Lens, free_intrinsics: bool) -> Diagnosis:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,16 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.graph import LATCHED, Graph
+from helpers.nodes import TIMEOUT
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 from sensor_msgs.msg import PointCloud2  # isort: skip
 from std_srvs.srv import Trigger  # isort: skip
 
-from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.rig_files import load_rig
-from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes import messages, model_critic
 from fisheye_svp_ros.nodes.model_critic import ModelCritic
 from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
 from fisheye_svp_ros.nodes.transforms import TransformPublisher
@@ -110,7 +112,37 @@ def test_a_critic_forgets_its_frames(graph: Callable[..., Graph], tmp_path: Path
     assert asked.progress[-1].status[0].message == '18 more views are needed'
     assert 'no diagnosis yet: 2 of 20 frames' in asked.ask('save').message
     assert asked.ask('reset').message == '2 frames forgotten'
-    assert 'no diagnosis yet: 0 of 20 frames' in asked.ask('save').message
+    assert asked.ask('save').message == 'no diagnosis yet: 0 of 20 frames'
+
+
+def test_a_critic_tells_that_a_diagnosis_is_under_way_and_why_there_is_none(
+    graph: Callable[..., Graph], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = threading.Event()
+
+    def judge(*_: Any) -> Any:
+        assert ended.wait(TIMEOUT)
+        raise ObservationError('not enough of them')
+
+    monkeypatch.setattr(model_critic, 'judge', judge)
+    g = graph('lens:=fish214', 'svp:=true', 'min_frames:=5', f'output:={tmp_path}/lens.yaml')
+    asked = Asked(g, ModelCritic, ('',))
+
+    def diagnosing() -> str:
+        return read_key_values(asked.progress[-1])['diagnosing'] if asked.progress else ''
+
+    for frame in range(5):
+        asked.tell(frame)
+    g.until(lambda: diagnosing() == 'True')
+    assert asked.ask('save').message == (
+        'no diagnosis yet: 5 of 5 frames; it is under way, ask again'
+    )
+    ended.set()
+    g.until(lambda: diagnosing() == 'False')
+    answer = asked.ask('save')
+    assert not answer.success and answer.message == 'not diagnosed: not enough of them'
+    asked.ask('reset')
+    assert asked.ask('save').message == 'no diagnosis yet: 0 of 5 frames'
 
 
 class TransformMessage:
