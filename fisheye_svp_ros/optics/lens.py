@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.curve_base import ImageHeight, ViewpointShift
 from fisheye_svp_ros.optics.image_field import ImageField
@@ -164,6 +164,12 @@ def parameter_values(lens: Lens, names: Sequence[str]) -> list[float]:
 def intrinsic_names(lens: Lens) -> tuple[str, ...]:
     """Return the intrinsics that a calibration frees: the four, and the height's coefficients."""
     return (*INTRINSICS, *lens.image_height.coefficient_names)
+
+
+def inside_image(lens: Lens, uv: Array) -> Mask:
+    """Say which image points (..., 2), px, lie in the image, to the edges of its outer pixels."""
+    size = np.array([lens.width, lens.height])
+    return np.asarray(np.all((uv >= -0.5) & (uv <= size - 0.5), axis=-1))
 
 
 def curve_limit(lens: Lens) -> float:

@@ -10,6 +10,7 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.effects.base import noise_scale
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.optics.lens import inside_image
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import (
     STEREO,
@@ -123,9 +124,7 @@ def add_noise(
         raise ParameterError(f'noise is {sigma} px; 0 or more is needed')
     ideal, scale = seen
     uv = ideal + sigma * scale * rng.standard_normal(ideal.shape)
-    size = np.array([model.lens.width, model.lens.height])
-    inside = np.all((uv >= -0.5) & (uv <= size - 0.5), axis=-1, keepdims=True)
-    uv = np.where(inside, uv, np.nan)
+    uv = np.where(inside_image(model.lens, uv)[..., None], uv, np.nan)
     for effect, values in model.noise_terms:
         uv = effect.record_points(uv, values, rng)
     return uv

@@ -10,7 +10,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
-from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.lens import Lens, inside_image
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
 from fisheye_svp_ros.scene.table_checks import remove_copies
@@ -168,8 +168,7 @@ def posable_observations(
 
 
 def _check_inside(observations: Observations, lens: Lens) -> None:
-    outside = (observations.uv < 0) | (observations.uv > (lens.width, lens.height))
-    if outside.any(axis=1).mean() > _OUTSIDE_SHARE:
+    if np.mean(~inside_image(lens, observations.uv)) > _OUTSIDE_SHARE:
         raise ObservationError(
             f'{observations.source}: image points lie outside the {lens.width}x{lens.height} px '
             f'of lens {lens.name!r}; check that it is the lens of this camera'

@@ -73,6 +73,19 @@ def test_what_cannot_be_posed_and_what_is_there_twice_is_left_out_by_one_step():
     assert usable.observations.frames.tolist() == [0, 1, 2, 3, 7]
 
 
+@pytest.mark.parametrize(
+    ('within', 'beyond'), [(-0.4, -0.6), (LENS.width - 0.6, LENS.width - 0.4)]
+)
+def test_an_image_ends_at_the_edges_of_its_outer_pixels(within, beyond):
+    rows = table()
+    uv = rows.uv.copy()
+    uv[::30, 0] = within
+    assert len(usable_observations(replace(rows, uv=uv), LENS).observations) == len(rows)
+    uv[::30, 0] = beyond
+    with pytest.raises(ObservationError, match='image points lie outside the'):
+        usable_observations(replace(rows, uv=uv), LENS)
+
+
 def test_a_state_without_an_image_of_some_points_is_refused():
     data = group_by_frame(table())
     state = initial_state(data, LENS)
