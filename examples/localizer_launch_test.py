@@ -1,6 +1,6 @@
 """A launch test: a localizer poses what a synthetic camera shows it, to a millimeter.
 
-    launch_test $(ros2 pkg prefix --share fisheye_svp_ros)/examples/localizer_launch_test.py
+    launch_test localizer_launch_test.py
 
 Copy it, put your camera and lens in its place, and `add_launch_test` (CMake) or pytest with
 launch_pytest runs it with the other tests of your package.

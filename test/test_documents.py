@@ -15,12 +15,14 @@ from helpers.nodes import ROOT
 import fisheye_svp_ros as fsvp
 from fisheye_svp_ros.cli import COMMANDS
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
+from fisheye_svp_ros.study.settings import SyntheticCameraSettings
 from fisheye_svp_ros.study.solutions import (
     LOCALIZATION_METRICS,
     STEREO_CALIBRATION_METRICS,
     STEREO_DEPTH_METRICS,
 )
 
+EXAMPLES = sorted((ROOT / 'examples').glob('*.py'))
 PAGES = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').rglob('*.md')])
 _CODE = re.compile(r'^```.*?^```|`[^`\n]*`', re.DOTALL | re.MULTILINE)
 _LINK = re.compile(r'\[[^\]]*\]\(([^)\s]+)\)')
@@ -94,6 +96,33 @@ def test_the_page_of_the_nodes_names_every_metric() -> None:
     for name in (*LOCALIZATION_METRICS, *STEREO_CALIBRATION_METRICS, *STEREO_DEPTH_METRICS):
         if not name.endswith(('_y_m', '_z_m')):
             assert f'`{name}`' in page, name
+
+
+def test_documented_paths_below_share_are_installed() -> None:
+    """The launch test was called where no installation has it."""
+    texts = [path.read_text(encoding='utf-8') for path in (*PAGES, *EXAMPLES)]
+    paths = set(re.findall(r'--share fisheye_svp_ros\)/([\w./]+)', '\n'.join(texts)))
+    assert paths
+    for path in paths:
+        assert path.startswith(('config/', 'launch/')) and (ROOT / path).is_file(), path
+
+
+def test_documented_lenses_of_nodes_are_files_folders_or_names() -> None:
+    """A folder without its slash is refused; the managed localizer sees the default camera."""
+    names = {path.stem for path in (ROOT / 'config' / 'lenses').iterdir()}
+    for page in PAGES:
+        for lens in re.findall(r'-p lens:=(\S+)', page.read_text(encoding='utf-8')):
+            assert lens in names or lens.endswith(('/', '.yaml', '$lens')), (page, lens)
+    page = (ROOT / 'docs' / 'reference' / 'nodes.md').read_text(encoding='utf-8')
+    assert f'-p lifecycle:=true -p lens:={SyntheticCameraSettings().lens}\n' in page
+
+
+def test_the_readme_echoes_a_topic_that_may_not_be_there_yet() -> None:
+    """Without its type, `ros2 topic echo` ends where the nodes before it are only starting."""
+    text = (ROOT / 'README.md').read_text(encoding='utf-8')
+    assert re.findall(r'^ros2 topic echo (/\S+) +(\S+)', text, re.MULTILINE) == [
+        ('/localizer/metrics/position_error_m', 'std_msgs/msg/Float64')
+    ]
 
 
 def test_a_diagnosis_is_what_its_schema_says() -> None:
