@@ -434,7 +434,7 @@ class Evaluation:
             }
             | dict(noise_causes)
         )
-        parts = variance_budget(null, self._squares, p_values, self.offsets.views)
+        parts = variance_budget(null, self.fitted, self._squares, p_values, self.offsets.views)
         return parts if self.medium is None else self.medium.budget(parts)
 
     @cached_property

@@ -26,7 +26,7 @@ from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.mixed_model import (
     component_p_values,
-    component_traces,
+    component_squares,
     eliminate,
     factor_equations,
     no_variances,
@@ -114,27 +114,28 @@ def _px2(null: NullModel) -> float:
 
 def variance_budget(
     null: NullModel,
+    fitted: FittedModel,
     squares: Mapping[str, float],
     p_values: Mapping[str, float],
     repeated: SimilarViews | None = None,
 ) -> list[Component]:
     """Return all parts: what is named, random components, noise.
 
-    squares: of the effects that were found (`cause_squares`); p_values: of effects and of the
-    random components that are there, by name; repeated: what of the noise comes again in similar
-    views.
+    fitted: of the null model; squares: of the effects that were found (`cause_squares`); p_values:
+    of effects and of the random components that are there, by name; repeated: what of the noise
+    comes again in similar views.
     """
     px2, variances = _px2(null), null.variances
-    traces = component_traces(null.full, variances)
+    added = component_squares(null.full, fitted.factored, variances)
     parts: list[tuple[str, str, float, bool, float]] = []
     for stage in STAGES[:3]:
         there = [name for name in squares if CATALOGUE[name].budget_stage() == stage]
         if there:
             size = sum(squares[name] for name in there)
             parts.append((f'named_{stage}', stage, size, True, min(p_values[n] for n in there)))
-    for name, tau, trace in zip(NAMES, variances.tau, traces, strict=True):
-        if trace > 0:
-            size = float(tau**2 * trace) * px2
+    for name, sum_of_squares in zip(NAMES, added.tolist(), strict=True):
+        if sum_of_squares > 0:
+            size = variances.sigma**2 * sum_of_squares * px2
             parts.append((name, STAGE_OF[name], size, False, p_values.get(name, 1.0)))
     noise = variances.sigma**2 * null.freedom * px2
     if repeated is not None:

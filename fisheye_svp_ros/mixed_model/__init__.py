@@ -44,7 +44,7 @@ from fisheye_svp_ros.mixed_model.reml import (
 from fisheye_svp_ros.mixed_model.score_tests import (
     IDENTIFIABLE,
     Score,
-    component_traces,
+    component_squares,
     eliminate,
     identifiable_basis,
     integrate_columns,
@@ -80,7 +80,7 @@ __all__ = [
     'Variances',
     'combine_offsets',
     'component_p_values',
-    'component_traces',
+    'component_squares',
     'eliminate',
     'estimate_variances',
     'factor_equations',

@@ -22,12 +22,12 @@ from fisheye_svp_ros.mixed_model.equations import (
     factor_equations,
     map_in_threads,
     no_variances,
-    prior_precisions,
     solve_lower,
 )
 from fisheye_svp_ros.mixed_model.model_columns import project_out
 from fisheye_svp_ros.mixed_model.solution import (
     Solution,
+    posterior_variances,
     solve_equations,
 )
 
@@ -187,24 +187,28 @@ def _least_p_value(ratio: float, count: int) -> float:
     return float(min(special.gammaincc(shape, shape * ratio) for shape in (0.5, count / 2)))
 
 
-def component_traces(eq: Equations, now: Variances) -> Array:
-    """Return what each component adds per unit of its variance (K,), groups' columns out.
+def component_squares(eq: Equations, f: FactoredEquations, now: Variances) -> Array:
+    """Return the sums of squares that components add, over the noise variance (K,).
 
-    Sums of squares of its columns once the fixed columns of groups are projected out, over the
-    factors on the precision of each unit's; 0 for what is not there.
+    Once the fixed columns of groups are projected out; 0 for what is not there.  By the variance
+    of a component; offsets of units, which have a scale each, by what their squares are expected
+    to be, given y.  eq: with all components; f: of those that are there, the border of full rank.
     """
     nothing = no_variances(eq.components.count, len(now.weight))
-    f = factor_equations(eq.select(nothing.alive), nothing.lam, now.weight)
-    traces = np.zeros(len(nothing.lam))
-    factor_e, factor_r = prior_precisions(eq, np.ones(len(nothing.lam)), now.weight)
+    bare = factor_equations(eq.select(nothing.alive), nothing.lam, now.weight)
+    solution, labels = solve_equations(f, posterior_variances(f)), f.equations.label
+    values = np.append(solution.e, solution.r)
+    spread = np.append(solution.spread_e, solution.spread_r)
+    squares = values**2 / solution.variance + spread
+    sums = np.zeros(len(nothing.lam))
     for kind in np.flatnonzero(now.alive):
         columns = _component_columns(eq, nothing.alive, int(kind))
-        if columns is not None:
-            in_e, in_r = eq.blocks.e_label == kind, eq.blocks.r_label == kind
-            factor = np.concatenate([factor_e[in_e], factor_r[in_r]])
-            diagonal = _remaining_information(f, columns, False).diagonal
-            traces[kind] = (diagonal / factor.reshape(diagonal.shape)).sum()
-    return traces
+        if columns is None:
+            continue
+        own = _remaining_information(bare, columns, False).diagonal.ravel()
+        of_units = eq.components.of_units[kind]
+        sums[kind] = own @ squares[labels == kind] if of_units else own.sum() / now.lam[kind]
+    return sums
 
 
 class _ComponentColumns(NamedTuple):

@@ -7,11 +7,12 @@ import pytest
 from scipy import sparse
 
 from fisheye_svp_ros.mixed_model import (
+    LAMBDA_ABSENT,
     Components,
     RandomColumns,
     Variances,
     component_p_values,
-    component_traces,
+    component_squares,
     estimate_variances,
     factor_equations,
     initial_variances,
@@ -176,18 +177,40 @@ def with_offsets(columns, unit):
 
 
 @pytest.mark.parametrize('by_group', [True, False])
-def test_units_add_to_the_variance_by_their_own_scales(case, by_group):
-    (_, columns, border), _, _, _, _, _ = case
+def test_what_units_add_is_what_their_offsets_are_expected_to(case, by_group):
+    """By dense algebra: mean and covariance of the offsets given y."""
+    (_, columns, border), _, now, _, _, _ = case
     points = np.arange(GROUPS * ROWS // 2).reshape(GROUPS, -1)
     crossed = with_offsets(columns, points % (ROWS // 2) if by_group else points)
-    fixed = np.ones((GROUPS, ROWS, 1))
-    eq = make_equations(crossed, fixed, border)
+    intercepts = np.ones((GROUPS, ROWS, 1))
+    border = border[..., 1:]
+    eq = make_equations(crossed, intercepts, border)
     assert eq.by_group == by_group
     weight = np.random.default_rng(1).uniform(0.1, 2.0, len(crossed.unit_label))
-    traces = component_traces(eq, Variances(1.0, np.ones(3), weight))
-    z = crossed.unit_columns.toarray().reshape(GROUPS, ROWS, -1)
-    z = z - z.mean(axis=1, keepdims=True)
-    np.testing.assert_allclose(traces[2], ((z**2).sum(axis=(0, 1)) / weight).sum(), rtol=1e-6)
+    lam = np.array([np.inf, now.lam[1], 2.0])
+    known = Variances(1.0, np.minimum(lam, LAMBDA_ABSENT), weight)
+    f = factor_equations(eq.select(known.alive), known.lam, weight)
+    added = component_squares(eq, f, known)
+
+    def flat(blocks):
+        own = np.zeros((GROUPS, ROWS, GROUPS, blocks.shape[-1]))
+        own[range(GROUPS), :, range(GROUPS)] = blocks
+        return own.reshape(GROUPS * ROWS, -1)
+
+    z = crossed.unit_columns.toarray()
+    slopes = flat(columns.group[..., 1:])
+    fixed = np.concatenate([flat(intercepts), border[..., :-1].reshape(len(z), -1)], axis=1)
+    y = border[..., -1].ravel()
+    v = np.eye(len(z)) + slopes @ slopes.T / lam[1] + z @ np.diag(1 / (2 * weight)) @ z.T
+    inverse = np.linalg.inv(v)
+    p = inverse - inverse @ fixed @ np.linalg.inv(fixed.T @ inverse @ fixed) @ fixed.T @ inverse
+    prior = np.diag(1 / (2 * weight))
+    offset, covariance = prior @ z.T @ p @ y, prior - prior @ z.T @ p @ z @ prior
+    variance = y @ p @ y / (len(y) - fixed.shape[1])
+    left = z - (z.reshape(GROUPS, ROWS, -1).mean(axis=1)).repeat(ROWS, axis=0)
+    expected = (left**2).sum(axis=0) @ (offset**2 / variance + np.diag(covariance))
+    np.testing.assert_allclose(added[2], expected, rtol=1e-6)
+    assert added[0] == 0
 
 
 def test_units_that_are_exact_leave_all_as_it_is(case):
