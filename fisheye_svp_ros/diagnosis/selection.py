@@ -125,7 +125,7 @@ def select_causes(problem: Problem, progress: Progress) -> Selection:
         most = _MAX_EFFECTS if turn else _most_causes(null)
         search = _change_effects(problem, before, null, most)
         if not turn:
-            problem.inputs.provisional(_found(problem, search))
+            problem.inputs.provisional(_names_found(problem, search))
         if search.state is before.state:
             search = _revise(problem, search, null)
         changed = search.state is not before.state
@@ -150,7 +150,7 @@ def first_causes(problem: Problem) -> tuple[str, ...]:
     search = _begin(problem)
     null = search.estimate_null_model(problem)
     search = replace(search, variances=null.variances)
-    return _found(problem, _change_effects(problem, search, null, _most_causes(null)))
+    return _names_found(problem, _change_effects(problem, search, null, _most_causes(null)))
 
 
 def _begin(problem: Problem) -> _Search:
@@ -158,7 +158,7 @@ def _begin(problem: Problem) -> _Search:
     return _Search(problem.data, _include_effects(problem), None, None, False, (), refits)
 
 
-def _found(problem: Problem, search: _Search) -> tuple[str, ...]:
+def _names_found(problem: Problem, search: _Search) -> tuple[str, ...]:
     """Return the names of what was found, without what the lens came with."""
     terms = search.state.terms
     return tuple(term.name for term in terms if term.effect not in problem.given_effects)

@@ -143,13 +143,13 @@ def _begin_first_look(inputs: Inputs, provisional: Provisional) -> Provisional:
             if not told.is_set():
                 provisional(names)
 
-    def tell(names: tuple[str, ...]) -> None:
+    def tell_of_round(names: tuple[str, ...]) -> None:
         told.set()
         provisional(names)
 
     if step > 1:
         Thread(target=look, daemon=True).start()
-    return tell
+    return tell_of_round
 
 
 def diagnose_against(
