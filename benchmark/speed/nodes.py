@@ -26,7 +26,7 @@ _RUN = [sys.executable, '-m', 'benchmark.speed.round_trip']
 _START_GOAL = 1.0  # s from the first import to a node that is ready
 _FIRST_START_GOAL = 2.0  # s, the same where Numba has compiled nothing yet
 _STARTS = 9
-_WITH_FILES = ('measured_camera', 'rectifier')  # which cannot start without any
+_WITH_FILES = ('measured_camera', 'rectifier', 'rig_localizer')  # which cannot start without any
 _START_TEXT = f"""From the start of Python to a node that is ready, its lens loaded, modules
 compiled: medians of {_STARTS} starts, wall clock and processor time. The last line: what Numba
 compiles is not there yet, and is made in the background."""
