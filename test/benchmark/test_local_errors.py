@@ -10,7 +10,7 @@ def test_a_shift_is_found_beside_local_errors():
     assert abs(found['found_mm'] - 7.0) < 4 * found['stderr_mm'] < 6.0
     page = report([found])
     assert '| 7 | 0 | 1 | 1 |' in page
-    assert '--trials 1\n' in page
+    assert '--trials 1`' in page
 
 
 def test_a_set_is_what_it_says():
