@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.detect.finders import Grey
 
-_EDGE_SAMPLES = (
-    2 * np.linspace(0.1, 0.9, 24) - 1
-)  # from corner to corner, -1 to 1; corners are rounded
+# From corner to corner, -1 to 1; corners are rounded
+_EDGE_SAMPLES = 2 * np.linspace(0.1, 0.9, 24) - 1
 _STRIP_SAMPLES = np.linspace(-1, 1, 17)  # half widths of the strip
 _STEPS = (_STRIP_SAMPLES[1:] + _STRIP_SAMPLES[:-1]) / 2
 _STRIP_SHARE, _MIN_STRIP, _MAX_STRIP = 0.125, 1.2, 4.0  # of a side (a cell of a tag); px
