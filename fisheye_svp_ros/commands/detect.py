@@ -29,6 +29,7 @@ from fisheye_svp_ros.io.readers import (
     write_observations,
 )
 from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.table_checks import looks_side_by_side
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.detect.detection import Detection
@@ -344,8 +345,6 @@ def _note_tags(detection: Detection, pattern: Pattern) -> None:
 
 def note_side_by_side(table: Observations, sizes: Sizes) -> None:
     """Say where the frames of a camera look like those of two, whose images are joined."""
-    from fisheye_svp_ros.detect.side_by_side import looks_side_by_side
-
     for number, camera in enumerate(table.cameras):
         size = sizes.get(camera) or sizes.get('')
         if size and looks_side_by_side(table.take(table.camera == number), size):

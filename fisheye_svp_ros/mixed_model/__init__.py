@@ -9,6 +9,7 @@ covariance, leave-one-group-out predictions.  It knows no camera, board, lens or
     solution       estimates and predictions, their covariance, groups left out one by one
     reml           variances by restricted maximum likelihood, which the data call for, p-values
     score_tests    Rao's score tests of added fixed columns and of variances at zero
+    threads        work on all cores
 """
 
 from fisheye_svp_ros.mixed_model.equations import (
@@ -18,9 +19,7 @@ from fisheye_svp_ros.mixed_model.equations import (
     Variances,
     factor_equations,
     make_equations,
-    map_in_threads,
     no_variances,
-    run_in_threads,
     solve_lower,
 )
 from fisheye_svp_ros.mixed_model.model_columns import (
@@ -65,6 +64,7 @@ from fisheye_svp_ros.mixed_model.solution import (
     solve_equations,
     unit_covariances,
 )
+from fisheye_svp_ros.mixed_model.threads import map_in_threads, run_in_threads
 
 __all__ = [
     'IDENTIFIABLE',

@@ -11,12 +11,9 @@ Biometrics 31 (1975); Searle, Casella, McCulloch, Variance Components (1992), ch
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy import linalg
@@ -29,31 +26,13 @@ from fisheye_svp_ros.mixed_model.model_columns import (
     arrange_blocks,
     multiply_columns,
 )
+from fisheye_svp_ros.mixed_model.threads import map_in_threads
 
 FIXED, ABSENT = -1, -2  # labels: without a prior; not there
 _RIDGE = 1e-10  # of normalized fixed columns of a group: some may be zero
 _ABSENT_PRECISION = 1e12
 _ROUNDING_RIDGE = 1e-5  # of a column's own information, where rounding makes the whole indefinite
-_WORTH_THREADS = 5e7  # products of numbers: fewer take less time than threads to start
-_T = TypeVar('_T')
-_R = TypeVar('_R')
 LAMBDA_ABSENT = 1e12  # lambda of a component without variance
-
-
-def map_in_threads(function: Callable[[_T], _R], items: Iterable[_T], products: float) -> list[_R]:
-    """Return what a function makes of items, on all cores where that is worth it.
-
-    products: of numbers, in all; NumPy lets go of the interpreter for them.
-    """
-    if products < _WORTH_THREADS:
-        return list(map(function, items))
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(function, items))
-
-
-def run_in_threads(*parts: Callable[[], Any]) -> list[Any]:
-    """Return what parts return that do not need each other, each long enough for a thread."""
-    return map_in_threads(lambda part: part(), parts, np.inf)
 
 
 def solve_lower(root: Array, right: Array, trans: Literal[0, 1] = 0) -> Array:
@@ -305,7 +284,7 @@ def make_equations(random: RandomColumns, group_fixed: Array, border: Array) -> 
         random.shared_label,
         by_group,
     )
-    rows = int((np.abs(group_fixed).sum(axis=-1) + np.abs(border).sum(axis=-1) > 0).sum())
+    rows = int((group_fixed.any(axis=-1) | border.any(axis=-1)).sum())
     return Equations(
         blocks,
         random.components,

@@ -18,6 +18,7 @@ import numpy as np
 from scipy import sparse
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.mixed_model.threads import run_in_threads
 
 
 @dataclass(frozen=True)
@@ -135,13 +136,37 @@ def multiply_columns(random: RandomColumns, group_fixed: Array, border: Array) -
     shared, fields, offsets = random.shared, random.fields.T, random.unit_columns
     own = np.concatenate([group_fixed, random.group], axis=-1)
     across, flat = np.swapaxes(own, -1, -2), border.reshape(groups * height, border.shape[-1])
-    uu, ux = _square_offsets(random), offsets.T @ flat
-    ug = _multiply_groups(offsets, own)
-    us = np.concatenate([(offsets.T @ shared).toarray(), _multiply_units(uu, random)], axis=1)
-    # A field is a combination of units, and so are its products.
-    fs, fx, fg = fields @ us, fields @ ux, fields @ ug.reshape(len(ug), groups * own.shape[-1])
-    ss = np.block([[(shared.T @ shared).toarray(), fs[:, : shared.shape[1]].T], [fs]])
-    sg = np.concatenate([_multiply_groups(shared, own), fg.reshape(len(fg), *ug.shape[1:])])
+    uu, count = _square_offsets(random), shared.shape[1]
+
+    def with_groups() -> tuple[Array, Array]:
+        """Return the products of offsets, and of fields, with what belongs to groups."""
+        ug = _multiply_groups(offsets, own)
+        # A field is a combination of units, and so are its products.
+        fg = fields @ ug.reshape(len(ug), groups * own.shape[-1])
+        return ug, fg.reshape(len(fg), *ug.shape[1:])
+
+    def with_shared() -> tuple[Array, Array]:
+        products = (offsets.T @ shared).toarray(), _multiply_units(uu, random)
+        us = np.concatenate(products, axis=1)
+        return us, fields @ us
+
+    def with_border() -> tuple[Array, Array]:
+        ux = offsets.T @ flat
+        return ux, fields @ ux
+
+    # The longest first.
+    sx, (ug, fg), ss, xx, (us, fs), gx, sg, (ux, fx) = run_in_threads(
+        lambda: shared.T @ flat,
+        with_groups,
+        lambda: (shared.T @ shared).toarray(),
+        lambda: flat.T @ flat,
+        with_shared,
+        lambda: across @ border,
+        lambda: _multiply_groups(shared, own),
+        with_border,
+        products=shared.nnz * flat.shape[1],
+    )
+    ss = np.block([[ss, fs[:, :count].T], [fs]])
     present = random.unit_label >= 0
     for part in (us, ux, ug):
         part[~present.ravel()] = 0.0
@@ -152,12 +177,12 @@ def multiply_columns(random: RandomColumns, group_fixed: Array, border: Array) -
         uu,
         of_units[0],
         ss,
-        sg,
+        np.concatenate([sg, fg]),
         of_units[1],
-        across @ border,
+        gx,
         of_units[2],
-        np.concatenate([shared.T @ flat, fx]),
-        flat.T @ flat,
+        np.concatenate([sx, fx]),
+        xx,
     )
 
 

@@ -25,7 +25,6 @@ from fisheye_svp_ros.mixed_model.equations import (
     FactoredEquations,
     Variances,
     factor_equations,
-    map_in_threads,
     no_variances,
 )
 from fisheye_svp_ros.mixed_model.score_tests import score_components
@@ -38,6 +37,7 @@ from fisheye_svp_ros.mixed_model.solution import (
     solution_without,
     solve_equations,
 )
+from fisheye_svp_ros.mixed_model.threads import map_in_threads
 
 T_FREEDOM = 3.0  # of the t distribution of units' offsets
 _MAX_STEPS = 25

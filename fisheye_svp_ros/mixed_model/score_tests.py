@@ -20,7 +20,6 @@ from fisheye_svp_ros.mixed_model.equations import (
     FactoredEquations,
     Variances,
     factor_equations,
-    map_in_threads,
     no_variances,
     solve_lower,
 )
@@ -30,6 +29,7 @@ from fisheye_svp_ros.mixed_model.solution import (
     posterior_variances,
     solve_equations,
 )
+from fisheye_svp_ros.mixed_model.threads import map_in_threads
 
 IDENTIFIABLE = 1e-8  # of a normalized column's square: what is left less cannot be told apart
 
@@ -151,7 +151,9 @@ def score_components(
     gamma distribution of the same mean and variance.  Source: Lin, Variance component testing in
     generalised linear models with random effects, Biometrika 84 (1997).
     """
-    p_values, kinds = np.full(eq.components.count, np.nan), list(kinds)
+    p_values = np.full(eq.components.count, np.nan)
+    # The largest first: one of many coefficients takes longer than all others.
+    kinds = sorted(kinds, key=lambda kind: -np.count_nonzero(eq.label == kind))
     if not kinds:
         return p_values
     f = factor_equations(eq.select(now.alive), now.lam, now.weight)

@@ -10,6 +10,7 @@ Source: Cook and Weisberg, Residuals and Influence in Regression (1982), for blo
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -20,11 +21,11 @@ from fisheye_svp_ros.mixed_model.equations import (
     Equations,
     FactoredEquations,
     log_determinant,
-    map_in_threads,
     solve_lower,
     solve_upper,
 )
 from fisheye_svp_ros.mixed_model.model_columns import RandomColumns, combine_offsets, group_basis
+from fisheye_svp_ros.mixed_model.threads import map_in_threads, run_in_threads
 
 _COLUMNS = 128  # of a triangle at a time: few of its zeros are multiplied
 
@@ -85,9 +86,11 @@ def posterior_variances(f: FactoredEquations) -> tuple[Array, Array]:
         """Return the squares of flat inverse', summed over a part of the columns."""
         return _row_squares(flat[:, : part.stop] @ inverse[part, : part.stop].T)
 
-    parts = [slice(at, min(at + _COLUMNS, rest)) for at in range(0, rest, _COLUMNS)]
-    sums = map_in_threads(sum_squares, parts[::-1], flat.size * rest)  # the largest first
-    by_block, by_rest, _ = _roots_of_fixed(f)
+    starts = range(0, rest, _COLUMNS)[::-1]  # the largest first
+    parts = [partial(sum_squares, slice(at, min(at + _COLUMNS, rest))) for at in starts]
+    (by_block, by_rest, _), *sums = run_in_threads(
+        partial(_roots_of_fixed, f), *parts, products=f.products
+    )
     e = _row_squares(by_block) + sum(sums, np.zeros(count * width))
     own = np.einsum('ekj,ekj->ej', f.inverse, f.inverse)
     return own + e.reshape(count, width), _row_squares(inverse.T) + _row_squares(by_rest)

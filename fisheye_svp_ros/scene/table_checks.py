@@ -17,6 +17,9 @@ _MIN_SIGMA, _MIN_SIGMA_SHARE = 1e-6, 1e-3  # px, and of the median
 SIGMA_BOUND = f'{_MIN_SIGMA:g} px or more, and {_MIN_SIGMA_SHARE:g} of the median or more'
 _COPIED_SHARE = 0.5  # of the image points: no two photographs have so many alike
 _PLACE_TOLERANCE = 1e-3  # of a target's extent: more than places that are written less exactly
+MIN_ASPECT = 1.9  # width over height: of two square images 2, of one sensor 1.78 at most
+_MIN_VIEWS = 3  # on either side of the middle
+_CHANCE = 0.05  # of frames of one camera to stay away from the middle so far
 _MANY_POINTS, _MIN_POINTS = 1500, 24  # of a thinned table, and of a view that stays whole
 
 
@@ -160,3 +163,23 @@ def quantization_step(uv: Array) -> float:
     step = float(gaps[gaps > 1e-9].min(initial=np.inf))
     offsets = (values - values[0]) / step
     return step if np.abs(offsets - np.round(offsets)).max() < 0.02 else 0.0
+
+
+def looks_side_by_side(table: Observations, size: tuple[int, int]) -> bool:
+    """Whether no frame of one camera lies across the middle of wide images, or near it."""
+    width, height = size
+    if width < MIN_ASPECT * height or not len(table):
+        return False
+    views = [table.uv[table.frame == frame, 0] for frame in table.frames]
+    low, high = (np.array([end(view) for view in views]) for end in (np.min, np.max))
+    middle = (width - 1) / 2
+    left, right = high < middle, low > middle
+    if (left ^ right).all() and min(left.sum(), right.sum()) >= _MIN_VIEWS:
+        return _chance((low + high) / 2 / width, left) < _CHANCE
+    return False
+
+
+def _chance(center: Array, left: Mask) -> float:
+    """Return how often places (F,), spread evenly over 0 to 1, leave such a gap at a half."""
+    gap, others = center[~left].min() - center[left].max(), len(center) - 1
+    return float((1 - gap) ** others * (1 + others * gap))

@@ -18,9 +18,9 @@ from fisheye_svp_ros.detect.rig_photographs import (
     split_names,
     stamp_of,
 )
-from fisheye_svp_ros.detect.side_by_side import looks_side_by_side
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.scene.observations import make_observations
+from fisheye_svp_ros.scene.table_checks import looks_side_by_side
 
 
 def film(path: Path, views: list[int]) -> None:

@@ -169,7 +169,7 @@ def test_without_a_component_is_what_the_equations_say_that_never_had_it(frames,
 @pytest.mark.parametrize('worth', [0.0, np.inf])
 @pytest.mark.parametrize('frames', [4, 24])
 def test_variances_are_those_of_the_whole_covariance(frames, worth, monkeypatch):
-    monkeypatch.setattr('fisheye_svp_ros.mixed_model.equations._WORTH_THREADS', worth)
+    monkeypatch.setattr('fisheye_svp_ros.mixed_model.threads._WORTH_THREADS', worth)
     linear = linearized(frames=frames, offsets=2e-3)
     border = np.concatenate(
         [linear.effect_columns(CATALOGUE['skew']()), linear.residual[..., None]], axis=-1
