@@ -206,6 +206,20 @@ class Evaluation:
         self, without: Sequence[str] = (), offsets: PredictedOffsets | None = None
     ) -> HeldOut:
         """Predict held-out frames without some causes, with or without random effects."""
+        if offsets is not None:
+            return self._predict(without, offsets)
+        # Confirmation, the causes' gains and the figures ask for the same ones.
+        named = frozenset(without)
+        if named not in self._predictions:
+            self._predictions[named] = self._predict(without)
+        return self._predictions[named]
+
+    @cached_property
+    def _predictions(self) -> dict[frozenset[str], HeldOut]:
+        """What was predicted without random effects, by the causes that were left out."""
+        return {}
+
+    def _predict(self, without: Sequence[str], offsets: PredictedOffsets | None = None) -> HeldOut:
         test, selection = self.held_out, self.selection
         if test is None:
             return cross_validate(self.null, without, offsets).take(self.counted_frames)
@@ -227,7 +241,7 @@ class Evaluation:
         with_causes, without = cross_validate(self.null), cross_validate(self.null, self.names)
         return with_causes.is_predictable | without.is_predictable
 
-    @cached_property
+    @property
     def _base_prediction(self) -> HeldOut:
         return self.predict(self.names)
 
@@ -267,7 +281,7 @@ class Evaluation:
     def _extended_prediction(self) -> HeldOut:
         return self.predict(offsets=self.offsets)
 
-    @cached_property
+    @property
     def _lens_prediction(self) -> HeldOut:
         return self.predict(self._not_of_lens)
 
