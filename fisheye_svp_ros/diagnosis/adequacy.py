@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
+import scipy
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.causes import Cause
@@ -256,7 +256,7 @@ def _clusters(values: Array) -> list[Index]:
     for count in range(2, _MAX_GROUPS + 1):
         if len(values) < count * MIN_GROUP:
             break
-        middles, label = kmeans2(values, count, minit='++', seed=0, iter=30)
+        middles, label = scipy.cluster.vq.kmeans2(values, count, minit='++', seed=0, iter=30)
         within = float(((values - middles[label]) ** 2).sum())
         groups = [np.flatnonzero(label == cluster) for cluster in range(count)]
         if within < _MAX_SPREAD * total and min(map(len, groups)) >= MIN_GROUP:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
+import scipy
 from scipy import sparse
-from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.base import Effect, Scene, Untestable
@@ -248,8 +248,8 @@ def hexagons(low: Array, high: Array, pitch: float) -> Array:
 def bump_values(at: Array, mine: Mask, centers: Array, pitch: float) -> sparse.csr_array:
     """Return Gaussian bumps (n, K) at places (..., 2), zero out of reach and not of `mine`."""
     sd = _BUMP_WIDTH * pitch
-    near = cKDTree(at[mine]).sparse_distance_matrix(
-        cKDTree(centers), _BUMP_REACH * sd, output_type='ndarray'
+    near = scipy.spatial.cKDTree(at[mine]).sparse_distance_matrix(
+        scipy.spatial.cKDTree(centers), _BUMP_REACH * sd, output_type='ndarray'
     )
     row = np.flatnonzero(mine)[near['i']]
     values = np.exp(-((near['v'] / sd) ** 2) / 2)

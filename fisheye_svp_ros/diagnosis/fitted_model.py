@@ -11,8 +11,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from scipy.sparse.linalg import eigsh
-from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.effect_forms import bump_values
@@ -205,7 +205,7 @@ class FittedModel:
         frame = np.nonzero(used)[0]
         at = uv[used]
         reach = float(np.ptp(at, axis=0).max()) / _PAIR_REACH
-        pairs = cKDTree(at).query_pairs(reach, output_type='ndarray')
+        pairs = scipy.spatial.cKDTree(at).query_pairs(reach, output_type='ndarray')
         pairs = pairs[frame[pairs[:, 0]] != frame[pairs[:, 1]]]
         apart = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
         return pairs[np.argsort(apart, kind='stable')], frame

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.cluster import hierarchy
+import scipy
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.effect_forms import (
@@ -440,9 +440,9 @@ def cluster_frames(linear: Linearization) -> Index:
     middle = pose.into_body(np.broadcast_to(points.mean(axis=0), (len(frames), 1, 3)))[:, 0]
     away = np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-300)
     turn = pose.rotation.reshape(-1, 9) / np.sqrt(2)  # so far apart as the angle, if small
-    tree = hierarchy.linkage(
-        np.concatenate([middle / away, np.log(away), turn], axis=1), 'complete'
-    )
+    places = np.concatenate([middle / away, np.log(away), turn], axis=1)
+    hierarchy = scipy.cluster.hierarchy
+    tree = hierarchy.linkage(places, 'complete')
     cluster = hierarchy.fcluster(tree, _SIMILAR_POSE, 'distance').astype(np.int64) - 1
     return frames if cluster.max() + 1 < _MIN_CLUSTERS else cluster
 

@@ -15,7 +15,8 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize, special
+import scipy
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
@@ -169,7 +170,7 @@ class _Process:
         start = min(np.log(starts), key=loss)
         around = [(x - np.log(_SEARCH_RANGE), x + np.log(_SEARCH_RANGE)) for x in start]
         return _unpack_parameters(
-            optimize.minimize(
+            scipy.optimize.minimize(
                 loss,
                 start,
                 method='L-BFGS-B',

@@ -9,7 +9,8 @@ from collections.abc import Container, Iterator, Sequence
 from itertools import chain, takewhile
 
 import numpy as np
-from scipy import optimize, special
+import scipy
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.effect_tests import (
@@ -292,6 +293,10 @@ def _test_against_bulk(
     def excess(log_scale: float) -> float:
         return float(np.median(statistic(np.exp(log_scale))[mine] / typical) - 1)
 
-    low, high = excess(0.0), excess(7.0)
-    scale = 0.0 if low <= 0 else 7.0 if high >= 0 else optimize.brentq(excess, 0.0, 7.0, xtol=0.05)
+    if excess(0.0) <= 0:
+        scale = 0.0
+    elif excess(7.0) >= 0:
+        scale = 7.0
+    else:
+        scale = scipy.optimize.brentq(excess, 0.0, 7.0, xtol=0.05)
     return statistic(np.exp(scale)), rank, offset

@@ -14,7 +14,8 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize, special
+import scipy
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
@@ -325,7 +326,7 @@ def _fit_growth(e2: Array, z: Array) -> tuple[float, float]:
         # The mean of log sigma does not change: only the scale is profiled out.
         return float(len(z) * np.log(np.mean(e2 * np.exp(-2 * growth * z))))
 
-    best = optimize.minimize_scalar(deviance, bounds=(-3.0, 3.0), method='bounded')
+    best = scipy.optimize.minimize_scalar(deviance, bounds=(-3.0, 3.0), method='bounded')
     return float(best.x), deviance(0.0) - float(best.fun)
 
 

@@ -187,6 +187,23 @@ def test_hardly_anything_is_loaded_before_signals_end_a_node_quietly() -> None:
     ]
 
 
+def test_a_node_that_diagnoses_starts_without_what_only_a_diagnosis_needs() -> None:
+    """A quarter of a second of imports that no start waits for."""
+    code = (
+        'import sys; import fisheye_svp_ros.nodes.model_critic; '
+        "print(*{'scipy.optimize', 'scipy.spatial', 'scipy.cluster', 'scipy.stats', 'matplotlib'} "
+        '& {*sys.modules})'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {'PYTHONPATH': str(ROOT)},
+    )
+    assert not done.stdout.split()
+
+
 @pytest.mark.parametrize(('given', 'taken'), [({}, '1'), ({'OMP_NUM_THREADS': '3'}, '3')])
 def test_a_node_computes_on_one_core_unless_told_otherwise(
     given: dict[str, str], taken: str
