@@ -366,10 +366,7 @@ def _write(
     from fisheye_svp_ros.reporting.diagnosis_report import write_report
     from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE, refusal_reason
 
-    folder, points = (
-        args.output,
-        point_residuals(diagnosis.evaluation.simulation, diagnosis.evaluation.cause_fit),
-    )
+    folder, points = args.output, point_residuals(diagnosis.evaluation)
     truth = {name: compared.to_dict() for name, compared in known.items()}
     document = {**diagnosis_document(diagnosis), 'known_truth': truth}
     if wanted:
@@ -383,7 +380,7 @@ def _write(
     _write_residuals(
         folder / 'residuals.csv', points, diagnosis.evaluation.fixed_model.data.observations
     )
-    write_report(diagnosis, points, known, _inputs(args, free), wanted)
+    write_report(diagnosis, known, _inputs(args, free), wanted)
 
 
 def _write_residuals(path: Path, points: PointResiduals, table: Observations) -> None:

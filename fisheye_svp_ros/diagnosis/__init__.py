@@ -46,7 +46,7 @@ from fisheye_svp_ros.diagnosis.decision import (
 )
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.effect_tests import CONFOUNDED_P, SIGNIFICANCE, EffectTests
-from fisheye_svp_ros.diagnosis.evaluation import MAX_RMS_RATIO
+from fisheye_svp_ros.diagnosis.evaluation import MAX_RMS_RATIO, Evaluation
 from fisheye_svp_ros.diagnosis.findings import (
     CONFIRMED_PROBABILITY,
     Finding,
@@ -87,6 +87,7 @@ __all__ = [
     'EffectBound',
     'EffectTests',
     'ErrorParts',
+    'Evaluation',
     'Figure',
     'FileFigure',
     'Finding',

@@ -19,7 +19,7 @@ from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.findings import MAX_SHIFT, Finding, Flaw, FlawKind, Reason
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, SAG
-from fisheye_svp_ros.diagnosis.variance_budget import REPEATED_COMPONENT, Component
+from fisheye_svp_ros.diagnosis.variance_budget import Component
 from fisheye_svp_ros.effects.recording_effects import FocalDriftEffect, SessionStepEffect
 from fisheye_svp_ros.scene.boards import is_flat
 from fisheye_svp_ros.scene.observations import frame_names
@@ -81,7 +81,7 @@ def judge_data(
     if evaluation.free and evaluation.medium is None:
         flaws += _coverage(evaluation)
         if not any(flaw.kind.is_misfit for flaw in flaws):
-            flaws += _unknown_rays(evaluation, _scatter(components), ray_errors)
+            flaws += _unknown_rays(evaluation, evaluation.scatter_px, ray_errors)
     flaws.sort(key=lambda flaw: flaw.kind.value)
     table = evaluation.problem.observations
     known = {frame for frame, _, _ in table.photographs}
@@ -116,7 +116,7 @@ def _misfits(
     evaluation: Evaluation, causes: Sequence[Cause], components: Sequence[Component]
 ) -> Iterator[Flaw]:
     """Yield what no lens explains: more than noise is left, and it differs between frames."""
-    scatter = _scatter(components)
+    scatter = evaluation.scatter_px
     frames = {
         part.name: part.sd_px / scatter
         for part in components
@@ -139,12 +139,6 @@ def _misfits(
         yield _changing_intrinsics(evaluation, *changes, total)
     elif is_no_fit(left, scatter):
         yield Flaw(FlawKind.NO_FIT, left, scatter)
-
-
-def _scatter(components: Sequence[Component]) -> float:
-    """Return the standard deviation of noise and what repeats in similar views, px."""
-    parts = [part.sd_px for part in components if part.name in ('noise', REPEATED_COMPONENT)]
-    return float(np.hypot.reduce(parts))
 
 
 def _camera_groups(evaluation: Evaluation, noise: float) -> tuple[tuple[int, ...], ...]:

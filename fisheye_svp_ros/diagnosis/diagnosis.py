@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras
@@ -20,7 +18,7 @@ from fisheye_svp_ros.diagnosis.evaluation import (
     Figures,
 )
 from fisheye_svp_ros.diagnosis.findings import Finding
-from fisheye_svp_ros.diagnosis.variance_budget import REPEATED_COMPONENT, Component, Structure
+from fisheye_svp_ros.diagnosis.variance_budget import Component, Structure
 from fisheye_svp_ros.effects.target_map import BoardMap, board_maps
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -137,11 +135,3 @@ class Diagnosis(Conclusion):
         state = self.evaluation.fixed_model.state
         terms = [term for term in state.terms if not names or term.name in names]
         return board_maps(self.evaluation.fixed_model.data.views, terms, state.lens)
-
-    @property
-    def scatter_px(self) -> float:
-        """Standard deviation of noise and what repeats in similar views, of one coordinate, px."""
-        parts = [
-            part.sd_px for part in self.components if part.name in ('noise', REPEATED_COMPONENT)
-        ]
-        return float(np.hypot.reduce(parts))

@@ -46,6 +46,7 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
     cause_squares,
     component_significance,
     noise_px,
+    scatter_px,
     variance_budget,
 )
 from fisheye_svp_ros.diagnosis.written_lens import AveragedModel, WrittenField
@@ -294,6 +295,11 @@ class Evaluation:
         """Variance of whitened noise: 1 where the table states sigma, else as it was estimated."""
         stated = np.isfinite(self.null.linear.data.observations.sigma).all()
         return 1.0 if stated else self.null.variances.sigma**2
+
+    @property
+    def scatter_px(self) -> float:
+        """Standard deviation of noise and what repeats in similar views, of one coordinate, px."""
+        return scatter_px(self.null)
 
     @property
     def simulation(self) -> Linearization:

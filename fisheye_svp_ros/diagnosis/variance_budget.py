@@ -138,7 +138,7 @@ def variance_budget(
         if sum_of_squares > 0:
             size = variances.sigma**2 * sum_of_squares * px2
             parts.append((name, STAGE_OF[name], size, False, p_values.get(name, 1.0)))
-    noise = variances.sigma**2 * null.freedom * px2
+    noise = 2 * scatter_px(null) ** 2
     if repeated is not None:
         size = repeated.share * noise
         parts.append((REPEATED_COMPONENT, 'frame', size, False, repeated.p_value))
@@ -182,6 +182,11 @@ def noise_px(null: NullModel) -> float:
     """Return the standard deviation of the noise of one coordinate, px."""
     weight = null.linear.weight[null.linear.weight > 0]
     return float(null.variances.sigma * np.sqrt(np.mean(1 / weight**2)))
+
+
+def scatter_px(null: NullModel) -> float:
+    """Return the standard deviation of what noise leaves of a fitted coordinate, px."""
+    return float(np.sqrt(null.variances.sigma**2 * null.freedom * _px2(null) / 2))
 
 
 class Structure(NamedTuple):

@@ -13,12 +13,11 @@ from matplotlib.patches import Rectangle
 from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis import Diagnosis
+from fisheye_svp_ros.diagnosis import Evaluation
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.plots import picture, round_number
 from fisheye_svp_ros.scene.observations import Observations, frame_name
 from fisheye_svp_ros.solve.measured_poses import rms_px
-from fisheye_svp_ros.solve.rig_state import Linearization
 
 BEFORE, AFTER, NOISE, INK = '#c2410c', '#1d4ed8', '#94a3b8', '#334155'
 _SIDES = (('before', BEFORE), ('after', AFTER))
@@ -53,8 +52,9 @@ class PointResiduals(NamedTuple):
     outlier: Mask
 
 
-def point_residuals(before: Linearization, after: Linearization) -> PointResiduals:
-    """Return the residuals of two states of the same data."""
+def point_residuals(evaluation: Evaluation) -> PointResiduals:
+    """Return the residuals of the simulation and of the causes, each as it was fitted."""
+    before, after = evaluation.simulation, evaluation.cause_fit
     views = after.data.views
     seen = views.landmark >= 0
     per_point = np.ones_like(seen, dtype=np.int64)
@@ -85,16 +85,15 @@ class PlotData(NamedTuple):
     table: Observations
 
     @classmethod
-    def from_diagnosis(cls, diagnosis: Diagnosis, points: PointResiduals) -> PlotData:
+    def from_evaluation(cls, evaluation: Evaluation) -> PlotData:
         """Leave out outliers: they have a table of their own."""
+        points = point_residuals(evaluation)
         both = np.concatenate([points.before, points.after], axis=1)
         kept = ~points.outlier & np.isfinite(both).all(axis=1)
         shown = PointResiduals._make(array[kept] for array in points)
-        state = diagnosis.evaluation.fixed_model.state
+        state = evaluation.fixed_model.state
         lenses = dict(zip(state.labels, state.lenses, strict=True))
-        return cls(
-            shown, lenses, diagnosis.scatter_px, diagnosis.evaluation.fixed_model.data.observations
-        )
+        return cls(shown, lenses, evaluation.scatter_px, evaluation.fixed_model.data.observations)
 
     def of_camera(self, camera: int) -> PointResiduals:
         """Return the points that were seen through one of the lenses."""

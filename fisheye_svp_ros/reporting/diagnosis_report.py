@@ -14,7 +14,7 @@ from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.planning.plan import NextViews
 from fisheye_svp_ros.reporting.blocks import data_uri, page
-from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, PointResiduals, residual_pictures
+from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
 from fisheye_svp_ros.reporting.shot_plots import draw_shots
 from fisheye_svp_ros.reporting.wording import shots
@@ -77,7 +77,6 @@ _ROWS = 24
 
 def write_report(
     diagnosis: Diagnosis,
-    points: PointResiduals,
     known: Mapping[str, Comparison],
     inputs: ReportInputs,
     wanted: NextViews | None = None,
@@ -87,7 +86,7 @@ def write_report(
     wanted: the photographs to take next, if they were asked for.
     Raises OutputError where one cannot be written.
     """
-    pictures = list(_draw(diagnosis, points, inputs.folder))
+    pictures = list(_draw(diagnosis, inputs.folder))
     pictures.append(inputs.folder / 'uncertainty.png')
     draw_uncertainty(pictures[-1], diagnosis)
     if wanted is not None:
@@ -141,10 +140,10 @@ def write_report(
     return [report, *pictures]
 
 
-def _draw(diagnosis: Diagnosis, points: PointResiduals, folder: Path) -> Iterator[Path]:
+def _draw(diagnosis: Diagnosis, folder: Path) -> Iterator[Path]:
     quick = diagnosis.evaluation.problem.options.quick
     remaining = {_PICTURE_OF.get(structure.variable) for structure in diagnosis.remaining}
-    for name, draw, arguments in residual_pictures(PlotData.from_diagnosis(diagnosis, points)):
+    for name, draw, arguments in residual_pictures(PlotData.from_evaluation(diagnosis.evaluation)):
         if not quick or name in _QUICK_PICTURES or name in remaining:
             draw(folder / f'{name}.png', *arguments)
             yield folder / f'{name}.png'

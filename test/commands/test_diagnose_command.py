@@ -40,7 +40,7 @@ from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting import diagnosis_plots, evidence_plots
-from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, point_residuals, residual_pictures
+from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
 from fisheye_svp_ros.reporting.wording.causes import cause_rows, intrinsic_rows
 from fisheye_svp_ros.reporting.wording.diagnosis import advice_text, verdict_sentences
 from fisheye_svp_ros.reporting.wording.first_screen import headline
@@ -627,8 +627,7 @@ def test_intrinsics_are_told_with_their_unit():
 def test_a_single_frame_is_drawn(tmp_path):
     table, _ = seen({})
     found = diagnose(table.take((table.frame == 0) & (table.landmark < 6)), LENS)
-    points = point_residuals(found.evaluation.simulation, found.evaluation.cause_fit)
-    for name, draw, arguments in residual_pictures(PlotData.from_diagnosis(found, points)):
+    for name, draw, arguments in residual_pictures(PlotData.from_evaluation(found.evaluation)):
         draw(tmp_path / f'{name}.png', *arguments)
     assert len(list(tmp_path.glob('*.png'))) == 7
 
@@ -656,8 +655,7 @@ def test_each_camera_of_a_rig_has_pictures_of_its_own_image(tmp_path, monkeypatc
         {'left': LENS, 'right': larger},
         options=DiagnosisOptions(quick=True),
     )
-    points = point_residuals(found.evaluation.simulation, found.evaluation.cause_fit)
-    shown = PlotData.from_diagnosis(found, points)
+    shown = PlotData.from_evaluation(found.evaluation)
     named = {name: (draw, arguments) for name, draw, arguments in residual_pictures(shown)}
     draw, arguments = named['field']
     draw(tmp_path / 'field.png', *arguments)

@@ -49,7 +49,7 @@ def test_what_repeats_is_found_predicted_and_told_of():
     assert part.sd_px == pytest.approx(0.1, rel=0.3)
     assert noise.sd_px == pytest.approx(NOISE, rel=0.3)
     assert found.noise_px == pytest.approx(NOISE, rel=0.3)
-    assert found.scatter_px == pytest.approx(np.hypot(part.sd_px, noise.sd_px))
+    assert found.evaluation.scatter_px == pytest.approx(np.hypot(part.sd_px, noise.sd_px))
     assert found.figures.extended.heldout_rms_px < 0.75 * found.figures.base.heldout_rms_px
     assert found.verdict == 'unexplained'
     assert Action.VARY_VIEWS in {advice.action for advice in found.advice}

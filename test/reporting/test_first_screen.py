@@ -29,7 +29,6 @@ from fisheye_svp_ros.diagnosis.adequacy import Adequacy, judge_data
 from fisheye_svp_ros.diagnosis.decision import EffectBound, Figure
 from fisheye_svp_ros.diagnosis.findings import MAX_SHIFT
 from fisheye_svp_ros.diagnosis.variance_budget import Structure
-from fisheye_svp_ros.reporting.diagnosis_plots import point_residuals
 from fisheye_svp_ros.reporting.diagnosis_report import write_report
 from fisheye_svp_ros.reporting.wording.adequacy import frame_list
 from fisheye_svp_ros.reporting.wording.causes import percent, size
@@ -511,7 +510,6 @@ def test_the_report_of_a_likely_shift_claims_no_causes(found: Diagnosis, tmp_pat
     likely = with_changes(_deciding(found, 'lens', say='use_extended'), causes=[], gross=gross)
     write_report(
         likely,
-        point_residuals(found.evaluation.simulation, found.evaluation.cause_fit),
         {},
         ReportInputs('obs.csv', ('l.yaml',), None, None, tmp_path, False),
     )
@@ -563,7 +561,6 @@ def test_evidence_tells_what_was_not_confirmed_in_the_end(
     table = with_changes(found, causes=[], trace=[step], candidates=[refuted])
     write_report(
         table,
-        point_residuals(found.evaluation.simulation, found.evaluation.cause_fit),
         {},
         ReportInputs('obs.csv', ('l.yaml',), None, None, tmp_path, False),
     )
