@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import shutil
-from collections.abc import Generator, Sequence
-from contextlib import closing
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.commands.executors import completed_tasks, dask, process_pool
@@ -26,7 +27,7 @@ from fisheye_svp_ros.io.files import (
 from fisheye_svp_ros.io.share import sweep_path
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.reporting.terminal import print_table, progress
-from fisheye_svp_ros.study.solutions import summarize
+from fisheye_svp_ros.study.summary import StoredMetric, Summary
 from fisheye_svp_ros.study.sweep import (
     Plan,
     column_types,
@@ -86,8 +87,7 @@ def run(args: argparse.Namespace) -> None:
         raise ParameterError(
             f'{path}: {len(plan.sweep)} scenarios ({lengths}); add --large to run them all'
         )
-    types = column_types(plan)
-    parts = TableParts(args.output / _PARTS, types)
+    parts = TableParts(args.output / _PARTS, column_types(plan))
     mine = fingerprint(plan)
     summary = args.output / _SUMMARY
     if (
@@ -105,9 +105,7 @@ def run(args: argparse.Namespace) -> None:
                 'compute them again with --resume'
             )
         with write_together():
-            names = [name for name, kind in types.items() if kind is float and '.' in name]
-            metrics = parts.join(args.output / 'sweep', names, part_check(plan))
-            _report(path, args.output, plan, mine, metrics)
+            _report(path, args.output, plan, mine, _join(args.output / 'sweep', plan, parts))
         note_formats()
     shutil.rmtree(parts.folder, ignore_errors=True)
 
@@ -176,9 +174,34 @@ def _written(
             yield numbers
 
 
-def _report(path: Path, folder: Path, plan: Plan, mine: str, metrics: DataFrame) -> None:
+def _join(path: Path, plan: Plan, parts: TableParts) -> dict[str, Summary]:
+    """Write the parts as one table; return the summary of each metric.
+
+    Raises OutputError where the disk is full, and as `TableParts.join` does.
+    """
+    names = [name for name, kind in column_types(plan).items() if kind is float and '.' in name]
+    try:
+        with ExitStack() as stack:
+            # Beside the parts, on a disk: the folder for temporary files may be memory.
+            files = [stack.enter_context(TemporaryFile(dir=parts.folder)) for _ in names]
+            metrics = {name: StoredMetric(file) for name, file in zip(names, files, strict=True)}
+
+            def take(part: DataFrame) -> None:
+                for name, metric in metrics.items():
+                    metric.add(part[name].to_numpy())
+
+            parts.join(path, part_check(plan), take)
+            return {name: metric.summarize() for name, metric in metrics.items()}
+    except OSError as cause:  # a file may tell only at its end
+        raise OutputError(
+            f'{parts.folder}: cannot be written ({cause.strerror or cause})'
+        ) from cause
+
+
+def _report(
+    path: Path, folder: Path, plan: Plan, mine: str, summaries: Mapping[str, Summary]
+) -> None:
     """Print and write what came out, metric by metric."""
-    summaries = {name: summarize(metrics[name].to_numpy()) for name in metrics}
     count = len(plan.sweep)
     print_table(
         f'{path}: {count_text(count, "scenario")}',

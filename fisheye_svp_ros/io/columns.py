@@ -109,25 +109,21 @@ class TableParts:
     def join(
         self,
         path: Path,
-        names: Sequence[str] = (),
         is_whole: Callable[[int, DataFrame], bool] = lambda *_: True,
-    ) -> DataFrame:
-        """Write all parts in order as `write_table` does; return the columns of some names.
+        take: Callable[[DataFrame], None] = lambda _: None,
+    ) -> None:
+        """Write all parts in order as `write_table` does; no more than one of them is held.
 
-        is_whole: asked of each part, by its number, whether it holds all its rows.  No more than
-        one part is held, and those columns.  Raises OutputError for a bad part.
+        is_whole: asked of each part, by its number, whether it holds all its rows; take: given
+        each part.  Raises OutputError for a bad part.
         """
-        from pandas import DataFrame, concat
-
-        kept = [DataFrame({name: np.empty(0) for name in names})]
         with _writing(path) as (text, write_parquet, _):
             for number in sorted(self.numbers()):
                 data = read_bytes(self._path(number), OutputError)
                 part = self._parse(number, data, is_whole)
                 text.write(data[data.index(b'\n') + 1 :] if text.tell() else data)
                 write_parquet(part)
-                kept.append(part[[*names]])
-        return concat(kept[1:] or kept, ignore_index=True)
+                take(part)
 
     def _parse(
         self, number: int, data: bytes, is_whole: Callable[[int, DataFrame], bool]

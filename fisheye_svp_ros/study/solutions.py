@@ -199,16 +199,6 @@ def measure_points(
     return SetSolutions(measured, metrics, np.asarray(both.any(axis=1)), _NO_PAIR)
 
 
-class Summary(NamedTuple):
-    """Of the finite ones among some values; NaN where there is none."""
-
-    solved: int
-    missing: int
-    median: float
-    mean: float
-    largest: float
-
-
 def localization_metrics(pose: Pose, residual: Array, true: Pose | None = None) -> Metrics:
     """Return the metrics of poses (S,) and of residuals (S, N, 2), px, NaN = no point.
 
@@ -286,13 +276,3 @@ def known_mean(values: Array) -> Array:
 def _nanmax(values: Array) -> Array:
     known = np.where(np.isfinite(values), values, np.nan)
     return np.asarray(np.fmax.reduce(known, axis=-1, initial=np.nan))
-
-
-def summarize(values: Array) -> Summary:
-    """Return the summary of values (N,), NaN = missing; the largest is that of the magnitudes."""
-    known = values[np.isfinite(values)]
-    missing = len(values) - len(known)
-    if not len(known):
-        return Summary(0, missing, np.nan, np.nan, np.nan)
-    largest = np.abs(known).max()
-    return Summary(len(known), missing, *map(float, (np.median(known), known.mean(), largest)))

@@ -23,14 +23,17 @@ from fisheye_svp_ros.commands.node_sweeps import read_sweep
 from fisheye_svp_ros.errors import OutputError, ParameterError
 from fisheye_svp_ros.io import columns as tables
 from fisheye_svp_ros.io.columns import plain_columns, read_table
+from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.parameters import with_values
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.simulate.scenario import Scenario, model_of, simulate_scenario
 from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.study import summary
 from fisheye_svp_ros.study.solutions import localization_metrics
 from fisheye_svp_ros.study.sweep import (
     column_types,
+    fingerprint,
     part_check,
     plan_sweep,
     sweep_rows,
@@ -574,30 +577,63 @@ def test_without_pyarrow_there_is_csv_and_one_line_that_says_so(
     ).read_text()
 
 
+def solve_all_but_join(path: Path, out: Path) -> None:
+    """Leave all parts of a sweep of one set a scenario behind, the rows of its first, repeated."""
+    plan = read_sweep(path)
+    parts = tables.TableParts(out / 'parts', column_types(plan))
+    rows = sweep_rows(plan, tasks(plan)[0])
+    for numbers in tasks(plan):
+        parts.write(numbers.start, rows.assign(scenario=rows['scenario'] + numbers.start))
+    write_text(parts.folder / 'sweep.txt', f'{fingerprint(plan)} numpy')
+
+
 @pytest.mark.parametrize('parquet', [True, False])
-def test_memory_does_not_grow_with_a_sweep_but_for_its_metrics(
-    parquet: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_memory_does_not_grow_with_a_sweep(
+    parquet: bool,
+    write: Callable[[str], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     if parquet and tables.arrow()[0] is None:
         pytest.skip('pyarrow is not here')
     if not parquet:
         monkeypatch.setattr(tables, 'arrow', lambda: (None, ''))
     monkeypatch.setattr(tables, '_ROWS', 4096)  # of a row group, which is held, too
-    rows, columns = 500, [f'column_{i}' for i in range(20)]
-    parts = tables.TableParts(tmp_path / 'parts', dict.fromkeys(columns, float))
+    monkeypatch.setattr(summary, '_BLOCK', 4096)
     peaks: list[int] = []
-    for first, total in ((0, 40), (40, 160)):
-        for number in range(first, total):
-            values = np.arange(rows) + number / 7
-            parts.write(number, pd.DataFrame(dict.fromkeys(columns, values)))
+    for seeds in (10, 10, 50):  # the first one loads what all need
+        lists = f'{{sweep.radius: {[0.5] * 512}, sweep.seed: {list(range(seeds))}}}'
+        path, out = write(f'/**: {{ros__parameters: {lists}}}'), tmp_path / f'{len(peaks)}'
+        solve_all_but_join(path, out)
         tracemalloc.start()
-        found = parts.join(tmp_path / 'whole', columns[:2])
+        sweep(path, '-o', out, '--resume')
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert {*found} == {*columns[:2]} and len(found['column_0']) == 160 * rows
-    assert found['column_1'].iloc[-1] == rows - 1 + 159 / 7
-    # Two columns, and what concatenating and formatting them takes
-    assert peaks[1] - peaks[0] < 3 * 2 * 8 * 120 * rows
+        written = json.loads((out / 'sweep.json').read_text())['metrics']
+        assert written['localizer.rms_px']['solved'] == 512 * seeds
+    # Of the 11 metrics of 20480 more scenarios, 8 bytes each, less than two
+    assert peaks[2] - peaks[1] < 2 * 8 * 20480
+
+
+@pytest.mark.skipif(not Path('/dev/full').exists(), reason='/dev/full stands for a full disk')
+def test_a_disk_that_is_full_while_parts_are_joined_is_one_line(
+    write: Callable[[str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path, out = write(SMALL), tmp_path / 'out'
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            'fisheye_svp_ros.commands.sweep.TemporaryFile',
+            lambda **_: Path('/dev/full').open('w+b'),  # noqa: SIM115 - the command closes it
+        )
+        assert main(['sweep', str(path), '-o', str(out)]) == 2
+    err = capsys.readouterr().err
+    assert f'{out / "parts"}: cannot be written (No space left' in err
+    assert sorted(file.name for file in out.iterdir()) == ['parts']
+    sweep(path, '-o', out, '--resume')
+    assert len(files_of(out)) == len(FILES)
 
 
 def test_a_damaged_part_is_named(tmp_path: Path) -> None:
@@ -626,7 +662,7 @@ def test_a_part_that_ends_with_a_line_before_its_last_one_is_named(
     plan = read_sweep(write(f'/**: {{ros__parameters: {text}}}'))
     parts = tables.TableParts(tmp_path / 'parts', column_types(plan))
     write_rows(parts, 'numpy', plan, range(2))
-    parts.join(tmp_path / 'whole', (), part_check(plan))
+    parts.join(tmp_path / 'whole', part_check(plan))
     (file,) = parts.folder.iterdir()
     lines = file.read_text().splitlines(keepends=True)
     assert len(lines) == 1 + 2 * 10
@@ -635,7 +671,7 @@ def test_a_part_that_ends_with_a_line_before_its_last_one_is_named(
         with pytest.raises(
             OutputError, match=r'000000000.csv: .* \(rows are missing\); remove it'
         ):
-            parts.join(tmp_path / 'whole', (), part_check(plan))
+            parts.join(tmp_path / 'whole', part_check(plan))
 
 
 def test_nodes_of_one_namespace_are_those_of_the_sweep(tmp_path: Path) -> None:
