@@ -45,7 +45,11 @@ localizer: {ros__parameters: {svp: true}}
 FEW = 'landmark,x,y,z\n1,0,0,-1\n2,1,0,-1\n3,0,1,-1\n'
 
 
-@pytest.mark.parametrize(('text', 'scenarios', 'sets'), [(MONO, 12, 1), (RIG, 4, 2), (SVP, 1, 10)])
+@pytest.mark.parametrize(
+    ('text', 'scenarios', 'sets'),
+    [(MONO, 12, 1), (RIG, 4, 2), (SVP, 1, 10)],
+    ids=['camera', 'rig', 'svp'],
+)
 def test_every_scenario_once_and_with_the_offline_numbers(
     ros_domain: int,
     monkeypatch: pytest.MonkeyPatch,
