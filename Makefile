@@ -17,8 +17,8 @@ WORKERS ?= $(shell expr $$(env -u OMP_NUM_THREADS nproc) + 1)
 # Further arguments of pytest, for example PYTEST='-k lens'.
 PYTEST ?=
 # Rooms whose tests start no process, nor diagnose whole sets.
-QUICK := $(patsubst %,test/%,optics scene mixed_model effects io simulate solve rectify detect study reporting) \
-	$(patsubst %,test/test_%.py,documents library pose)
+QUICK := $(patsubst %,test/%,optics scene mixed_model effects io simulate solve rectify detect study reporting library) \
+	$(patsubst %,test/test_%.py,documents pose)
 # Kept, whatever the environment says: tests start hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 # setuptools has a long notice for every editable installation.

@@ -205,3 +205,15 @@ def test_what_is_left_out_of_the_shorter_run_is_there():
     for line in tests:
         file, *_, name = line.partition('[')[0].split('::')
         assert re.search(rf'\bdef {name}\(', (ROOT / file).read_text()), line
+
+
+@pytest.mark.skipif(shutil.which('make') is None, reason='make is not here')
+def test_what_is_checked_at_every_save_is_there(monkeypatch):
+    """A folder that was a file before ended `make check` without a test."""
+    for name in ('MAKEFLAGS', 'MAKELEVEL'):
+        monkeypatch.delenv(name, raising=False)
+    told = subprocess.run(
+        ['make', '-n', 'check'], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    paths = re.findall(r' (test/\S+)', told)
+    assert len(paths) > 10 and all((ROOT / path).exists() for path in paths), paths
