@@ -17,7 +17,8 @@ from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.optics.lens import INTRINSICS, parameter_values
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
-from fisheye_svp_ros.study.trust import assess_lens, calibrate_without_outliers
+from fisheye_svp_ros.solve.robust_calibration import calibrate_without_outliers
+from fisheye_svp_ros.study.trust import assess_lens
 
 DEALS = 10  # random halves of each set
 WITHIN = 1.959964  # standard errors, 95 %

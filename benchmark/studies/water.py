@@ -27,11 +27,8 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
-from fisheye_svp_ros.study.trust import (
-    assess_lens,
-    calibrate_without_outliers,
-    with_covariance,
-)
+from fisheye_svp_ros.solve.robust_calibration import calibrate_without_outliers
+from fisheye_svp_ros.study.trust import assess_lens, with_covariance
 
 KINDS = ('water', 'water', 'water', 'plate', 'focal', 'curve', 'air')
 

@@ -74,6 +74,7 @@ from fisheye_svp_ros.solve.rig_calibration import (
     connected_cameras,
 )
 from fisheye_svp_ros.solve.rig_checks import MAX_RIG_RATIO, MIN_SHARED_FRAMES
+from fisheye_svp_ros.solve.robust_calibration import calibrate_without_outliers
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -254,13 +255,6 @@ def _calibrate_camera(
     table: Observations, args: argparse.Namespace, size: tuple[int, int], name: str
 ) -> CalibratedCamera:
     """Return the lens, the rows that it is of, without outliers, and what may be trusted."""
-    from fisheye_svp_ros.study.trust import (
-        assess_lens,
-        calibrate_without_outliers,
-        generalize,
-        with_covariance,
-    )
-
     port = port_of(args)
     note_huge(table)
     air = load_with_notes(args.lens) if args.lens else None
@@ -282,6 +276,8 @@ def _calibrate_camera(
     values = ', '.join(f'{name} {value:.6g}' for name, value in known)
     try:  # the lens is there in a second, its errors take longer
         with stages(f'{values}; computing their standard errors'):
+            from fisheye_svp_ros.study.trust import assess_lens, generalize, with_covariance
+
             trusted = assess_lens(kept, result.adjusted.lens, result.adjusted.names)
     except np.linalg.LinAlgError as cause:
         remedy = 'check --port and --medium' if port else 'add views from other sides'

@@ -178,12 +178,8 @@ def calibrate(
     Raises LensError for an unknown model or parameter, ParameterError for an image size that is
     none, ObservationError or GeometryError where the data do not fix a lens.
     """
-    from fisheye_svp_ros.study.trust import (
-        assess_lens,
-        calibrate_without_outliers,
-        generalize,
-        with_covariance,
-    )
+    from fisheye_svp_ros.solve.robust_calibration import calibrate_without_outliers
+    from fisheye_svp_ros.study.trust import assess_lens, generalize, with_covariance
 
     size = check_size(image_size, 'image_size')
     table = table_of(observations)

@@ -21,24 +21,20 @@ from fisheye_svp_ros.diagnosis import (
     total_errors,
 )
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError
+from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.mixed_model import FactoredEquations, factor_equations, pseudo_inverse
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import Pose, axis_angle_between, identity
 from fisheye_svp_ros.scene.observations import Observations, views_of
-from fisheye_svp_ros.scene.table_checks import check_frames_differ
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state, localize_cameras
 from fisheye_svp_ros.solve.lens_calibration import Calibration, with_values
 from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measured, rms_px
-from fisheye_svp_ros.solve.outliers import NO_OUTLIERS, Outliers, find_outliers
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 from fisheye_svp_ros.solve.stereo_depth import triangulate
-from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
 
 _SHIFT_NAMES = ('s0', 'e0', 'e1', 'e2', 'thickness')
 _INTERVAL_SIGMAS = 2.0  # standard errors of an interval
-_MAX_ROUNDS = 4
 _MAX_POINTS = 500  # stereo points
 _FOLDS = 3
 _TARGET_SHARES = (0.0, 0.03, 0.1, 0.3, 1.0)  # of what is large for an error of the target
@@ -81,50 +77,6 @@ class LensTrust:
             for name, range_ in self.admissible.items()
             if name in _SHIFT_NAMES and not range_.settled
         }
-
-
-def calibrate_without_outliers(
-    observations: Observations,
-    calibrate: Callable[[Observations], Calibration],
-    starts: Sequence[Lens] = (),
-) -> tuple[Calibration, Observations, Outliers]:
-    """Calibrate a lens of one camera anew for as long as outliers are found.
-
-    calibrate: fits a lens to some of the rows; starts: rough lenses, to find wrong landmarks with
-    where it fails.  Returns the last lens, the rows that it is of, and those that are rejected.
-    """
-    check_frames_differ(observations)
-    result = _fit_if_possible(calibrate, observations)
-    wrong = find_wrong_landmarks(
-        observations,
-        result and ForwardModel(result.adjusted.lens),
-        lambda some: ForwardModel(calibrate(some).adjusted.lens),
-        map(ForwardModel, starts),
-    )
-    rejected, rounds = NO_OUTLIERS.append_landmarks(observations, wrong), 0
-    rows = np.delete(np.arange(len(observations)), rejected.rows)
-    while True:
-        if result is None or rounds or wrong:
-            result = calibrate(observations.take(rows))
-        rows = rows[~np.isin(observations.frame[rows], result.left_out)]
-        table = observations.take(rows)
-        data = group_by_frame(table)
-        outliers = find_outliers(data, initial_state(data, result.adjusted.lens))[1]
-        rounds += 1
-        if not len(outliers.rows) or rounds == _MAX_ROUNDS:
-            return result, table, rejected
-        rejected = rejected.join(outliers._replace(rows=rows[outliers.rows]))
-        rows = np.delete(rows, outliers.rows)
-
-
-def _fit_if_possible(
-    calibrate: Callable[[Observations], Calibration], observations: Observations
-) -> Calibration | None:
-    """Return a lens of all rows; None where wrong landmarks, perhaps, leave none to fit."""
-    try:
-        return calibrate(observations)
-    except GeometryError:
-        return None
 
 
 def assess_lens(observations: Observations, lens: Lens, names: Sequence[str]) -> LensTrust:

@@ -24,7 +24,8 @@ from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
-from fisheye_svp_ros.study.trust import assess_lens, calibrate_without_outliers
+from fisheye_svp_ros.solve.robust_calibration import calibrate_without_outliers
+from fisheye_svp_ros.study.trust import assess_lens
 
 SIGMA, SHIFT = 0.1, 0.004
 DRAWS = 14

@@ -18,7 +18,7 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.lens_calibration import calibrate
-from fisheye_svp_ros.study.trust import calibrate_without_outliers
+from fisheye_svp_ros.solve.robust_calibration import calibrate_without_outliers
 
 FAULTS = DATA.parent / 'faults'
 # One process makes each diagnosis once.

@@ -15,8 +15,8 @@ from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.lens_calibration import calibrate, rough_lenses
 from fisheye_svp_ros.solve.measured_poses import localize_measured
+from fisheye_svp_ros.solve.robust_calibration import calibrate_without_outliers
 from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
-from fisheye_svp_ros.study.trust import calibrate_without_outliers
 
 SIZE = (LENS.width, LENS.height)
 fit = partial(calibrate, model='kannala_brandt', image_size=SIZE)
