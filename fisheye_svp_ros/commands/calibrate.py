@@ -74,7 +74,6 @@ from fisheye_svp_ros.solve.rig_calibration import (
     connected_cameras,
 )
 from fisheye_svp_ros.solve.rig_checks import MAX_RIG_RATIO, MIN_SHARED_FRAMES
-from fisheye_svp_ros.solve.robust_calibration import calibrate_without_outliers
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -255,6 +254,8 @@ def _calibrate_camera(
     table: Observations, args: argparse.Namespace, size: tuple[int, int], name: str
 ) -> CalibratedCamera:
     """Return the lens, the rows that it is of, without outliers, and what may be trusted."""
+    from fisheye_svp_ros.solve.robust_calibration import calibrate_without_outliers
+
     port = port_of(args)
     note_huge(table)
     air = load_with_notes(args.lens) if args.lens else None

@@ -81,7 +81,7 @@ def judge_data(
     if evaluation.free and evaluation.medium is None:
         flaws += _coverage(evaluation)
         if not any(flaw.kind.is_misfit for flaw in flaws):
-            flaws += _unknown_rays(evaluation, evaluation.scatter_px, ray_errors)
+            flaws += _unknown_rays(evaluation, ray_errors)
     flaws.sort(key=lambda flaw: flaw.kind.value)
     table = evaluation.problem.observations
     known = {frame for frame, _, _ in table.photographs}
@@ -273,13 +273,12 @@ def _coverage(evaluation: Evaluation) -> Iterator[Flaw]:
 
 
 def _unknown_rays(
-    evaluation: Evaluation,
-    scatter: float,
-    ray_errors: Mapping[str, Mapping[str, Sequence[RayError]]],
+    evaluation: Evaluation, ray_errors: Mapping[str, Mapping[str, Sequence[RayError]]]
 ) -> Iterator[Flaw]:
     """Yield cameras whose rays are unknown even where there are points."""
     lenses = evaluation.problem.inputs.lenses
     for name, sides in ray_errors.items():
-        error, point = sides['extended'][_NEAR_RANGE].value, scatter / lenses[name].fx
+        error = sides['extended'][_NEAR_RANGE].value
+        point = evaluation.scatter_px / lenses[name].fx
         if error > _MAX_RAY_RATIO * point:
             yield Flaw(FlawKind.LENS_UNKNOWN, error, point, camera=name)

@@ -270,7 +270,7 @@ class Evaluation:
         state = valid_state(state, test.data, data, test.another_target)
         return predict_other_data(test.data, replace(state, pose=test.pose)).rms
 
-    @cached_property
+    @property
     def _cause_predictions(self) -> list[HeldOut]:
         """Predictions with the first 0, 1, ... causes."""
         return [

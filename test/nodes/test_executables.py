@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -165,19 +165,23 @@ def test_a_signal_while_a_node_starts_ends_it_quietly(
     assert status in (0, 130, -number)
 
 
+def printed_by(code: str, environment: Mapping[str, str] = os.environ) -> str:
+    """Return what Python code prints in a process of its own."""
+    return subprocess.run(
+        [sys.executable, '-c', code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**environment, 'PYTHONPATH': str(ROOT)},
+    ).stdout
+
+
 def test_hardly_anything_is_loaded_before_signals_end_a_node_quietly() -> None:
     code = (
         'import sys; before = {*sys.modules}; import fisheye_svp_ros.nodes.executables; '
         "print(*sorted(name for name in {*sys.modules} - before if 'fisheye' in name))"
     )
-    done = subprocess.run(
-        [sys.executable, '-c', code],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | {'PYTHONPATH': str(ROOT)},
-    )
-    assert done.stdout.split() == [
+    assert printed_by(code).split() == [
         'fisheye_svp_ros',
         'fisheye_svp_ros.io',
         'fisheye_svp_ros.io.streams',
@@ -194,14 +198,7 @@ def test_a_node_that_diagnoses_starts_without_what_only_a_diagnosis_needs() -> N
         "print(*{'scipy.optimize', 'scipy.spatial', 'scipy.cluster', 'scipy.stats', 'matplotlib'} "
         '& {*sys.modules})'
     )
-    done = subprocess.run(
-        [sys.executable, '-c', code],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=os.environ | {'PYTHONPATH': str(ROOT)},
-    )
-    assert not done.stdout.split()
+    assert not printed_by(code).split()
 
 
 @pytest.mark.parametrize(('given', 'taken'), [({}, '1'), ({'OMP_NUM_THREADS': '3'}, '3')])
@@ -213,14 +210,7 @@ def test_a_node_computes_on_one_core_unless_told_otherwise(
         "assert 'numpy' not in sys.modules; print(os.environ['OMP_NUM_THREADS'])"
     )
     env = {name: value for name, value in os.environ.items() if name != 'OMP_NUM_THREADS'}
-    done = subprocess.run(
-        [sys.executable, '-c', code],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=env | {'PYTHONPATH': str(ROOT)} | given,
-    )
-    assert done.stdout.strip() == taken
+    assert printed_by(code, env | given).strip() == taken
 
 
 @pytest.mark.parametrize('name', NODES)
