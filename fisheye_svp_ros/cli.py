@@ -18,7 +18,7 @@ from typing import NoReturn
 from fisheye_svp_ros import __version__
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.io.streams import tolerant_streams
-from fisheye_svp_ros.process import set_thread_count
+from fisheye_svp_ros.process import draw_to_files, set_thread_count
 
 _DESCRIPTION = (
     'Measure what the single-viewpoint (SVP) approximation of a fisheye lens costs, and find the '
@@ -141,6 +141,7 @@ def _run(arguments: Sequence[str]) -> None:
     for name, purpose in COMMANDS.items():
         commands.add_parser(name, help=purpose, description=purpose[0].upper() + purpose[1:] + '.')
     named = next((word for word in arguments if not word.startswith('-')), '')
+    draw_to_files()
     if named in _ON_ONE_THREAD:
         set_thread_count()
     if named in _ON_LARGE_ARRAYS:

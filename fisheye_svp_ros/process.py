@@ -1,4 +1,4 @@
-"""What a process asks of its system: threads of linear algebra, and memory.
+"""What a process asks of its system: threads of linear algebra, memory, pictures in files.
 
 One thread, unless the environment says otherwise.  The matrices here are small.  Threads of BLAS
 that wait for each other at every product cost several times what they bring, and some BLAS returns
@@ -27,6 +27,15 @@ _MMAP_MAX, _TRIM_THRESHOLD, _ARENA_MAX, _TOP_PAD = (-4, 0), (-1, 2**31 - 1), (-8
 def set_thread_count() -> None:
     """Ask for one thread in this process and its workers; call it before NumPy is imported."""
     os.environ.setdefault(VARIABLES[0], '1')
+
+
+def draw_to_files() -> None:
+    """Have Matplotlib draw into files alone, in this process and its workers.
+
+    A backend that the environment names, as that of a notebook, need not be installed here; call
+    it before Matplotlib is imported.
+    """
+    os.environ['MPLBACKEND'] = 'agg'
 
 
 def limit_threads(function: Callable[_P, _R]) -> Callable[_P, _R]:

@@ -6,7 +6,6 @@ import argparse
 
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.outputs import add_output_folder
-from fisheye_svp_ros.io.files import write_together
 
 # Limits by quantity: option, unit, factor from the unit to SI.
 _LIMITS = {
@@ -83,7 +82,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.files import write_json
     from fisheye_svp_ros.io.share import typed_lens_path
     from fisheye_svp_ros.reporting.budget_report import BudgetRequest, answer, document, draw, rows
-    from fisheye_svp_ros.reporting.terminal import print_table, progress
+    from fisheye_svp_ros.reporting.terminal import draw_or_note, print_table, progress
     from fisheye_svp_ros.scene.rigs import rig
     from fisheye_svp_ros.study.budget import Setup, at_point, default_spread, make_budget
 
@@ -108,6 +107,5 @@ def run(args: argparse.Namespace) -> None:
     )
     print(f'  {answer(points, asked)}')
     if args.output:
-        with write_together():
-            draw(args.output / 'budget.png', budget, points, asked)
-            write_json(args.output / 'budget.json', document(budget, points, asked))
+        write_json(args.output / 'budget.json', document(budget, points, asked))
+        draw_or_note(args.output / 'budget.png', draw, budget, points, asked)

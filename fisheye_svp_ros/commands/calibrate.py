@@ -172,14 +172,14 @@ def run(args: argparse.Namespace) -> None:
                 paths[camera] = args.output if alone else args.output / f'{camera}.yaml'
                 save_lens(one.lens, paths[camera])
                 write_json(paths[camera].with_suffix('.calibrate.json'), _document(one))
-            report = (
-                args.output / 'calibration.html'
-                if len(paths) > 1
-                else next(iter(paths.values())).with_suffix('.calibrate.html')
-            )
-            write_calibration_report(report, found, _next_command(args, paths))
             if rig:
                 write_rig(rig, args.output)
+        report = (
+            args.output / 'calibration.html'
+            if len(paths) > 1
+            else next(iter(paths.values())).with_suffix('.calibrate.html')
+        )
+        write_calibration_report(report, found, _next_command(args, paths))
     for one in found.values():
         _print(one)
         for warning in calibration_warnings(one):

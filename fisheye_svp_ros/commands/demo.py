@@ -107,8 +107,8 @@ def run(args: argparse.Namespace) -> None:
                 'rectified': remaining_document(apart),
             },
         )
-        _draw(args.output, rows, fields)
-        draw_pair(args.output / 'rectified.png', *images)
+    _draw(args.output, rows, fields)
+    draw_pair(args.output / 'rectified.png', *images)
     note_formats()
     _print(rows)
     print_remaining(
@@ -189,6 +189,7 @@ def _cells(row: DemoRow) -> tuple[str, ...]:
 
 def _draw(folder: Path, rows: Sequence[DemoRow], fields: Sequence[ResidualSet]) -> None:
     from fisheye_svp_ros.paper.demonstration_plots import draw_comparison, draw_residual_fields
+    from fisheye_svp_ros.reporting.terminal import draw_or_note
 
-    draw_comparison(rows, folder / 'errors.png')
-    draw_residual_fields(fields, folder / 'residuals.png')
+    draw_or_note(folder / 'errors.png', draw_comparison, rows)
+    draw_or_note(folder / 'residuals.png', draw_residual_fields, fields)

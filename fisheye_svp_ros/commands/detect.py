@@ -74,21 +74,23 @@ def run(args: argparse.Namespace) -> None:
 
     detection = search(args.photographs, args)
     _print(detection, args.board)
-    with write_together():
-        if args.output:
+    if args.output:
+        with write_together():
             write_observations(args.output, detection.observations)
             write_json(args.output.with_suffix('.detect.json'), _document(detection, args.board))
-        if args.overlays:
-            from fisheye_svp_ros.reporting.overlays import write_coverage, write_overlays
+    if args.overlays:
+        from fisheye_svp_ros.reporting.overlays import write_coverage, write_overlays
+        from fisheye_svp_ros.reporting.terminal import draw_or_note
 
-            coverage = args.overlays / 'coverage.png'
-            with keep_existing(not coverage.exists()):  # photographs, but no earlier overlays
-                write_overlays(
-                    find_photographs(args.photographs, args.every, args.split or 1),
-                    detection,
-                    args.overlays,
-                )
-                write_coverage(detection, coverage)
+        coverage = args.overlays / 'coverage.png'
+        # Photographs may be there, but no earlier overlays.
+        with keep_existing(not coverage.exists()), write_together():
+            write_overlays(
+                find_photographs(args.photographs, args.every, args.split or 1),
+                detection,
+                args.overlays,
+            )
+            draw_or_note(coverage, write_coverage, detection)
 
 
 def _print(detection: Detection, board: str) -> None:

@@ -199,9 +199,13 @@ def run(args: argparse.Namespace) -> None:
             raise _fit_error(args, cause) from cause
         wanted, impossible = _plan_next_views(args, diagnosis) if args.count else (None, None)
         if args.output:
+            from fisheye_svp_ros.reporting.diagnosis_report import write_report
+
             progress('report', 0.9)
             with write_together():
-                _write(args, diagnosis, known, bool(fitted), wanted)
+                _write(args, diagnosis, known, wanted)
+            with write_together():
+                write_report(diagnosis, known, _inputs(args, bool(fitted)), wanted)
     _print(diagnosis, known, args, wanted)
     for names in told:
         print(*headline_changes(names, diagnosis), sep='\n', end='', file=sys.stderr)
@@ -358,12 +362,11 @@ def _write(
     args: argparse.Namespace,
     diagnosis: Diagnosis,
     known: Mapping[str, Comparison],
-    free: bool,
     wanted: NextViews | None,
 ) -> None:
+    """Write what the pictures are made of, and are not needed for."""
     from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
     from fisheye_svp_ros.reporting.diagnosis_plots import point_residuals
-    from fisheye_svp_ros.reporting.diagnosis_report import write_report
     from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE, refusal_reason
 
     folder, points = args.output, point_residuals(diagnosis.evaluation)
@@ -380,7 +383,6 @@ def _write(
     _write_residuals(
         folder / 'residuals.csv', points, diagnosis.evaluation.fixed_model.data.observations
     )
-    write_report(diagnosis, known, _inputs(args, free), wanted)
 
 
 def _write_residuals(path: Path, points: PointResiduals, table: Observations) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.io.lens_formats import READERS_TO_90_DEG, share_beyond_90_deg
+from fisheye_svp_ros.reporting.terminal import print_note
 from fisheye_svp_ros.reporting.wording.inputs import points_extrapolated
 from fisheye_svp_ros.reporting.wording.poses import wrong_landmark_notes
 from fisheye_svp_ros.scene.observations import frame_name, list_frames
@@ -31,7 +31,7 @@ _DIGITS = re.compile(r'\d')
 
 def say(note: str) -> None:
     """Print a note."""
-    print(f'fisheye-svp: note: {note}', file=sys.stderr)
+    print_note(note)
 
 
 def note_reader_limit(lens: Lens, form: str) -> None:

@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> None:
     """Choose, print, draw."""
     from fisheye_svp_ros.planning.plan import plan
     from fisheye_svp_ros.reporting.shot_plots import draw_shots
-    from fisheye_svp_ros.reporting.terminal import UNITS, print_table
+    from fisheye_svp_ros.reporting.terminal import UNITS, draw_or_note, print_table
     from fisheye_svp_ros.reporting.wording import shots
 
     if not args.noise > 0:
@@ -98,7 +98,6 @@ def run(args: argparse.Namespace) -> None:
     wanted = planned.wanted
     if args.output:
         with write_together():
-            draw_shots(args.output / 'plan.pdf', ForwardModel(lens), wanted)
             write_poses(
                 args.output / 'poses.csv',
                 np.arange(len(wanted.shots.distance)),
@@ -108,6 +107,7 @@ def run(args: argparse.Namespace) -> None:
                 args.output / 'plan.json',
                 {'photographs': wanted.to_list(), 'stderr': planned.stderr},
             )
+        draw_or_note(args.output / 'plan.pdf', draw_shots, ForwardModel(lens), wanted)
     print_table(
         f'{lens.name}, {pattern.spec}: photographs to take, {shots.purpose(wanted)}',
         shots.HEADER,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,9 @@ def _table_in(source: Path) -> Path | None:
 
 
 def _of_bag(args: argparse.Namespace) -> list[Path]:
+    from fisheye_svp_ros.paper.demonstration_plots import draw_residual_fields
     from fisheye_svp_ros.reporting.sweep_plots import draw_residuals, draw_table
+    from fisheye_svp_ros.reporting.terminal import draw_or_note
 
     bag = Bag(args.source)
     with progress('reading', 2 * bag.size) as passed:
@@ -82,28 +85,28 @@ def _of_bag(args: argparse.Namespace) -> list[Path]:
         # Rows of the namespace with most of them: others have other metrics.
         most = table[NAMESPACE].mode()[:1]
         files = draw_table(table[table[NAMESPACE].isin(most)], args.output)
+        drawings: list[tuple[str, Callable[..., None], tuple[Any, ...]]] = []
         if sets:
-            files.append(args.output / 'residuals.png')
-            draw_residuals(
-                [one.points for one in sets],
-                [one.tags.get('lens', '') for one in sets],
-                files[-1],
+            points, lenses = zip(
+                *((one.points, one.tags.get('lens', '')) for one in sets), strict=True
             )
-            files += _fields(sets, args.output / 'residual_fields.png')
+            drawings.append(('residuals', draw_residuals, (points, lenses)))
+        if fields := _fields(sets):
+            drawings.append(('residual_fields', draw_residual_fields, (fields,)))
+        files += [
+            path
+            for name, draw, arguments in drawings
+            if draw_or_note(path := args.output / f'{name}.png', draw, *arguments)
+        ]
     return files
 
 
-def _fields(sets: list[ResidualSet], path: Path) -> list[Path]:
-    """Draw the residuals over the image, once a lens and range, where a scenario names these."""
+def _fields(sets: list[ResidualSet]) -> list[ResidualSet]:
+    """Return the sets to draw over the image: one a lens and range that a scenario names."""
     named: dict[Any, ResidualSet] = {}
     for one in sets:
         key = one.tags.get('lens'), one.tags.get('radius')
         same_lens = sum(lens == key[0] for lens, _ in named)
         if None not in key and len(one.points) and same_lens < _FIELDS:
             named.setdefault(key, one)
-    if not named:
-        return []
-    from fisheye_svp_ros.paper.demonstration_plots import draw_residual_fields
-
-    draw_residual_fields(list(named.values()), path)
-    return [path]
+    return list(named.values())

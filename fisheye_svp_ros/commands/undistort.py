@@ -28,7 +28,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.cameras import PROJECTIONS, STEREO_PROJECTIONS, camera_for
 from fisheye_svp_ros.rectify.maps import RANGE, Rectification, RectifiedPair, rectify_pair
-from fisheye_svp_ros.reporting.terminal import progress, range_text
+from fisheye_svp_ros.reporting.terminal import draw_or_note, progress, range_text
 from fisheye_svp_ros.reporting.undistort_report import (
     Remaining,
     draw_pair,
@@ -142,9 +142,9 @@ def run(args: argparse.Namespace) -> None:
                 'baseline_m': pair.baseline,
                 'rows': remaining_document(rows) if rows else None,
             }
-        if pair and rows:
-            draw_remaining(args.output / 'rows.png', pair.left, rows, 'difference of rows')
         write_json(args.output / _RESULT, document)
+    with keep_existing(fresh):
+        _draw(sides, pair, left, rows, args.output)
     for name, side in sides.items():
         if side.extrapolated_points:
             say(points_extrapolated(name or side.lens.name, side.extrapolated_points))
@@ -287,8 +287,6 @@ def _write_camera(
             folder / 'camera_info.yaml',
             camera_info_text(name or side.lens.name, size, side.k, model, [0.0] * count, side.p),
         )
-    if left:
-        draw_remaining(folder / 'shift.png', side, left, 'error of image points')
     return {
         'lens': side.lens.name,
         'size': list(size),
@@ -299,6 +297,22 @@ def _write_camera(
         'reached': float(maps.mask.mean()),
         'shift': remaining_document(left) if left else None,
     }
+
+
+def _draw(
+    sides: dict[str, Rectification],
+    pair: RectifiedPair | None,
+    left: dict[str, Remaining],
+    rows: Remaining | None,
+    folder: Path,
+) -> None:
+    """Draw what is left: of each camera, and between the rows of a pair."""
+    for name, remaining in left.items():
+        path = folder / name / 'shift.png'
+        draw_or_note(path, draw_remaining, sides[name], remaining, 'error of image points')
+    if pair and rows:
+        path = folder / 'rows.png'
+        draw_or_note(path, draw_remaining, pair.left, rows, 'difference of rows')
 
 
 def _print_camera(side: Rectification, name: str, left: Remaining | None) -> None:

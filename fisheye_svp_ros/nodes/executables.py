@@ -19,13 +19,14 @@ from typing import TYPE_CHECKING
 from fisheye_svp_ros import __version__
 from fisheye_svp_ros.io.streams import tolerant_streams
 from fisheye_svp_ros.nodes import NODES
-from fisheye_svp_ros.process import set_thread_count
+from fisheye_svp_ros.process import draw_to_files, set_thread_count
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.io.parameters import Row
     from fisheye_svp_ros.nodes.base import BaseNode
 
 set_thread_count()  # other nodes use the other cores
+draw_to_files()
 
 
 @contextmanager

@@ -32,7 +32,7 @@ _TITLES = {
 }
 
 
-def draw_comparison(rows: Sequence[DemoRow], path: Path) -> None:
+def draw_comparison(path: Path, rows: Sequence[DemoRow]) -> None:
     """Draw the errors of the demo beside the published ones: a column a task, a row a lens."""
     lenses = list(dict.fromkeys(row.lens for row in rows))
     with picture(path, 11.0, 1.2 + 2.6 * len(lenses)) as figure:
@@ -67,7 +67,7 @@ def _draw_errors(axis: Any, rows: Sequence[DemoRow]) -> None:
     axis.grid(visible=False, axis='y')
 
 
-def draw_residual_fields(fields: Sequence[ResidualSet], path: Path) -> None:
+def draw_residual_fields(path: Path, fields: Sequence[ResidualSet]) -> None:
     """Draw the residuals of localization over the image, magnified (figure 6): a row a lens.
 
     The scenarios of all of them name lens and radius.

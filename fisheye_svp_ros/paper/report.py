@@ -6,12 +6,13 @@ from collections.abc import Iterator
 from concurrent.futures import Executor, Future, wait
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.io.files import replacing, write_json, write_together
+from fisheye_svp_ros.io.files import write_bytes, write_json, write_together
 from fisheye_svp_ros.paper import figures
 from fisheye_svp_ros.paper.claims import FAILS, HOLDS, IN_PART
 from fisheye_svp_ros.paper.extensions import CALIBRATION_NOISE, NOISES, POSE_SETS
@@ -34,6 +35,7 @@ from fisheye_svp_ros.reporting.blocks import (
     Text,
     write_blocks,
 )
+from fisheye_svp_ros.reporting.terminal import draw_or_note
 from fisheye_svp_ros.scene.observations import RADII, SPREADS
 
 FACTOR = 3.0  # beyond it a difference is discussed
@@ -59,28 +61,27 @@ def write_report(results: Results, folder: Path, executor: Executor) -> list[Pat
         _differences,
     )
     blocks = [block for part in parts for block in part(results)]
+    write_json(folder / 'paper.json', results.document())
     with write_together():
         pictures = _drawn(results, folder, executor)
-        write_json(folder / 'paper.json', results.document())
         return [folder / 'paper.json', *write_blocks(folder, 'paper', blocks), *pictures]
 
 
 def _drawn(results: Results, folder: Path, executor: Executor) -> list[Path]:
     """Draw the pictures by the executor; return them."""
-    drawings = _drawings(results)
-    with ExitStack() as stack:
-        places = {
-            folder / f'{name}.png': stack.enter_context(replacing(folder / f'{name}.png'))
-            for name in drawings
-        }
-        under_way: list[Future[None]] = []
-        # Whatever ends this, nobody draws any longer when the temporary files go.
-        stack.callback(lambda: wait([one for one in under_way if not one.cancel()]))
-        for place, (draw, *arguments) in zip(places.values(), drawings.values(), strict=True):
-            under_way.append(executor.submit(draw, place, *arguments))
-        for drawn in under_way:
-            drawn.result()
-    return [*places]
+    under_way: dict[str, Future[None]] = {}
+    with TemporaryDirectory() as scratch, ExitStack() as stack:
+        # Whatever ends this, nobody draws any longer when the scratch folder goes.
+        stack.callback(lambda: wait([one for one in under_way.values() if not one.cancel()]))
+        for name, (draw, *arguments) in _drawings(results).items():
+            under_way[name] = executor.submit(draw, Path(scratch, f'{name}.png'), *arguments)
+
+        def keep(path: Path) -> None:
+            under_way[path.stem].result()
+            write_bytes(path, Path(scratch, path.name).read_bytes())
+
+        paths = (folder / f'{name}.png' for name in under_way)
+        return [path for path in paths if draw_or_note(path, keep)]
 
 
 def _drawings(results: Results) -> dict[str, tuple[Any, ...]]:

@@ -49,6 +49,11 @@ Block = Heading | Text | TableBlock | Picture
 
 def write_blocks(folder: Path, name: str, blocks: Sequence[Block]) -> list[Path]:
     """Write NAME.md and NAME.html beside the pictures; return both, or raise OutputError."""
+    blocks = [
+        block
+        for block in blocks
+        if not isinstance(block, Picture) or written(folder / block.file).exists()
+    ]
     pictures = {
         block.file: data_uri(folder / block.file) for block in blocks if isinstance(block, Picture)
     }

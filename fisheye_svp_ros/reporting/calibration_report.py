@@ -14,7 +14,14 @@ from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.reporting.blocks import page, png_uri
 from fisheye_svp_ros.reporting.calibrated_camera import CalibratedCamera
-from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, drawing, round_number
+from fisheye_svp_ros.reporting.plots import (
+    FAINT,
+    OURS,
+    PUBLISHED,
+    drawing,
+    round_number,
+)
+from fisheye_svp_ros.reporting.terminal import draw_or_note
 from fisheye_svp_ros.reporting.wording.calibration import (
     ANY_TARGET,
     ANY_TARGET_NOTE,
@@ -71,10 +78,10 @@ def _camera(name: str, camera: CalibratedCamera) -> dict[str, Any]:
             (f'{e.range_m:g}', f'{1e3 * e.value:.2g}', f'{1e3 * e.low:.2g}', f'{1e3 * e.high:.2g}')
             for e in rays[1].errors()
         ],
-        'coverage': _drawn(_coverage, camera),
-        'residuals': _drawn(_residuals, camera),
-        'frames_picture': _drawn(_frames, camera),
-        'uncertainty': _drawn(_uncertainty, camera, *rays),
+        'coverage': _drawn('coverage', _coverage, camera),
+        'residuals': _drawn('residuals', _residuals, camera),
+        'frames_picture': _drawn('residuals by frame', _frames, camera),
+        'uncertainty': _drawn('uncertainty', _uncertainty, camera, *rays),
     }
 
 
@@ -92,11 +99,15 @@ def _rays(camera: CalibratedCamera) -> tuple[Array, RayModel]:
     return uv[there], model
 
 
-def _drawn(draw: Any, *arguments: Any) -> str:
+def _drawn(name: str, draw: Any, *arguments: Any) -> str:
+    """Return a picture as part of the page, '' where it cannot be drawn."""
     drawn = BytesIO()
-    with drawing(drawn, _WIDTH, 3.6) as figure:
-        draw(figure, *arguments)
-    return png_uri(drawn.getvalue())
+
+    def draw_figure(_: Path) -> None:
+        with drawing(drawn, _WIDTH, 3.6) as figure:
+            draw(figure, *arguments)
+
+    return png_uri(drawn.getvalue()) if draw_or_note(Path(name), draw_figure) else ''
 
 
 def _image(axis: Any, lens: Lens) -> None:

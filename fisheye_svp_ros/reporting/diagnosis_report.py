@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from fisheye_svp_ros.reporting.blocks import data_uri, page
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
 from fisheye_svp_ros.reporting.shot_plots import draw_shots
+from fisheye_svp_ros.reporting.terminal import draw_or_note
 from fisheye_svp_ros.reporting.wording import shots
 from fisheye_svp_ros.reporting.wording.causes import (
     bare_probability,
@@ -86,13 +87,11 @@ def write_report(
     wanted: the photographs to take next, if they were asked for.
     Raises OutputError where one cannot be written.
     """
-    pictures = list(_draw(diagnosis, inputs.folder))
-    pictures.append(inputs.folder / 'uncertainty.png')
-    draw_uncertainty(pictures[-1], diagnosis)
-    if wanted is not None:
-        pictures.append(inputs.folder / 'next.png')
-        state = diagnosis.evaluation.fixed_model.state
-        draw_shots(pictures[-1], ForwardModel(state.lens, state.terms), wanted)
+    pictures = [
+        inputs.folder / f'{name}.png'
+        for name, draw, arguments in _drawings(diagnosis, wanted)
+        if draw_or_note(inputs.folder / f'{name}.png', draw, *arguments)
+    ]
     drawn = {p.stem: data_uri(p) for p in pictures}
     report = inputs.folder / 'report.html'
     write_text(
@@ -108,12 +107,7 @@ def write_report(
             verdict=verdict_words(diagnosis),
             tone=tone(diagnosis),
             sentences=verdict_sentences(diagnosis, known),
-            pictures={
-                'target': None,
-                'evidence': None,
-                'next': None,
-                **drawn,
-            },
+            pictures={**dict.fromkeys(('target', 'evidence', 'next', 'uncertainty')), **drawn},
             shown=[(name, text) for name, text in CAPTIONS.items() if name in drawn],
             **_causes(diagnosis),
             **_budget(diagnosis),
@@ -140,22 +134,24 @@ def write_report(
     return [report, *pictures]
 
 
-def _draw(diagnosis: Diagnosis, folder: Path) -> Iterator[Path]:
+def _drawings(
+    diagnosis: Diagnosis, wanted: NextViews | None
+) -> Iterator[tuple[str, Callable[..., None], Sequence[Any]]]:
+    """Yield the pictures: name, what draws it into a file, arguments."""
     quick = diagnosis.evaluation.problem.options.quick
     remaining = {_PICTURE_OF.get(structure.variable) for structure in diagnosis.remaining}
     for name, draw, arguments in residual_pictures(PlotData.from_evaluation(diagnosis.evaluation)):
         if not quick or name in _QUICK_PICTURES or name in remaining:
-            draw(folder / f'{name}.png', *arguments)
-            yield folder / f'{name}.png'
-    if quick:
-        return
-    if diagnosis.trace:
-        draw_evidence(folder / 'evidence.png', diagnosis)
-        yield folder / 'evidence.png'
-    maps = list(_target_maps(diagnosis))
+            yield name, draw, arguments
+    if diagnosis.trace and not quick:
+        yield 'evidence', draw_evidence, (diagnosis,)
+    maps = [] if quick else list(_target_maps(diagnosis))
     if maps:
-        draw_target(folder / 'target.png', maps)
-        yield folder / 'target.png'
+        yield 'target', draw_target, (maps,)
+    yield 'uncertainty', draw_uncertainty, (diagnosis,)
+    if wanted is not None:
+        state = diagnosis.evaluation.fixed_model.state
+        yield 'next', draw_shots, (ForwardModel(state.lens, state.terms), wanted)
 
 
 def _target_maps(diagnosis: Diagnosis) -> Iterator[tuple[str, BoardMap]]:

@@ -44,7 +44,7 @@ def _overlay(pixels: np.ndarray, searched: SearchedPhotograph) -> np.ndarray:
     return image
 
 
-def write_coverage(detection: Detection, path: Path) -> None:
+def write_coverage(path: Path, detection: Detection) -> None:
     """Draw all corners on the image, and, as a first calibration has them, angles and ranges."""
     table = detection.observations
     found = sum(photograph.points is not None for photograph in detection.searched)

@@ -58,7 +58,9 @@ def drawing(
     tight: the axes are of a regular grid and may have any aspect (`MarginLayout`).
     """
     layout = MarginLayout() if tight else ConstrainedLayoutEngine()
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context():
+        mpl.rcdefaults()  # a user's own style, with LaTeX say, is not that of these pictures
+        mpl.rcParams.update(_STYLE)
         figure = Figure(figsize=(width, height), dpi=150, layout=layout)
         FigureCanvasAgg(figure)
         yield figure

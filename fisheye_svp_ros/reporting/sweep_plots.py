@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,7 +15,13 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.decoding import Points
 from fisheye_svp_ros.io.parameters import rows
 from fisheye_svp_ros.io.recording import STAMP
-from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, legend_below, picture
+from fisheye_svp_ros.reporting.plots import (
+    OURS,
+    PUBLISHED,
+    legend_below,
+    picture,
+)
+from fisheye_svp_ros.reporting.terminal import draw_or_note
 from fisheye_svp_ros.reporting.wording.metrics import metric_text
 from fisheye_svp_ros.simulate.scenario import SCALARS, Scenario
 from fisheye_svp_ros.study.dependence import (
@@ -79,26 +85,29 @@ def is_drawn(column: str) -> bool:
 
 def draw_table(table: DataFrame, folder: Path) -> list[Path]:
     """Draw whatever a table is good for; return the files."""
-    files = []
+    drawings: list[tuple[str, Callable[..., None], tuple[Any, ...]]] = []
     metrics = _plotted_metrics(table)
     swept = swept_parameters(table)
     numbers = [name for name in swept if is_number(table, name)]
     for x in numbers if metrics else ():
-        files.append(folder / f'error_against_{x}.png')
-        _draw_curves(table, metrics, x, [name for name in swept if name != x], files[-1])
+        others = [name for name in swept if name != x]
+        drawings.append((f'error_against_{x}', _draw_curves, (table, metrics, x, others)))
     if len(numbers) >= 2 and metrics:
         y, x = sorted(sorted(numbers, key=lambda n: -table[n].nunique())[:2], key=numbers.index)
-        files.append(folder / f'heat_map_{y}_{x}.png')
         others = [name for name in swept if name not in (x, y)]
-        _draw_grids(table, metrics, x, y, others, files[-1])
+        drawings.append((f'heat_map_{y}_{x}', _draw_grids, (table, metrics, x, y, others)))
     if {*_SPREAD_COLUMNS} <= {*table} and table['noise_px'].any():
-        files.append(folder / 'residuals_and_noise.png')
         others = [name for name in swept if name != 'noise_px']
         few = [name for name in others if table[name].nunique() <= 2 * _HUES]
-        _draw_spreads(
-            table, min(few, key=lambda name: table[name].nunique(), default=None), files[-1]
-        )
-    return files + draw_runs(table, folder / 'runs.png')
+        fewest = min(few, key=lambda name: table[name].nunique(), default=None)
+        drawings.append(('residuals_and_noise', _draw_spreads, (table, fewest)))
+    if runs := _compared_runs(table):
+        drawings.append(('runs', _draw_runs, (table, runs)))
+    return [
+        path
+        for name, draw, arguments in drawings
+        if draw_or_note(path := folder / f'{name}.png', draw, *arguments)
+    ]
 
 
 @contextmanager
@@ -113,7 +122,7 @@ def _axes(path: Path, count: int, width: float, height: float) -> Iterator[Any]:
 
 
 def _draw_curves(
-    table: DataFrame, metrics: Sequence[PlottedMetric], x: str, others: Sequence[str], path: Path
+    path: Path, table: DataFrame, metrics: Sequence[PlottedMetric], x: str, others: Sequence[str]
 ) -> None:
     """Draw an error over x: the color tells one other parameter, the line style a second."""
     by = sorted(others, key=lambda name: -table[name].nunique())[-2:]
@@ -166,12 +175,12 @@ def _pick_evenly(values: list[Any], most: int) -> list[Any]:
 
 
 def _draw_grids(
+    path: Path,
     table: DataFrame,
     metrics: Sequence[PlottedMetric],
     x: str,
     y: str,
     others: Sequence[str],
-    path: Path,
 ) -> None:
     with _axes(path, len(metrics), 4.4, 3.6) as (figure, axes):
         for axis, metric in zip(axes, metrics, strict=True):
@@ -193,7 +202,7 @@ def _draw_grids(
         figure.suptitle(f'median of the magnitude{over}', x=0.01, ha='left', fontsize=8)
 
 
-def _draw_spreads(table: DataFrame, by: str | None, path: Path) -> None:
+def _draw_spreads(path: Path, table: DataFrame, by: str | None) -> None:
     spreads = noise_spreads(table, by)
     with _axes(path, len(spreads), 4.0, 2.8) as (figure, axes):
         for axis, spread in zip(axes, spreads, strict=True):
@@ -219,7 +228,7 @@ def _draw_spreads(table: DataFrame, by: str | None, path: Path) -> None:
         legend_below(figure, axes[0])
 
 
-def draw_residuals(clouds: Sequence[Points], lenses: Sequence[str], path: Path) -> None:
+def draw_residuals(path: Path, clouds: Sequence[Points], lenses: Sequence[str]) -> None:
     """Draw residuals (io.decoding.RESIDUALS) against the incidence angle and the range.
 
     lenses: of each cloud, told apart by color; '' where it is not known.
@@ -285,20 +294,21 @@ def _label(name: str) -> str:
     return ', '.join(filter(None, (_NAMES.get(name, name), _UNITS.get(name))))
 
 
-def draw_runs(table: DataFrame, path: Path) -> list[Path]:
-    """Draw over time the errors that several localizers publish, from a tabulated recording.
-
-    Returns the file; none where there are no two localizers to compare.
-    """
+def _compared_runs(table: DataFrame) -> dict[str, list[str]]:
+    """Return the columns of each error that several localizers publish; none over no time."""
     posed = [c.rpartition('.')[0] for c in table if c.endswith('.axis_error_rad')]
     localizers = [name for name in posed if f'{name}.views' not in table]  # no calibrator
-    runs = {
+    if STAMP not in table:
+        return {}
+    return {
         name: found
         for name in DRAWN_METRICS
         if len(found := [c for n in localizers if (c := f'{n}.{name}') in table]) > 1
     }
-    if not runs or STAMP not in table:
-        return []
+
+
+def _draw_runs(path: Path, table: DataFrame, runs: Mapping[str, Sequence[str]]) -> None:
+    """Draw errors over time, from a tabulated recording."""
     stamp = table[STAMP].to_numpy(float) / 1e9
     with picture(path, 9.2, 0.8 + 2.1 * len(runs)) as figure:
         axes = figure.subplots(len(runs), 1, sharex=True, squeeze=False)[:, 0]
@@ -318,4 +328,3 @@ def draw_runs(table: DataFrame, path: Path) -> list[Path]:
             axis.set(ylabel=text.title(' / '), ylim=(0, None))
             axis.legend(loc='lower right', bbox_to_anchor=(1, 1), ncols=len(nodes), fontsize=8)
         axes[-1].set_xlabel('time / s')
-    return [path]

@@ -11,12 +11,16 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 from rich import box
 from rich.console import Console, JustifyMethod
 from rich.padding import Padding
 from rich.progress import Progress
 from rich.table import Table
+
+from fisheye_svp_ros.errors import FisheyeSvpError
 
 UNITS = {  # of the parameters of a lens; 1 where there is none
     **dict.fromkeys(('f', 'fx', 'fy', 'cx', 'cy'), 'px'),
@@ -28,6 +32,7 @@ UNITS = {  # of the parameters of a lens; 1 where there is none
 }
 _DEFAULT_WIDTH = 200  # columns where no terminal says how many it has
 _MIN_WIDTH = 10  # columns that text is broken into at the narrowest
+_MAX_REASON = 200  # characters of an error
 _INTERVAL = 5.0  # seconds between lines where there is no terminal
 
 
@@ -55,6 +60,29 @@ def print_table(
     out.print(title)
     out.width = max(out.width, least)  # in less room rich leaves out whole columns
     out.print(table, crop=False, overflow='ignore')
+
+
+def print_note(note: str) -> None:
+    """Print what there is to say beside the results, on standard error."""
+    print(f'fisheye-svp: note: {note}', file=sys.stderr, flush=True)
+
+
+def draw_or_note(path: Path, draw: Callable[..., None], *arguments: Any) -> bool:
+    """Call draw(path, *arguments); return whether the picture was drawn, with a note if not.
+
+    Numbers do not depend on their pictures.  Raises OutputError where a file cannot be written.
+    """
+    try:
+        draw(path, *arguments)
+    except FisheyeSvpError:
+        raise
+    except Exception as error:
+        print_note(
+            f'{path} cannot be drawn ({type(error).__name__}: {str(error)[:_MAX_REASON]!r}); '
+            'all other results are written'
+        )
+        return False
+    return True
 
 
 def print_lines(lines: Iterable[str]) -> None:

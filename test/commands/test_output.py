@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from helpers.commands import refused
 from helpers.targets import plane, poses_around
+from matplotlib.figure import Figure
 
 from benchmark.hardening import kills
 from fisheye_svp_ros.cli import COMMANDS as COMMAND_NAMES
@@ -72,6 +73,36 @@ COMMANDS = {
         '-o',
         '{out}',
     ),
+}
+
+NUMBERS = {  # what commands write before they draw
+    'calibrate': ['new.calibrate.json', 'new.yaml'],
+    'plan': ['plan.json', 'poses.csv'],
+}
+DRAWING = {
+    'budget --lens fish180 -o {out}': ['budget.json'],
+    'calibrate {obs} --image-size 1536x1536 --model equidistant -o {out}/new.yaml': [
+        'new.calibrate.html',
+        'new.calibrate.json',
+        'new.yaml',
+    ],
+    'diagnose {obs} --lens {lens} --quick -o {out}': [
+        'diagnosis.json',
+        'extended_lens.yaml',
+        'report.html',
+        'residuals.csv',
+    ],
+    'plan --lens fish180 --board chessboard:4x3:25mm --room 0.1 0.5 --count 1 -o {out}': [
+        'plan.json',
+        'poses.csv',
+    ],
+    'undistort fish214 --size 64x64 -o {out}': [
+        'camera_info.yaml',
+        'maps.npz',
+        'maps.yml',
+        'mask.png',
+        'undistort.json',
+    ],
 }
 
 
@@ -142,9 +173,44 @@ def test_on_a_full_disk_there_is_one_line_and_no_file(
     if code:
         assert code == 2 and len(err) == 1
         assert 'cannot be written (' in err[0] and 'File too large' in err[0]
-        assert not results(out)
+        assert results(out) in ([], NUMBERS.get(name))
     else:
         assert not err and results(out)
+
+
+@pytest.mark.parametrize('line', DRAWING)
+def test_a_picture_that_cannot_be_drawn_costs_a_note(
+    line: str,
+    given: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise RuntimeError('no font')
+
+    monkeypatch.setattr(Figure, 'savefig', fail)
+    out = tmp_path / 'out'
+    assert main([word.format(out=out, **given) for word in line.split()]) == 0
+    assert results(out) == DRAWING[line]
+    assert "cannot be drawn (RuntimeError: 'no font'); all other" in capsys.readouterr().err
+    for page in out.glob('*.html'):
+        assert 'src=""' not in page.read_text() and '<img' not in page.read_text()
+
+
+@pytest.mark.parametrize('backend', ['module://matplotlib_inline.backend_inline', 'foo'])
+def test_pictures_do_not_depend_on_the_backend_of_the_environment(
+    backend: str, given: dict[str, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / 'out'
+    # A style of the user's that needs LaTeX is not that of these pictures either.
+    (tmp_path / 'matplotlibrc').write_text('text.usetex: True')
+    subprocess.run(
+        [sys.executable, '-m', 'fisheye_svp_ros.cli', *words('plot', given, out)],
+        env={**os.environ, 'MPLBACKEND': backend, 'MATPLOTLIBRC': str(tmp_path), 'PATH': ''},
+        check=True,
+    )
+    assert 'error_against_radius.png' in results(out)
 
 
 def png(path: Path, side: int = 1536) -> bytes:

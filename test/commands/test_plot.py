@@ -163,7 +163,7 @@ def test_residuals_are_drawn_against_angle_and_range(tmp_path: Path) -> None:
     cloud = structured_array(RESIDUALS, np.arange(50), *columns)
     pictures = []
     for lenses in (['', '', ''], ['a', 'b', 'b']):
-        draw_residuals([cloud] * 3, lenses, tmp_path / 'a.png')
+        draw_residuals(tmp_path / 'a.png', [cloud] * 3, lenses)
         pictures.append(imread(tmp_path / 'a.png'))
     assert pictures[0].shape[1] > 500
     # Colors of their own and a legend tell lenses apart.

@@ -39,7 +39,7 @@ from fisheye_svp_ros.nodes.model_critic import ModelCritic, in_background
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.reporting.sweep_plots import draw_runs
+from fisheye_svp_ros.reporting.sweep_plots import draw_table
 from fisheye_svp_ros.scene.observations import Landmarks
 
 FRAMES = 16
@@ -253,8 +253,9 @@ def test_two_runs_are_drawn_into_one_picture(tmp_path: Path) -> None:
         'depth.rms_px': [1.0, 1.0],
     }
     path = tmp_path / 'runs.png'
-    assert draw_runs(make_table(columns), path) == [] and not path.exists()
-    assert draw_runs(make_table({**columns, 'after.axis_error_rad': [0.5, None]}), path) == [path]
+    assert draw_table(make_table(columns), tmp_path) == [] and not path.exists()
+    two = make_table({**columns, 'after.axis_error_rad': [0.5, None]})
+    assert draw_table(two, tmp_path) == [path]
     assert path.read_bytes().startswith(b'\x89PNG')
 
 
