@@ -77,10 +77,11 @@ def note_odd(lens: Lens, path: str | Path, worst: float) -> None:
 class Lenses(dict[str, 'Lens']):
     """Lenses by camera; '' is that of every camera without its own.
 
-    in_file: cameras of a file that holds several, in its order; '' is the first of them; file: it,
-    as given.
+    files: where they are from; in_file: cameras of a file that holds several, in its order; '' is
+    the first of them; file: it, as given.
     """
 
+    files: dict[str, Path]
     file: str = ''
     in_file: tuple[Lens, ...] = ()
     names: tuple[str, ...] = ()
@@ -89,6 +90,7 @@ class Lenses(dict[str, 'Lens']):
 def load_lenses(given: Sequence[str]) -> Lenses:
     """Return the lenses of --lens; raise LensError for a bad one, and for two of a camera."""
     lenses = Lenses()
+    lenses.files = {}
     for text in given:
         camera, equals, path = text.partition('=')
         if not equals or is_there(Path(without_camera(text)[0])):
@@ -101,6 +103,7 @@ def load_lenses(given: Sequence[str]) -> Lenses:
             )
         file = typed_lens_path(path)
         lenses[camera] = load_with_notes(file)
+        lenses.files[camera] = file
         if not camera:
             lenses.file, lenses.names = path, cameras_in(file)
             lenses.in_file = tuple(load_lens(f'{file}#{name}') for name in lenses.names)

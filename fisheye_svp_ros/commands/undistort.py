@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.files import keep_existing, write_json, write_text, write_together
 from fisheye_svp_ros.io.image_files import save_maps, write_png
 from fisheye_svp_ros.io.lens_formats.ros import camera_info_text
-from fisheye_svp_ros.io.rig_files import load_pair, pair_of_lenses
+from fisheye_svp_ros.io.rig_files import load_pair, pair_of_camera_infos, pair_of_lenses
 from fisheye_svp_ros.io.share import typed_lens_path
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -172,7 +172,7 @@ def _rectifications(
     photographs = find_photographs(paths, split=args.split or 1)
     photographed = tuple(dict.fromkeys(one.camera for one in photographs))
     by_camera = _by_camera(photographed, lenses)
-    rig = _rig(args, by_camera)
+    rig = _rig(args, by_camera, lenses.files)
     field = None if args.fov is None else float(np.radians(args.fov))
     wanted = args.projection, args.size, field
     if rig is None:
@@ -196,7 +196,9 @@ def _by_camera(photographed: Sequence[str], lenses: Lenses) -> dict[str, Lens]:
     return lenses_of(cameras, lenses)
 
 
-def _rig(args: argparse.Namespace, lenses: dict[str, Lens]) -> Pose | None:
+def _rig(
+    args: argparse.Namespace, lenses: dict[str, Lens], files: Mapping[str, Path]
+) -> Pose | None:
     if args.rig:
         if len(lenses) != 2:
             raise ParameterError(
@@ -204,8 +206,10 @@ def _rig(args: argparse.Namespace, lenses: dict[str, Lens]) -> Pose | None:
                 f'{len(lenses)}; give --lens left=LENS --lens right=LENS'
             )
         return load_pair(args.rig, list(lenses))
-    if args.lens or len(lenses) != 2:
+    if len(lenses) != 2:
         return None
+    if args.lens:
+        return pair_of_camera_infos([files[name] for name in lenses if name in files])
     return pair_of_lenses(typed_lens_path(args.inputs[0]), list(lenses))
 
 

@@ -5,10 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.files import dump_yaml, read_text, write_text
-from fisheye_svp_ros.io.lens_files import FILES_OF_RIG, MAX_LENS_BYTES, read_lens_file
-from fisheye_svp_ros.io.lens_formats import Foreign, read_foreign
+from fisheye_svp_ros.io.lens_files import (
+    FILES_OF_RIG,
+    MAX_LENS_BYTES,
+    cameras_in,
+    read_lens_file,
+)
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, read_foreign
 from fisheye_svp_ros.io.lens_formats.rig import SEPARATOR, cameras_of, pose_keys
 from fisheye_svp_ros.io.paths import path_of
 from fisheye_svp_ros.pose import Pose, identity, quaternion_from_rotation
@@ -79,7 +86,7 @@ def load_rig(path: str | Path) -> Pose:
     """Return the first (left) camera in the second one, of a rig file or what another tool wrote.
 
     Kalibr's camchain, Basalt, OpenCV's R and T, URDF, what `ros2 topic echo /tf_static` prints; of
-    a folder its rig.yaml.
+    a folder its rig.yaml, or R and P of its two camera_info files.
     Raises LensError, naming file and field, where there is none.
     """
     return load_rigs(path)[0]
@@ -109,10 +116,33 @@ def pair_of_lenses(path: str | Path, cameras: Sequence[str]) -> Pose | None:
     return load_pair(path, cameras) if rigs_of_lenses(path) else None
 
 
+def pair_of_camera_infos(paths: Sequence[str | Path]) -> Pose | None:
+    """Return the first of two cameras in the second one, of R and P of their camera_info.
+
+    R turns points of a camera to the rectified frame, and P = K (I | t) shifts them there.
+    None for other files, and for cameras that were calibrated by themselves.
+    """
+    foreign = [read_lens_file(path) for path in paths]
+    sides = [one.rectified for one in foreign if one is not None and one.rectified is not None]
+    if len(sides) != 2 or len(paths) != 2 or not all(np.linalg.det(p[:, :3]) for _, p in sides):
+        return None
+    left, right = (
+        # The frame of both rectified images in the camera
+        turned.compose(Pose(np.eye(3), np.linalg.solve(p[:, :3], p[:, 3])))
+        for turned, p in (
+            (fields.pose(np.zeros(3), turn.T, f'{path}: R'), p)
+            for path, (turn, p) in zip(paths, sides, strict=True)
+        )
+    )
+    rig = right.compose(left.inverse())
+    return rig if rig.position.any() else None
+
+
 def rigs_of_lenses(path: str | Path) -> tuple[Pose, ...]:
     """Return each camera in the next one, as a file or folder of lenses holds them, if it does."""
     if Path(path).is_dir():
-        return load_rigs(path) if _rig_file(path).exists() else ()
+        held = _read_rig(path) if _rig_file(path).exists() else _pair_in_folder(path)
+        return held.rigs if held else ()
     foreign = read_lens_file(path)
     return foreign.rigs if foreign else ()
 
@@ -133,11 +163,21 @@ def _read_chain(path: str | Path) -> tuple[tuple[str, ...], tuple[Pose, ...]]:
     return names, held.rigs
 
 
+def _pair_in_folder(folder: str | Path) -> Foreign | None:
+    """Return the rig of a folder that holds two camera_info files, None of another."""
+    names = cameras_in(folder)
+    rig = pair_of_camera_infos([f'{folder}#{name}' for name in names])
+    return rig and Foreign('ROS', {}, (rig,), {}, names)
+
+
 def _read_rig(path: str | Path) -> Foreign:
     file = _rig_file(path)
+    if path_of(path).is_dir() and not file.exists() and (pair := _pair_in_folder(path)):
+        return pair
     foreign = read_foreign(file, read_text(file, LensError, MAX_LENS_BYTES))
     if foreign is None:
         raise LensError(f'{file}: left_in_right with position and quaternion is needed')
     if not foreign.rigs:
-        raise LensError(f'{file}: it holds one camera, or no transform between two')
+        both = '; give the folder with both camera_info files' if foreign.rectified else ''
+        raise LensError(f'{file}: it holds one camera, or no transform between two{both}')
     return foreign

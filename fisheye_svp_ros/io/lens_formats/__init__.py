@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import back_project_corrected
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.lens import Lens
@@ -26,6 +27,12 @@ FORMATS = (
     'euroc',
     'orbslam',
     'camodocal',
+    'mc_calib',
+    'gyroflow',
+    'depthai',
+    'photonvision',
+    'theia',
+    'woodscape',
     'opencv',
     'basalt',
     'mrcal',
@@ -50,7 +57,8 @@ _FAR_CAMERAS = 15.0  # m: between two neighbors; a baseline of 15 mm is the smal
 _GRID = 100  # image points along each axis
 READABLE = (
     'ROS camera_info, Kalibr, OpenCV, Basalt, mrcal, EuRoC, COLMAP, ORB-SLAM3, CamOdoCal, '
-    'nerfstudio, Metashape, OCamCalib and BoofCV'
+    'nerfstudio, Metashape, OCamCalib, BoofCV, PhotonVision, DepthAI, Gyroflow, '
+    'OpenImuCameraCalibrator, MC-Calib and WoodScape'
 )
 # What is known by sight alone
 UNREADABLE_FORMATS = {
@@ -67,6 +75,9 @@ UNREADABLE_FORMATS = {
     'a BoofCV model other than omnidirectional_universal': '^ *pinhole:',
     'a configuration of stella_vslam': r'^ +setup: *"?(monocular|stereo|RGBD)',
     'a calibration of the MATLAB toolbox of Caltech': r'^ *fc *= *\[',
+    'a calibu rig': '<camera_model',
+    'a .mat file of MATLAB (write camera matrix, distortion and size as YAML)': '^MATLAB 5.0 MAT',
+    'a field layout of WPILib (a tag map, no lens)': r'"pose"\s*:\s*\{\s*"translation"',
 }
 
 
@@ -75,7 +86,7 @@ class Foreign(NamedTuple):
 
     form: of the file; lenses by camera; rigs: each camera in the next one; worst_px: how far each
     lens is from what the file says; cameras: of a rig without lenses, if it names them;
-    notes: what was assumed.
+    notes: what was assumed; rectified: R (3, 3) and P (3, 4) of a camera_info.
     """
 
     form: str
@@ -84,6 +95,7 @@ class Foreign(NamedTuple):
     worst_px: dict[str, float]
     cameras: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    rectified: tuple[Array, Array] | None = None
 
     @classmethod
     def from_lenses(

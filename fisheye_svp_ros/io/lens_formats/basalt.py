@@ -49,7 +49,7 @@ def read(text: str, where: str) -> Foreign:
 
 
 def _lens(name: str, camera: Mapping[str, Any], size: Any, where: str) -> tuple[Lens, float]:
-    kind = str(camera.get('camera_type'))
+    kind = str(camera.get('camera_type')).lower()
     if kind not in _MODELS:
         raise LensError(
             f'{where}: camera_type is {kind!r}; those that can be read are {", ".join(_MODELS)}'

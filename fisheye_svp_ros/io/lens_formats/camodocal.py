@@ -27,7 +27,7 @@ def recognises(text: str) -> bool:
 def read(text: str, where: str) -> Foreign:
     """Read the lens; raises LensError, naming the field."""
     document = fields.yaml(text, where)
-    model = document.get('model_type')
+    model = str(document.get('model_type')).upper()
     if model not in INTRINSICS:
         raise LensError(
             f'{where}: model_type is {model!r}; those that can be read are {", ".join(INTRINSICS)}'

@@ -9,7 +9,6 @@ from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 
 # Kimera's has camera_id in place of sensor_type.
 _OF_CAMERA = re.compile(r'^(sensor_type: *camera|camera_id:)', re.MULTILINE)
-_RADIAL_TANGENTIAL = ('radial-tangential', 'radial_tangential', 'radtan')
 
 
 def recognises(text: str) -> bool:
@@ -20,15 +19,15 @@ def recognises(text: str) -> bool:
 def read(text: str, where: str) -> Foreign:
     """Read the lens; raises LensError, naming the field."""
     document = fields.yaml(text, where)
-    model, kind = document.get('camera_model'), document.get('distortion_model', 'none')
-    if model != 'pinhole':
+    model, kind = document.get('camera_model'), str(document.get('distortion_model', 'none'))
+    if str(model).lower() != 'pinhole':
         raise LensError(f'{where}: camera_model is {model!r}; pinhole can be read')
-    name = 'distortion_coefficients'
-    if kind == 'equidistant':
+    name, stated = 'distortion_coefficients', models.stated_model(kind)
+    if stated == 'equidistant':
         k = fields.coefficients(document, name, (4,), where)
         distortion = models.Distortion(models.EQUIDISTANT, k)
-    elif kind in (*_RADIAL_TANGENTIAL, 'none'):
-        d = fields.coefficients(document, name, (4, 5), where) if kind != 'none' else ()
+    elif stated == 'plumb_bob' or kind.lower() == 'none':
+        d = fields.coefficients(document, name, (4, 5), where) if stated else ()
         distortion = models.opencv_distortion(d)
     else:
         raise LensError(

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.files import LARGEST_YAML, parse_yaml
 from fisheye_svp_ros.pose import Pose, nearest_rotation, rotation_from_quaternion
@@ -43,6 +44,23 @@ def numbers(mapping: Mapping[str, Any], name: str, count: int, where: str) -> li
     ):
         raise LensError(f'{where}: {name} must be a list of {count} finite numbers, is {values!r}')
     return [float(value) for value in values]
+
+
+def number_list(mapping: Mapping[str, Any], name: str, where: str) -> list[float]:
+    """Return a list of any length of numbers of a mapping; raise LensError naming the field."""
+    given = mapping.get(name)
+    return numbers(mapping, name, len(given) if isinstance(given, list) else 1, where)
+
+
+def matrix(mapping: Mapping[str, Any], name: str, shape: tuple[int, int], where: str) -> Array:
+    """Return the rows of a mapping as an array of a shape; raise LensError naming the field."""
+    rows = mapping.get(name)
+    flat = [
+        number
+        for row in (rows if isinstance(rows, list) else [])
+        for number in (row if isinstance(row, list) else [row])
+    ]
+    return np.reshape(numbers({name: flat}, name, shape[0] * shape[1], where), shape)
 
 
 def values(mapping: Mapping[str, Any], names: Sequence[str], where: str) -> list[float]:
@@ -102,6 +120,18 @@ def pose(place: ArrayLike, turn: ArrayLike, where: str) -> Pose:
     raise LensError(
         f'{where}: a translation and a quaternion of unit length or a rotation matrix are needed'
     )
+
+
+def rectified(r: Any, p: Any, where: str) -> tuple[Array, Array] | None:
+    """Return R (3, 3) and P (3, 4) of a camera_info, from lists; None where one is missing.
+
+    Raises LensError, naming `where`, for lists of other lengths.
+    """
+    if r is None or p is None:
+        return None
+    lists = (('R', r, 9), ('P', p, 12))
+    turn, projection = (numbers({name: one}, name, count, where) for name, one, count in lists)
+    return np.reshape(turn, (3, 3)), np.reshape(projection, (3, 4))
 
 
 def xml(text: str, where: str, form: str) -> ElementTree.Element:

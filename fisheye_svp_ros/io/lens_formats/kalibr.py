@@ -1,8 +1,13 @@
-"""Kalibr camchain YAML, OpenVINS's too: pinhole-equidistant as it stands, others by a fit."""
+"""Kalibr camchain YAML, OpenVINS's too: pinhole-equidistant as it stands, others by a fit.
+
+A camera stands in the one before (T_cn_cnm1) or, as both do, in the IMU (T_cam_imu brings points
+of the IMU into the camera, T_imu_cam the other way).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -30,23 +35,24 @@ def read(text: str, where: str) -> Foreign:
         (name for name in map(str, document) if name.startswith('cam')),
         key=lambda name: (len(name), name),
     )
-    lenses = {}
+    cameras = {name: fields.section(document, name, where) for name in names}
+    lenses = {name: _lens(name, camera, f'{where}: {name}') for name, camera in cameras.items()}
     rigs: list[Pose] = []
-    for number, name in enumerate(names):
-        camera = fields.section(document, name, where)
-        lenses[name] = _lens(name, camera, f'{where}: {name}')
-        if number and 'T_cn_cnm1' in camera:
-            if len(rigs) < number - 1:
-                raise LensError(
-                    f'{where}: {names[len(rigs) + 1]} has no T_cn_cnm1, and {name} '
-                    'after it has one; the chain is broken'
-                )
-            rigs.append(_rig(camera['T_cn_cnm1'], f'{where}: {name}'))
+    for number, (before, name) in enumerate(pairwise(names)):
+        step = _step(cameras, before, name, where)
+        if step is None:
+            continue
+        if len(rigs) < number:
+            raise LensError(
+                f'{where}: {names[len(rigs) + 1]} has no T_cn_cnm1, and {name} '
+                'after it has one; the chain is broken'
+            )
+        rigs.append(step)
     return Foreign.from_lenses('Kalibr', lenses, rigs)
 
 
 def _lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float]:
-    model = str(camera.get('camera_model'))
+    model = str(camera.get('camera_model')).lower()
     if model not in _INTRINSICS:
         raise LensError(f'{where}: camera_model is {model!r}; known are {", ".join(_INTRINSICS)}')
     *own, fx, fy, cx, cy = fields.numbers(camera, 'intrinsics', _INTRINSICS[model], where)
@@ -59,7 +65,7 @@ def _distortion(
     camera: Mapping[str, Any], model: str, own: Sequence[float], where: str
 ) -> models.Distortion:
     """Return what the image is distorted by; own: numbers of the model beside the intrinsics."""
-    kind = str(camera.get('distortion_model', 'none'))
+    kind = str(camera.get('distortion_model', 'none')).lower()
     d = (
         fields.coefficients(camera, 'distortion_coeffs', (_COEFFICIENTS[kind],), where)
         if (_COEFFICIENTS.get(kind))
@@ -84,12 +90,30 @@ def _distortion(
     )
 
 
-def _rig(rows: Any, where: str) -> Pose:
+def _step(
+    cameras: Mapping[str, Mapping[str, Any]], before: str, name: str, where: str
+) -> Pose | None:
+    """Return a camera's neighbor in it: as stated, or through the IMU of both; None: not known."""
+    if 'T_cn_cnm1' in cameras[name]:
+        return _transform(cameras[name], 'T_cn_cnm1', f'{where}: {name}')
+    poses = [_imu_in_camera(cameras[one], f'{where}: {one}') for one in (before, name)]
+    if poses[0] is None or poses[1] is None:
+        return None
+    return poses[1].compose(poses[0].inverse())
+
+
+def _imu_in_camera(camera: Mapping[str, Any], where: str) -> Pose | None:
+    if 'T_cam_imu' in camera:
+        return _transform(camera, 'T_cam_imu', where)
+    return _transform(camera, 'T_imu_cam', where).inverse() if 'T_imu_cam' in camera else None
+
+
+def _transform(camera: Mapping[str, Any], name: str, where: str) -> Pose:
     try:
-        matrix = np.array(rows, dtype=float).reshape(4, 4)
+        matrix = np.array(camera[name], dtype=float).reshape(4, 4)
     except (TypeError, ValueError) as cause:
-        raise LensError(f'{where}: T_cn_cnm1 must be a matrix of 4 x 4') from cause
-    return fields.pose(matrix[:3, 3], matrix[:3, :3], f'{where}: T_cn_cnm1')
+        raise LensError(f'{where}: {name} must be a matrix of 4 x 4') from cause
+    return fields.pose(matrix[:3, 3], matrix[:3, :3], f'{where}: {name}')
 
 
 def write(lens: Lens) -> str:

@@ -6,6 +6,7 @@ moved sideways: Brown and Conrady's p1, p2, numbered as OpenCV does, and thin pr
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -27,6 +28,18 @@ from fisheye_svp_ros.scene.observations import views_of
 HeightFormula = Callable[[Array], Array]  # image height over f of the incidence angle
 
 OPENCV = ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6')  # in its order
+# What programs call a distortion, without case and separators
+_NAMES = {
+    'equidistant': 'equidistant fisheye fisheye4 opencvfisheye kannalabrandt kannalabrandt4 '
+    'kannalabrandt8 kb kb4 kb8 equi',
+    'plumb_bob': 'plumbbob radtan radtan4 radtan5 radialtangential brown brownconrady '
+    'opencvstandard standard',
+    'rational_polynomial': 'rationalpolynomial rational radtan8',
+}
+_COUNTS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,)}  # of coefficients
+_RTABMAP_FISHEYE = 6  # coefficients
+_MODEL_OF = {name: model for model, names in _NAMES.items() for name in names.split()}
+STATED_MODELS = tuple(_NAMES)  # as sensor_msgs/CameraInfo calls them
 RADIAL_TERMS = 4  # radial coefficients that Kannala-Brandt has
 _GRID, _STEPS = 600, 40  # angles of a curve; angles and azimuths of an image
 _ANGLE_MARGIN = 1 - 1e-3  # of the angle at which a curve ends
@@ -173,6 +186,39 @@ def brown(base: Base, values: Mapping[str, float]) -> Distortion:
 def opencv_distortion(d: Sequence[float], base: Base = PERSPECTIVE) -> Distortion:
     """Return the distortion of coefficients in OpenCV's order, by default of a pinhole."""
     return brown(base, dict(zip(OPENCV, d, strict=False)))
+
+
+def stated_model(name: str) -> str | None:
+    """Return the one of STATED_MODELS that a name in any notation means; None for another."""
+    return _MODEL_OF.get(re.sub('[^a-z0-9]', '', name.lower()))
+
+
+def stated_distortion(model: str, d: Sequence[float], where: str) -> Distortion:
+    """Return the distortion of one of STATED_MODELS and its coefficients, in OpenCV's order.
+
+    Raises LensError, naming `where`, for another number of coefficients than the model has.
+    """
+    if model == 'equidistant':
+        # RTAB-Map has two zeros where p1 and p2 of a plumb_bob stand.
+        k = (*d[:2], *d[4:]) if len(d) == _RTABMAP_FISHEYE and not any(d[2:4]) else d
+        if len(k) < RADIAL_TERMS or any(k[RADIAL_TERMS:]):
+            raise LensError(f'{where}: {model} has {len(d)} coefficients; k1 to k4 are needed')
+        return Distortion(EQUIDISTANT, k[:RADIAL_TERMS])
+    counts = _COUNTS[model]
+    # More may be those of a thin prism and of a tilt; a model may be stated without distortion.
+    if len(d) not in counts and any(d[counts[-1] :] or d):
+        raise LensError(f'{where}: {model} has {len(d)} coefficients; {counts[-1]} are needed')
+    return opencv_distortion(d)
+
+
+def without_tilt(d: Sequence[float], where: str) -> list[float]:
+    """Return the coefficients of OpenCV up to k6; raise LensError where others are not 0."""
+    if any(d[len(OPENCV) :]):
+        raise LensError(
+            f'{where}: {len(d)} coefficients, with a thin prism or a tilt; the four '
+            'of cv2.fisheye, or five or eight of cv2.calibrateCamera can be read'
+        )
+    return list(d[: len(OPENCV)])
 
 
 def nearest_lens(

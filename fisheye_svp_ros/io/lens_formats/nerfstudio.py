@@ -44,7 +44,8 @@ def read(text: str, where: str) -> Foreign:
 
 
 def _lens(name: str, given: Mapping[str, Any], where: str) -> tuple[Lens, float]:
-    model = given.get('camera_model', _FISHEYE if given.get('is_fisheye') else 'OPENCV')
+    model = str(given.get('camera_model', _FISHEYE if given.get('is_fisheye') else 'OPENCV'))
+    model = model.upper()
     if model != _FISHEYE and model not in _PERSPECTIVE:
         raise LensError(
             f'{where}: camera_model is {model!r}; those that can be read are '

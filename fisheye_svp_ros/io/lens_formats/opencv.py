@@ -34,10 +34,13 @@ _COEFFICIENTS = (
 )
 _SIDES = (('1', '2'), ('0', '1'), ('l', 'r'), ('left', 'right'))
 _ROTATION, _TRANSLATION = ('r', 'rotation', 'rotationmatrix'), ('t', 'translation')
+_RECTIFIED = ('rectificationmatrix', 'projectionmatrix')  # as a camera_info has them
 _WIDTH, _HEIGHT = ('imagewidth', 'imgwidth', 'width'), ('imageheight', 'imgheight', 'height')
 _SIZE = ('imagesize', 'imgsize', 'size', 'framesize', 'resolution')
 _XI, _OF_FISHEYE = 'xi', 4
 _IS_FISHEYE = ('fisheyemodel', 'fisheye')  # 0 or 1; the first of OpenCV's own program
+_STATED = ('distortionmodel', 'distortiontype')  # by name: these decide
+_KIND = ('cameramodel', 'cameratype', 'modeltype', 'lensmodel')  # of a camera or its distortion
 # Entries that tell lists of other programs, as words and as single letters
 _LISTS = tuple(
     re.compile(
@@ -50,7 +53,7 @@ _LISTS = tuple(
         ('dist(?:ortion)?(?:_?coeff(?:icient)?s?)?', 'D'),
     )
 )
-_COUNTS = [shape for n in (4, 5, 8, 12, 14) for shape in ((1, n), (n, 1))]
+_COUNTS = [shape for n in (4, 5, 6, 8, 12, 14) for shape in ((1, n), (n, 1))]
 _FISHEYE_NOTE = (
     '4 coefficients are read as those of cv2.fisheye; add `fisheye_model: 0` for those of '
     'cv2.calibrateCamera'
@@ -106,8 +109,14 @@ def read(text: str, where: str) -> Foreign:
         place = _matrix(_value(named, _TRANSLATION, where), ((3, 1), (1, 3)), where)
         rigs = (fields.pose(place, turn, f'{where}: R, T'),)
     given = Foreign.from_lenses('OpenCV', lenses, rigs)
-    assumed = not {_XI, *_IS_FISHEYE} & {*named}
-    return given._replace(notes=(_FISHEYE_NOTE,) * (assumed and _has_four(named)))
+    assumed = not {_XI, *_IS_FISHEYE} & {*named} and not any(
+        models.stated_model(str(named.get(name, ''))) for name in (*_STATED, *_KIND)
+    )
+    r, p = (_matrix_numbers(named.get(name)) for name in _RECTIFIED)
+    return given._replace(
+        notes=(_FISHEYE_NOTE,) * (assumed and _has_four(named)),
+        rectified=fields.rectified(r, p, where),
+    )
 
 
 def _names_of_side(names: Sequence[str], side: str) -> list[str]:
@@ -157,7 +166,18 @@ def _image_size(named: Mapping[str, Any], where: str) -> list[float]:
 
 
 def _distortion(d: Sequence[float], named: Mapping[str, Any], where: str) -> models.Distortion:
-    """Four coefficients are those of cv2.fisheye, with xi of cv2.omnidir; more, of a pinhole."""
+    """Return what the file states; four coefficients alone are those of cv2.fisheye.
+
+    With xi they are those of cv2.omnidir; more than four are of a pinhole.
+    """
+    stated = {name: str(named[name]) for name in (*_STATED, *_KIND) if name in named}
+    if model := next(filter(None, map(models.stated_model, stated.values())), None):
+        return models.stated_distortion(model, d, where)
+    if _XI not in named and (unknown := next((stated[n] for n in _STATED if n in stated), '')):
+        raise LensError(
+            f'{where}: the distortion model is {unknown!r}; known are '
+            f'{", ".join(models.STATED_MODELS)} and fisheye'
+        )
     if _XI in named:
         given = named[_XI]
         xi = (
@@ -168,12 +188,7 @@ def _distortion(d: Sequence[float], named: Mapping[str, Any], where: str) -> mod
         return models.opencv_distortion(d, models.omnidirectional(xi))
     if len(d) == _OF_FISHEYE and all(named.get(name, 1) for name in _IS_FISHEYE):
         return models.Distortion(models.EQUIDISTANT, d)
-    if any(d[len(models.OPENCV) :]):
-        raise LensError(
-            f'{where}: {len(d)} coefficients, with a thin prism or a tilt; the four '
-            'of cv2.fisheye, or five or eight of cv2.calibrateCamera can be read'
-        )
-    return models.opencv_distortion(d)
+    return models.opencv_distortion(models.without_tilt(d, where))
 
 
 def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[float]:

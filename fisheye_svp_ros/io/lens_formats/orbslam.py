@@ -44,12 +44,12 @@ def _lens(name: str, prefix: str, document: Mapping[str, Any], where: str) -> tu
     def values(*names: str) -> list[float]:
         return fields.values(document, [f'{prefix}{name}' for name in names], where)
 
-    kind = document.get('Camera.type', 'PinHole')
+    kind = str(document.get('Camera.type', 'PinHole'))
     size = fields.values(document, ('Camera.width', 'Camera.height'), where)
     intrinsics = values('fx', 'fy', 'cx', 'cy')
-    if kind == 'KannalaBrandt8':
+    if models.stated_model(kind) == 'equidistant':
         distortion = models.Distortion(models.EQUIDISTANT, values('k1', 'k2', 'k3', 'k4'))
-    elif kind == 'PinHole':
+    elif kind.lower() == 'pinhole':
         names = [name for name in models.OPENCV if f'{prefix}{name}' in document]
         distortion = models.brown(
             models.PERSPECTIVE, dict(zip(names, values(*names), strict=True))

@@ -21,9 +21,6 @@ from fisheye_svp_ros.io.files import dump_yaml, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 
-# How many coefficients each distortion model of sensor_msgs/distortion_models has
-_PERSPECTIVE = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,)}
-_EQUIDISTANT = ('equidistant', 'fisheye')
 _TOLERANCE = 0.2  # px, of a perspective lens as one of ours
 _MESSAGE = re.compile('^[kK]:', re.MULTILINE)
 
@@ -60,10 +57,15 @@ def read(text: str, where: str) -> Foreign:
         raise LensError(f'{where}: not a whole camera_info; {cause.args[0]} is missing') from cause
     except (TypeError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
-    return Foreign.from_lenses(
+    given = Foreign.from_lenses(
         'ROS',
         {name: _fit_lens(model, size, (k[0], k[4], k[2], k[5], k[1]), tuple(d), name, where)},
     )
+    r, p = (
+        fields.section({key: {}, **document}, key, where).get('data')
+        for key in ('rectification_matrix', 'projection_matrix')
+    )
+    return given._replace(rectified=fields.rectified(r, p, where))
 
 
 def _read_message(text: str, where: str) -> Foreign:
@@ -78,7 +80,8 @@ def _read_message(text: str, where: str) -> Foreign:
         raise LensError(str(cause)) from cause
     except (LookupError, TypeError, ValueError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
-    return Foreign.from_lenses('ROS', {name: _fit_lens(*model, name, where)})
+    given = Foreign.from_lenses('ROS', {name: _fit_lens(*model, name, where)})
+    return given._replace(rectified=fields.rectified(told.get('r'), told.get('p'), where))
 
 
 @lru_cache(maxsize=64)
@@ -114,21 +117,13 @@ def _fit_lens(
     where: str,
 ) -> tuple[Lens, float]:
     """Return the nearest lens, however far off: a file is read with a warning."""
-    if model in _EQUIDISTANT:
-        if len(d) < 4 or any(d[4:]):
-            raise LensError(f'{where}: {model} has {len(d)} coefficients; k1 to k4 are needed')
-        distortion = models.Distortion(models.EQUIDISTANT, d[:4])
-    elif model in _PERSPECTIVE:
-        counts = _PERSPECTIVE[model]
-        # rational_polynomial may carry coefficients of a thin prism and a tilt as well.
-        if len(d) not in counts and any(d[counts[-1] :] or d):
-            raise LensError(f'{where}: {model} has {len(d)} coefficients; {counts[-1]} are needed')
-        distortion = models.opencv_distortion(d)
-    else:
+    stated = models.stated_model(model)
+    if stated is None:
         raise LensError(
             f'{where}: distortion_model is {model!r}; known are '
-            f'{", ".join((*_EQUIDISTANT, *_PERSPECTIVE))}'
+            f'{", ".join(models.STATED_MODELS)} and fisheye'
         )
+    distortion = models.stated_distortion(stated, d, where)
     try:
         with np.errstate(all='ignore'):
             return models.nearest_lens(name, size, intrinsics, distortion, where)
