@@ -45,14 +45,17 @@ def flat_rows(columns: Array) -> Array:
 
 
 class Batch:
-    """Methods of a named tuple whose fields, arrays or batches, share their leading axes."""
+    """Methods of a named tuple whose fields, arrays or batches, share their leading axes.
+
+    A field may be None, of all rows alike.
+    """
 
     __slots__ = ()
 
     def take(self, index: Any) -> Self:
         """Return what stands at `index` of the leading axes."""
         return self._from_fields(
-            part.take(index) if isinstance(part, Batch) else part[index]
+            part if part is None else part.take(index) if isinstance(part, Batch) else part[index]
             for part in self._fields_tuple()
         )
 
@@ -61,7 +64,7 @@ class Batch:
         for mine, new in zip(self._fields_tuple(), other._fields_tuple(), strict=True):
             if isinstance(mine, Batch):
                 mine.put(index, new)
-            else:
+            elif mine is not None:
                 mine[index] = new
 
     @classmethod
@@ -77,7 +80,11 @@ class Batch:
     @classmethod
     def _join_fields(cls, join: Any, parts: Sequence[Self]) -> Self:
         return cls._from_fields(
-            fields[0]._join_fields(join, fields) if isinstance(fields[0], Batch) else join(fields)
+            fields[0]
+            if fields[0] is None
+            else fields[0]._join_fields(join, fields)
+            if isinstance(fields[0], Batch)
+            else join(fields)
             for fields in zip(*(part._fields_tuple() for part in parts), strict=True)
         )
 

@@ -160,13 +160,15 @@ class _Views(NamedTuple):
     frame: Index
     camera: Index
     row: Index
+    landmark_covariance: Array | None = None
 
 
 class Views(_Views, Batch):
     """Observations in batch form: S views (one frame of one camera) of up to N points.
 
     points (S, N, 3), m; uv (S, N, 2), px; weight (S, N): 1 / sigma, 0 for padding; landmark,
-    board (S, N); t (S, N), s; frame, camera (S,); row (S, N): row of the table, -1 for padding.
+    board (S, N); t (S, N), s; frame, camera (S,); row (S, N): row of the table, -1 for padding;
+    landmark_covariance (S, N, 3, N, 3), m^2: of the points, None where they are exact.
     """
 
     __slots__ = ()
@@ -183,6 +185,9 @@ class Views(_Views, Batch):
 
     def take_points(self, at: Index) -> Views:
         """Return the same views with some of their N points."""
+        covariance = self.landmark_covariance
+        if covariance is not None:
+            covariance = covariance[:, at][:, :, :, at]
         return self._replace(
             points=self.points[:, at],
             uv=self.uv[:, at],
@@ -191,6 +196,7 @@ class Views(_Views, Batch):
             board=self.board[:, at],
             t=self.t[:, at],
             row=self.row[:, at],
+            landmark_covariance=covariance,
         )
 
 

@@ -14,12 +14,14 @@ from fisheye_svp_ros.optics.engines.results import Localization as Localization
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.initial_pose import candidate_poses, initial_poses
+from fisheye_svp_ros.solve.landmark_errors import generalized_equations
 from fisheye_svp_ros.solve.least_squares import (
     UNDETERMINED_EIGENVALUE,
     Arrays,
     dense_step,
     levenberg_marquardt,
     never_singular,
+    solve_damped,
     with_unit_diagonal,
 )
 
@@ -27,6 +29,8 @@ MIN_POINTS, FEW_POINTS = 4, 6
 _STARTING_STEPS = 4  # from rough poses to ones that a joint solution can begin with
 _MOTIONS = 3  # times that velocities and poses follow from each other
 _MIN_SEPARATION = 0.01  # squared Mahalanobis distance of two minima
+_WEIGHINGS = 2  # steps from a pose by exact landmarks to one by their errors
+_VIEWS_AT_ONCE = 64  # whose noise is a full matrix
 
 
 def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Localization:
@@ -36,6 +40,7 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
     small looks, tilted to one side, like tilted to the other, and the misfit has a minimum on
     either side (Schweighofer and Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014): both are tried.
     So are all minima of views with fewer than FEW_POINTS points.
+    Landmarks that have a covariance are weighed by it (`solve.landmark_errors`).
     What a lens has that follows from motion (a rolling shutter) needs times: velocities are those
     between the poses of neighboring views.
     Raises GeometryError, naming the frame, for fewer than MIN_POINTS usable points.
@@ -105,7 +110,43 @@ def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localiza
             _improve(
                 model, views, found, few, candidate_poses(some.points, direction, some.weight)
             )
+    if views.landmark_covariance is not None:
+        rows = np.flatnonzero(found.converged)
+        for first in range(0, len(rows), _VIEWS_AT_ONCE):
+            _weigh_landmarks(model, views, found, rows[first : first + _VIEWS_AT_ONCE])
     return found
+
+
+def _weigh_landmarks(
+    model: ForwardModel, views: Views, localization: Localization, rows: Index
+) -> None:
+    """Write to views (R,), solved by exact landmarks, what comes of their covariance."""
+    before, seen = localization.take(rows), views.take(rows)
+    weighed, two = _weigh_from(model, seen, before.pose), np.flatnonzero(np.isfinite(before.gap))
+    if two.size:
+        second = _weigh_from(model, seen.take(two), before.other.take(two))
+        first = weighed.take(two)
+        better = second.cost < first.cost
+        weighed.put(two[better], second.take(better))
+        weighed.other.put(two, first.pose.where(better, second.pose))
+        weighed.gap[two] = np.abs(second.cost - first.cost)
+    localization.put(rows, weighed._replace(iterations=before.iterations))
+
+
+def _weigh_from(model: ForwardModel, views: Views, pose: Pose) -> Localization:
+    """Return the minima (S,) near poses (S,), landmarks being weighed by their covariance."""
+    cost, (hessian, gradient) = pose_equations(model, pose, views)
+    for _ in range(_WEIGHINGS):
+        trial = pose.retract(solve_damped(hessian, gradient, np.zeros(len(cost))))
+        lower, normal = pose_equations(model, trial, views)
+        seen = np.isfinite(lower)
+        pose, cost = trial.where(seen, pose), np.where(seen, lower, cost)
+        hessian = np.where(seen[:, None, None], normal[0], hessian)
+        gradient = np.where(seen[:, None], normal[1], gradient)
+    covariance, fixed = _covariance(hessian)
+    covariance[~fixed] = np.nan
+    off, no_steps = residuals(model, pose, views), np.zeros(len(cost), dtype=np.int64)
+    return Localization.of_one_minimum(pose, covariance, off, cost, fixed, no_steps)
 
 
 def _improve(
@@ -261,7 +302,7 @@ class _Localization:
 
     def __init__(self, model: ForwardModel, views: Views) -> None:
         self._model = model
-        self._views = views
+        self._views = views._replace(landmark_covariance=None)  # see `_weigh_landmarks`
 
     def linearize(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         views = self._views
@@ -275,11 +316,13 @@ class _Localization:
 
 def pose_equations(model: ForwardModel, pose: Pose, views: Views) -> tuple[Array, Arrays]:
     """Return costs (S,) and (H (S, 6, 6), g (S, 6)) of poses (S,), each the only unknown."""
-    if model.is_lens_only and model.lens.is_bare:
+    exact = views.landmark_covariance is None
+    if exact and model.is_lens_only and model.lens.is_bare:
         cost, *normal = engines.pose_equations(model.lens, *pose, views.solver_inputs)
         return cost, tuple(normal)
     linear = model.linearize(pose, views)
-    return normal_equations(linear.uv, model.d_pose(linear, views), views)
+    equations = normal_equations if exact else generalized_equations
+    return equations(linear.uv, model.d_pose(linear, views), views)
 
 
 def normal_equations(uv: Array, jacobian: Array, views: Views) -> tuple[Array, Arrays]:

@@ -17,6 +17,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.initial_pose import initial_poses
+from fisheye_svp_ros.solve.landmark_errors import with_own_errors
 from fisheye_svp_ros.solve.localization import (
     MIN_POINTS,
     Localization,
@@ -116,7 +117,8 @@ def _examine(
     """Examine with a sigma in units of 1 / weight; tolerance: of the misfit, as a factor."""
     freedom = 2 * (views.weight > 0).sum(axis=1) - 6
     allowed = (tolerance * sigma) ** 2
-    suspect = ~localization.converged | _suspect(views, localization, freedom, allowed)
+    own = with_own_errors(model, views, localization.pose)
+    suspect = ~localization.converged | _suspect(own, localization, freedom, allowed)
     result, reasons = localization, _far_reasons(views, localization)
     gross = np.zeros(views.used.shape, dtype=bool)
     if not suspect.any():
@@ -125,7 +127,7 @@ def _examine(
     for i in np.flatnonzero(suspect):
         view = views.take([i])
         other = (
-            _consensus_pose(model, view, localization.take([i]), sigma, tolerance)
+            _consensus_pose(model, view, own.take([i]), localization.take([i]), sigma, tolerance)
             if searched
             else None
         )
@@ -201,21 +203,29 @@ def noise_sigma(cost: float, rows: int, unknowns: int) -> float:
 
 
 def _consensus_pose(
-    model: ForwardModel, view: Views, localization: Localization, sigma: float, tolerance: float
+    model: ForwardModel,
+    view: Views,
+    own: Views,
+    localization: Localization,
+    sigma: float,
+    tolerance: float,
 ) -> Localization | None:
-    """Return the pose that most points of one view (1,) agree on, residuals NaN for the others."""
+    """Return the pose that most points of one view (1,) agree on, residuals NaN for the others.
+
+    own: the view with weights of independent errors.
+    """
     used = view.weight > 0
     enough = max(MIN_POINTS + _SPARE_POINTS, _MIN_AGREEMENT * used.sum())
     if (used & model.back_project(view.uv).valid).sum() < enough:
         return None
-    start = consensus_pose(model, view, localization, sigma)
+    start = consensus_pose(model, own, localization, sigma)
     for _ in range(_ROUNDS):
-        inside = _lengths(model, start, view) < _GROSS * tolerance * sigma
+        inside = _lengths(model, start, own) < _GROSS * tolerance * sigma
         if inside.sum() < enough:
             return None
         kept = view._replace(weight=np.where(inside, view.weight, 0.0))
         solved = localize(model, kept, start)
-        if np.array_equal(_lengths(model, solved.pose, view) < _GROSS * tolerance * sigma, inside):
+        if np.array_equal(_lengths(model, solved.pose, own) < _GROSS * tolerance * sigma, inside):
             break
         start = solved.pose
     allowed = (tolerance * sigma) ** 2

@@ -55,11 +55,14 @@ def hold_weak_geometry(
     if weak.size:
         covariance = covariance.copy()
         double = localization.gap[weak] < _MAX_GAP
+        at_once = _VIEWS_AT_ONCE
+        if views.landmark_covariance is not None:  # whose noise is a full matrix
+            at_once = max(1, at_once // views.weight.shape[1])
         many = double | (curvature > _MANY_CURVATURE)
         for two, nodes in ((True, _MANY_NODES), (False, _MANY_NODES), (False, _NODES)):
             group = weak[(double == two) & (many == (nodes == _MANY_NODES))]
-            for start in range(0, len(group), _VIEWS_AT_ONCE):
-                rows = group[start : start + _VIEWS_AT_ONCE]
+            for start in range(0, len(group), at_once):
+                rows = group[start : start + at_once]
                 some, seen = localization.take(rows), views.take(rows)
                 minima = (some.pose, some.other)[: 1 + two]
                 covariance[rows] = _integrate(model, seen, minima, deviation[rows], nodes)
