@@ -26,6 +26,7 @@ _HOMES = {
     'load_lens': 'library.functions',
     'load_rig': 'io.rig_files',
     'save_lens': 'library.functions',
+    'resize_lens': 'library.lenses',
     'project': 'library.functions',
     'back_project': 'library.functions',
     'localize': 'library.functions',

@@ -5,14 +5,17 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 
+from fisheye_svp_ros.commands.detect import image_size
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import note_reader_limit, say
 from fisheye_svp_ros.commands.outputs import output_file
 from fisheye_svp_ros.effects.extension import LANDMARKS
 from fisheye_svp_ros.effects.forward import project_corrected
+from fisheye_svp_ros.effects.resizing import ImageChange
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file, save_lens
@@ -25,6 +28,7 @@ from fisheye_svp_ros.io.lens_formats import (
 )
 from fisheye_svp_ros.io.rig_files import load_cameras, rigs_of_lenses, save_rig
 from fisheye_svp_ros.io.share import typed_lens_path
+from fisheye_svp_ros.library.lenses import change_image
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import IMAGE_FIELD, PORT, Lens
 from fisheye_svp_ros.pose import Pose
@@ -35,6 +39,7 @@ from fisheye_svp_ros.scene.observations import STEREO
 _ANGLES, _RANGES = (20, 40, 60, 75, 85, 95, 105), (0.1, 0.2, 0.5, 2.0)  # deg, m
 _AZIMUTHS = np.radians(np.arange(0, 360, 15))  # the axis
 _VISIBLE_PX = 5e-4  # px
+_STRETCH = 2e-3  # of one axis against the other, beyond what rounding to whole pixels does
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -59,6 +64,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='range, m or inf, at which a format with a single viewpoint is '
         'fitted to a lens whose viewpoint moves',
     )
+    parser.add_argument(
+        '--crop',
+        type=_crop,
+        metavar='X,Y,W,H',
+        help='show and write the lens of a part of the image, px: first column and row, size',
+    )
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument(
+        '--scale',
+        type=_scale,
+        metavar='FACTOR',
+        help='of an image resized by a factor, such as 1/2, after --crop (pixel centers are at '
+        'whole numbers: cx becomes (cx + 0.5) / 2 - 0.5, as binning and cv2.INTER_AREA do)',
+    )
+    size.add_argument(
+        '--size', type=image_size, metavar='WxH', help='of an image resized to a size, px'
+    )
 
 
 def run(args: argparse.Namespace) -> None:
@@ -69,12 +91,13 @@ def run(args: argparse.Namespace) -> None:
         raise ParameterError(f'--range {args.range_m:g} needs --format, for example ros')
     path = typed_lens_path(args.lens)
     foreign = read_lens_file(path)
-    if foreign is not None and not foreign.lenses and not args.format:
+    changed = (args.crop, args.scale, args.size) != (None, None, None)
+    if foreign is not None and not foreign.lenses and not args.format and not changed:
         _print_rig(foreign.rigs)
         if args.output:
             save_rig(foreign.rigs, args.output, foreign.cameras or STEREO)
         return
-    lens = load_with_notes(path)
+    lens = _changed(load_with_notes(path), args) if changed else load_with_notes(path)
     several = cameras_in(path)
     steps = rigs_of_lenses(path) if several else ()
     chain = load_cameras(path)[0] if steps else ()
@@ -110,11 +133,47 @@ def run(args: argparse.Namespace) -> None:
     _print_rig(steps)
     if args.output and args.format:
         cameras = [load_lens(f'{path}#{name}') for name in chain] if whole else []
+        cameras = [_changed(camera, args) for camera in cameras] if changed else cameras
         _convert(cameras or [lens], steps if cameras else (), args)
     elif args.output:
         save_lens(lens, args.output)
     if args.output:
         print(f'{args.output}: {args.format or "lens file of this package"}')
+
+
+def _changed(lens: Lens, args: argparse.Namespace) -> Lens:
+    """Return the lens of the image that the arguments ask for; say what that loses."""
+    change = ImageChange.of((lens.width, lens.height), args.crop, args.scale, args.size)
+    resized, lost = change_image(lens, change)
+    if lost:
+        say(f'left out, since the pixels have another size: {", ".join(lost)}')
+    if abs(np.log(change.scale[0] / change.scale[1])) > _STRETCH:
+        say(
+            f'{args.size[0]}x{args.size[1]} px stretches the image by '
+            f'{change.scale[0]:.4g} along u and {change.scale[1]:.4g} along v; if it was cut, '
+            'state the part by --crop'
+        )
+    return resized
+
+
+def _crop(text: str) -> tuple[int, int, int, int]:
+    """Return X, Y, width and height, px, of a text such as 0,40,1280,720."""
+    words = text.split(',')
+    if len(words) != 4 or not all(word.strip().isdecimal() for word in words):
+        raise argparse.ArgumentTypeError(f'{text!r} is not of the form X,Y,WIDTH,HEIGHT, px')
+    x, y, width, height = map(int, words)
+    return x, y, width, height
+
+
+def _scale(text: str) -> float:
+    """Return the factor of a text such as 1/2 or 0.5."""
+    try:
+        factor = float(Fraction(text))
+    except (ValueError, ZeroDivisionError, OverflowError):
+        factor = 0.0
+    if not 0 < factor < np.inf:
+        raise argparse.ArgumentTypeError(f'{text!r} is no factor above 0, such as 1/2 or 0.5')
+    return factor
 
 
 def _convert(lenses: Sequence[Lens], steps: Sequence[Pose], args: argparse.Namespace) -> None:

@@ -58,7 +58,13 @@ from fisheye_svp_ros.diagnosis.findings import (
     status_of,
 )
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
-from fisheye_svp_ros.diagnosis.model_errors import ErrorParts, LensErrors, pose_maps, pose_summary
+from fisheye_svp_ros.diagnosis.model_errors import (
+    ErrorParts,
+    LensErrors,
+    pose_maps,
+    pose_summary,
+    resize_uncertainty,
+)
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, can_be_included
 from fisheye_svp_ros.diagnosis.stages import diagnose, diagnose_against
@@ -121,6 +127,7 @@ __all__ = [
     'pose_summary',
     'predict_board',
     'predict_other_data',
+    'resize_uncertainty',
     'stage_shares',
     'standard_errors',
     'status_of',

@@ -17,6 +17,7 @@ from fisheye_svp_ros.arrays import Array, Index, Mask, flat_rows
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
 from fisheye_svp_ros.diagnosis.null_model import FINEST_FIELD, NullModel
 from fisheye_svp_ros.diagnosis.random_effects import (
+    IN_MILLIMETRES,
     MILLIMETRE,
     NAMES,
     STAGE_OF,
@@ -26,6 +27,7 @@ from fisheye_svp_ros.diagnosis.random_effects import (
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.extension import Target
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.resizing import ImageChange, resize_covariance
 from fisheye_svp_ros.effects.target_map import KnownTarget
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.mixed_model import (
@@ -376,6 +378,30 @@ def calibrated_covariance(lens: Lens) -> tuple[tuple[str, ...], Array] | None:
             'leave it out'
         ) from cause
     return names, whole
+
+
+def resize_uncertainty(entry: Mapping[str, Any], change: ImageChange) -> dict[str, Any]:
+    """Return what the file of a lens says of its errors, for an image that is cut and scaled.
+
+    change: of both axes alike.
+    """
+    scale = change.mean_scale
+    found = dict(entry)
+    for name in ('noise_px', 'misfit_px', 'finest_px'):
+        if isinstance(entry.get(name), float):
+            found[name] = scale * entry[name]
+    if 'extent_px' in entry:
+        found['extent_px'] = change.apply(np.array(entry['extent_px'], dtype=float)).tolist()
+    if 'covariance' in entry:
+        names, covariance = entry['parameters'], np.array(entry['covariance'], dtype=float)
+        covariance = covariance.reshape(len(names), len(names))
+        found['covariance'] = resize_covariance(names, covariance, change).tolist()
+    if 'components' in entry:
+        found['components'] = {
+            name: size if name in IN_MILLIMETRES else scale * size
+            for name, size in entry['components'].items()
+        }
+    return found
 
 
 @dataclass(frozen=True)

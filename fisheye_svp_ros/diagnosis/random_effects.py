@@ -43,6 +43,8 @@ STAGE_OF = {
     SAG: 'frame',
 }
 NAMES = tuple(STAGE_OF)
+# Whose sizes are lengths on the target; those of all others are px
+IN_MILLIMETRES = {*(name for name in NAMES if STAGE_OF[name] == 'target'), 'frame_bend', SAG}
 OF_LANDMARKS = np.array([name.startswith('landmark') for name in NAMES])  # components
 # Of many coefficients, seldom called for: asked for beside all others that are there.
 _NUMEROUS = np.isin(NAMES, ('frame_bumps', 'image_fine', 'image_finest'))

@@ -235,6 +235,13 @@ class Effect(ABC):
         """
         return values
 
+    def resize_values(self, values: Array, scale: float, rows: float) -> Array | None:
+        """Return the values for an image whose pixels are scaled; None where there are none.
+
+        scale: of the focal length, px; rows: share of the old image's rows that it has.
+        """
+        return values * [scale if one.unit == 'px' else 1.0 for one in self.parameters]
+
     def merge_with(self, other: Self) -> Effect:
         """Return the form that holds this one and another of the same effect."""
         return other

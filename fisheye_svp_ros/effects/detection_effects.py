@@ -111,6 +111,9 @@ class DetectorBiasEffect(Effect):
         columns[..., 1, 2], columns[..., 1, 3] = np.sin(phase[..., 1]), np.cos(phase[..., 1])
         return columns
 
+    def resize_values(self, values: Array, scale: float, rows: float) -> Array | None:
+        return values if scale == 1 else None  # other pixels have other phases
+
 
 @dataclass(frozen=True)
 class WrongIdsEffect(NoiseEffect):

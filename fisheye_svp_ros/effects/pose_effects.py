@@ -40,6 +40,9 @@ class RollingShutterEffect(Effect):
         fraction = scene.uv[..., 1] / scene.lens.height - 0.5
         return np.asarray((fraction[..., None] * scene.twist[:, None, :])[..., None])
 
+    def resize_values(self, values: Array, scale: float, rows: float) -> Array:
+        return values * rows
+
 
 @dataclass(frozen=True)
 class StereoTimeOffsetEffect(Effect):
