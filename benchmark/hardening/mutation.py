@@ -15,17 +15,11 @@ import json
 import os
 import random
 import shutil
-import signal
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
-from importlib import import_module
 from itertools import accumulate, islice
-from multiprocessing import get_context
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 from cosmic_ray.ast import ast_nodes, get_ast
@@ -34,6 +28,7 @@ from cosmic_ray.plugins import get_operator, operator_names
 from rich.progress import track
 
 from benchmark.hardening.mutation_reach import Reach, load, trace
+from benchmark.hardening.trial import failing_test, preload
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = Path('fisheye_svp_ros')
@@ -55,26 +50,6 @@ COMPILED = {
     'optics/rays.py',
     *(f'optics/engines/{name}.py' for name in ('kernels', 'adjustment', 'entries', 'marquardt')),
 }
-FORK = get_context('fork')
-# What the tests import of others, loaded once for all mutants.
-PRELOADED = (
-    'pytest',
-    'hypothesis',
-    'numpy',
-    'scipy.optimize',
-    'scipy.stats',
-    'scipy.spatial',
-    'scipy.sparse.linalg',
-    'numba',
-    'cv2',
-    'matplotlib.pyplot',
-    'rosbags.highlevel',
-    'yaml',
-    'pyarrow.parquet',
-    'rclpy.node',
-    'rich.console',
-    'jinja2',
-)
 BY_HAND = '\n<!-- what the survivors are: by hand -->\n'  # kept from here on
 KINDS = {
     'NumberReplacer': 'a number one off',
@@ -169,7 +144,7 @@ def verdict(
     chosen, patience = tests[:within], 120.0 + 4.0 * sum(seconds[:within])
     kinds = [{'NUMBA_DISABLE_JIT': '1'}] if compiled else []
     for environment in [*kinds, {'NUMBA_DISABLE_JIT': '0'}]:
-        found = _failing(chosen, tree, environment, patience, log)
+        found = failing_test(chosen, tree, environment, patience, log)
         if found and (found != 'hung' or environment['NUMBA_DISABLE_JIT'] == '0'):
             return found
     return (
@@ -177,44 +152,6 @@ def verdict(
         if within == len(tests)
         else (f'survived {budget:g} s of {sum(seconds):.0f} s of tests')
     )
-
-
-def _failing(
-    tests: list[str], tree: Path, environment: dict[str, str], patience: float, log: Path
-) -> str:
-    """Return the first test that fails, 'hung', or nothing, in a process that is forked."""
-    child = FORK.Process(target=_run_tests, args=(tests, tree, environment, log))
-    child.start()
-    child.join(patience)
-    hung = child.exitcode is None
-    with suppress(ProcessLookupError):
-        os.killpg(child.pid or 0, signal.SIGKILL)  # with what tests have started
-    child.join()
-    if hung or child.exitcode == 0:
-        return 'hung' if hung else ''
-    lines = log.read_text(encoding='utf-8', errors='replace').splitlines()
-    failed = [line for line in lines if line.startswith(('FAILED ', 'ERROR '))]
-    return failed[0].split(' ', 1)[1].split(' - ')[0] if failed else f'exit {child.exitcode}'
-
-
-def _run_tests(tests: list[str], tree: Path, environment: dict[str, str], log: Path) -> None:
-    os.setsid()
-    with log.open('wb') as stream:
-        for descriptor in (1, 2):
-            os.dup2(stream.fileno(), descriptor)
-    os.chdir(tree)
-    sys.path.insert(0, str(tree))
-    for name in [name for name in sys.modules if name.startswith('benchmark')]:
-        del sys.modules[name]
-    sys.modules['__main__'] = ModuleType('__main__')  # which processes of the tests import, too
-    os.environ |= environment | {'PYTHONPATH': str(tree), 'OMP_NUM_THREADS': '1'}
-    sys.dont_write_bytecode = True  # a fault may have the size and the second of its original
-    os.environ['PYTHONDONTWRITEBYTECODE'] = '1'
-    if (numba := sys.modules.get('numba')) is not None:
-        numba.config.DISABLE_JIT = int(environment['NUMBA_DISABLE_JIT'])
-    import pytest
-
-    os._exit(int(pytest.main(['-x', '-q', '-p', 'no:cacheprovider', *tests])))
 
 
 def attempt(mutant: Mutant, tree: Path, reach: Reach, budget: float) -> str:
@@ -251,9 +188,7 @@ def run(mutants: list[Mutant], folder: Path, budget: float) -> dict[str, str]:
     )
     open_ones = [mutant for mutant in mutants if _key(mutant) not in known]
     reach = load(tree, folder / 'reach')
-    for name in PRELOADED:
-        with suppress(ImportError):
-            import_module(name)
+    preload()
     with state.open('a', encoding='utf-8') as stream:
         for mutant in track(open_ones, 'mutants'):
             known[_key(mutant)] = attempt(mutant, tree, reach, budget)
