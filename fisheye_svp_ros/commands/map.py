@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Find the tags, map them, print and write the map."""
     from fisheye_svp_ros.detect.photographs import find_photographs
-    from fisheye_svp_ros.detect.tags import find_tag_views, tag_size
+    from fisheye_svp_ros.detect.tags import FAMILY, find_tag_views, tag_size
     from fisheye_svp_ros.io.tag_maps import map_of_size, write_tag_map
     from fisheye_svp_ros.solve.tag_mapping import map_tags
 
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> None:
     check_sizes(args.recording[0], {'': seen.size}, {'': lens})
     with progress('mapping'):
         tag_map = map_tags(ForwardModel(lens), seen.image, seen.ids, seen.uv, size, args.origin)
-    tags = map_of_size(tag_map.ids, size, tag_map.poses)
+    tags = map_of_size(tag_map.ids, size, tag_map.poses, FAMILY)
     print_table(
         f'{len(tag_map.ids)} tags from {len(tag_map.images)} of {len(seen.names)} images, '
         f'rms {tag_map.rms_px:.3f} px',

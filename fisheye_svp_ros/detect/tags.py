@@ -19,6 +19,7 @@ from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.tag_maps import CORNERS
 from fisheye_svp_ros.scene.observations import Landmarks
 
+FAMILY = '36h11'
 # libapriltag goes round a tag from its lower left, against the clock; OpenCV's print of a tag is
 # that of libapriltag turned by half.
 _ORDER = [1, 0, 3, 2]

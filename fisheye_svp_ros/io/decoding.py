@@ -159,13 +159,19 @@ class LandmarkSet(NamedTuple):
 
 
 class ImagePoints(NamedTuple):
-    """landmark (N,); uv (N, 2), px; frame: the camera's frame_id; rejected: as in LandmarkSet."""
+    """landmark (N,); uv (N, 2), px; frame: the camera's frame_id; rejected: as in LandmarkSet.
+
+    tag (N,): that each belongs to, None where landmarks belong to none; doubtful_tags: how many
+    tags the detector itself doubts, which are left out.
+    """
 
     landmark: Index
     uv: Array
     frame: str
     rejected: int = 0
     reason: str = ''
+    tag: Index | None = None
+    doubtful_tags: int = 0
 
 
 class FramedPose(NamedTuple):

@@ -5,6 +5,7 @@ A tag's frame is that of apriltag_ros: the middle of the tag, x right, y up, z o
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,17 +20,19 @@ from fisheye_svp_ros.scene.observations import Landmarks
 
 CORNERS = 4  # of a tag, landmark CORNERS * id + corner: from its lower left, against the clock
 CENTER_OFFSET = 100_000_000  # landmark of the middle of a tag, before its id
+_FAMILY_PREFIX = re.compile(r'^(dict_)?(april)?_?(tag)?_?')
 _MAX_ID = 1_000_000
 _MAX_SIZE = 10.0  # m; a larger tag is a slip of the unit
 _UNIT_CORNERS = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
 
 
 class TagMap(NamedTuple):
-    """Tags (T,): id, side, m, pose in the frame of the map."""
+    """Tags (T,): id, side, m, pose in the frame of the map; family: '' where it is not stated."""
 
     ids: Index
     sizes: Array
     poses: Pose
+    family: str = ''
 
     @property
     def corners(self) -> Array:
@@ -48,9 +51,15 @@ class TagMap(NamedTuple):
         )
 
 
-def map_of_size(ids: Index, size: float, poses: Pose) -> TagMap:
+def tags_of(landmarks: Index) -> Index:
+    """Return the tags (N,) that landmarks (N,) of `TagMap.landmarks` belong to."""
+    corner = landmarks < CENTER_OFFSET
+    return np.asarray(np.where(corner, landmarks // CORNERS, landmarks - CENTER_OFFSET))
+
+
+def map_of_size(ids: Index, size: float, poses: Pose, family: str = '') -> TagMap:
     """Return a map of tags (T,) of one size, m."""
-    return TagMap(ids, np.full(len(ids), size), poses)
+    return TagMap(ids, np.full(len(ids), size), poses, family)
 
 
 def read_tag_map(path: str | Path) -> TagMap:
@@ -79,7 +88,21 @@ def read_tag_map(path: str | Path) -> TagMap:
     if len(np.unique(ids)) < len(ids):
         twice = next(one for one in ids.tolist() if (ids == one).sum() > 1)
         raise ObservationError(f'{path}: tag id {twice} is listed twice; remove one')
-    return TagMap(ids, np.array([tag[1] for tag in tags]), Pose.stack([tag[2] for tag in tags]))
+    sizes, poses = np.array([tag[1] for tag in tags]), Pose.stack([tag[2] for tag in tags])
+    return TagMap(ids, sizes, poses, _read_family(document, path))
+
+
+def check_family(seen: str, stated: str, where: str) -> None:
+    """Raise ObservationError where tags that were seen are of another family than the map's.
+
+    Names as libapriltag and OpenCV have them: tag36h11, 36h11, DICT_APRILTAG_36H11.  What is not
+    known passes.
+    """
+    if seen and stated and _plain_family(seen) != _plain_family(stated):
+        raise ObservationError(
+            f'{where}: its tags are of family {seen!r}, those of the map of {stated!r}; set the '
+            'detector to that family, or map the tags again'
+        )
 
 
 def write_tag_map(
@@ -99,7 +122,19 @@ def write_tag_map(
         for i in range(len(tags.ids))
     ]
     head = f'# {about}\n' if about else ''
-    write_text(path, head + dump_yaml({'tags': entries}))
+    family = {'family': tags.family} if tags.family else {}
+    write_text(path, head + dump_yaml({**family, 'tags': entries}))
+
+
+def _plain_family(name: str) -> str:
+    return _FAMILY_PREFIX.sub('', name.lower()).replace('_', '')
+
+
+def _read_family(document: Mapping[str, Any], path: str | Path) -> str:
+    family = document.get('family', document.get('tag_family', ''))
+    if not isinstance(family, str):
+        raise ObservationError(f'{path}: family is {family!r:.40}; a name such as 36h11 is needed')
+    return family
 
 
 def _from_bundle(entry: Any) -> Any:

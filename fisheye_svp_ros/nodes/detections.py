@@ -3,28 +3,50 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.decoding import ImagePoints
-from fisheye_svp_ros.io.tag_maps import CENTER_OFFSET, CORNERS
+from fisheye_svp_ros.io.tag_maps import CENTER_OFFSET, CORNERS, check_family, tags_of
+from fisheye_svp_ros.reporting.wording import inputs as wording
 
 _LAST_NUMBER = re.compile(r'(\d{1,6})\D*$')  # of an id such as tag36h11:5
 
 
-def detections_reader(package: str) -> tuple[Any, Callable[[Any, str], ImagePoints]]:
+class TagLimits(NamedTuple):
+    """Which tags of a detector are used, and the family of the map, '' where it is not known."""
+
+    max_hamming: int = 1
+    min_decision_margin: float = 10.0
+    family: str = ''
+
+    def pass_tag(self, tag: Any) -> bool:
+        """Say whether a detection is sure enough; a margin of 0 is one that is not stated."""
+        margin = float(tag.decision_margin)
+        return tag.hamming <= self.max_hamming and not 0 < margin < self.min_decision_margin
+
+
+DEFAULT_LIMITS = TagLimits()
+
+
+def detections_reader(
+    package: str, limits: TagLimits
+) -> tuple[Any, Callable[[Any, str], ImagePoints]]:
     """Return the message class of detections, and what decodes one.
 
     package: apriltag_msgs or vision_msgs.  Raises ParameterError where it is not installed.
     """
-    name, read = {
-        'apriltag_msgs': ('AprilTagDetectionArray', read_apriltags),
+    kinds: dict[str, tuple[str, Callable[[Any, str], ImagePoints]]] = {
+        'apriltag_msgs': ('AprilTagDetectionArray', partial(read_apriltags, limits=limits)),
         'vision_msgs': ('Detection2DArray', read_detections),
-    }[package]
+    }
+    name, read = kinds[package]
     try:
         return getattr(import_module(f'{package}.msg'), name), read
     except ImportError as cause:
@@ -34,12 +56,23 @@ def detections_reader(package: str) -> tuple[Any, Callable[[Any, str], ImagePoin
         ) from cause
 
 
-def read_apriltags(message: Any, topic: str = 'detections') -> ImagePoints:
-    """Return the corners of tags; libapriltag puts pixel centers at a half."""
-    tags = message.detections
+def read_apriltags(
+    message: Any, topic: str = 'detections', limits: TagLimits = DEFAULT_LIMITS
+) -> ImagePoints:
+    """Return the corners of tags; libapriltag puts pixel centers at a half.
+
+    Raises ObservationError for tags of another family than those of the map.
+    """
+    for family in {str(tag.family) for tag in message.detections}:
+        check_family(family, limits.family, topic)
+    counts = Counter(int(tag.id) for tag in message.detections)
+    tags = [tag for tag in message.detections if limits.pass_tag(tag) and counts[tag.id] == 1]
     ids = [CORNERS * int(tag.id) + corner for tag in tags for corner in range(CORNERS)]
     uv = [(corner.x - 0.5, corner.y - 0.5) for tag in tags for corner in tag.corners]
-    return _image_points(ids, uv, message, topic)
+    doubtful = len(message.detections) - len(tags)
+    if doubtful and not tags:
+        raise ObservationError(f'{topic}: {wording.doubtful_tags(doubtful, doubtful)}')
+    return _image_points(ids, uv, message, topic)._replace(doubtful_tags=doubtful)
 
 
 def read_detections(message: Any, topic: str = 'detections') -> ImagePoints:
@@ -60,15 +93,16 @@ def _image_points(
 ) -> ImagePoints:
     if not ids:
         raise ObservationError(f'{topic}: it holds no tag')
-    points = np.array(uv, dtype=float)
+    points, landmark = np.array(uv, dtype=float), np.array(ids, dtype=np.int64)
     usable = np.isfinite(points).all(axis=1)
     if not usable.any():
         raise ObservationError(f'{topic}: no image point is a finite number')
     rejected = int((~usable).sum())
     return ImagePoints(
-        np.array(ids, dtype=np.int64)[usable],
+        landmark[usable],
         points[usable],
         str(message.header.frame_id),
         rejected,
         f'{topic}: {rejected} points are no finite numbers' if rejected else '',
+        tags_of(landmark[usable]),
     )

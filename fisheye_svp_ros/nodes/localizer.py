@@ -18,7 +18,7 @@ from fisheye_svp_ros.io.tag_maps import read_tag_map
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base_pose import BasePose
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
-from fisheye_svp_ros.nodes.detections import detections_reader
+from fisheye_svp_ros.nodes.detections import TagLimits, detections_reader
 from fisheye_svp_ros.nodes.messages import camera_shape
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.solver import SolverNode, lens_of
@@ -77,7 +77,8 @@ class Localizer(SolverNode):
             return
         tags = read_tag_map(settings.tag_map)
         self.hold_landmarks(decoding.LandmarkSet(tags.landmarks(), settings.map_frame))
-        kind, read = detections_reader(settings.detections)
+        limits = TagLimits(settings.max_hamming, settings.min_decision_margin, tags.family)
+        kind, read = detections_reader(settings.detections, limits)
         use = functools.partial(self._add, topic)
         self.collect(kind, topic, read, use, name='detections')
 
@@ -142,13 +143,16 @@ class Localizer(SolverNode):
         start = _pose_at(stamp, self._latest)
         measured = bool(self.settings.lens)
         searched = measured and self._misfits % OUTLIER_SEARCH_INTERVAL == 0
-        solved = localize_sets(model, views, true, start, examined=True, searched=searched)
+        localize = functools.partial(
+            localize_sets, model, views, true, examined=True, tags=bool(self.settings.tag_map)
+        )
+        solved = localize(start=start, searched=searched)
         if start is not None and not (
             _rms_px(solved) < MAX_RMS_RATIO * self._rms_before
             and _is_near(start, solved.solution.pose, views)
         ):
             self._latest.clear()
-            solved = localize_sets(model, views, true, examined=True, searched=measured)
+            solved = localize(searched=measured)
         rms, pose = _rms_px(solved), solved.solution.pose
         if np.isfinite(rms):
             self._latest.append((stamp, pose))

@@ -260,7 +260,7 @@ class SolverNode(ManagedNode):
             uv=seen.uv[None],
             weight=np.full(shape, 1 / self.settings.sigma_px),
             landmark=seen.landmark[None],
-            board=np.zeros(shape, dtype=np.int64),
+            board=np.zeros(shape, dtype=np.int64) if seen.tag is None else seen.tag[None],
             t=np.full(shape, stamp / 1e9),
             frame=np.array([stamp]),
             camera=np.zeros(1, dtype=np.int64),

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
 from fisheye_svp_ros.io.decoding import FramedPose, ImagePoints, LandmarkSet, frames_differ
 from fisheye_svp_ros.nodes.join import NeighborPair
@@ -19,16 +19,21 @@ from fisheye_svp_ros.study.settings import SolverSettings
 
 Items = Mapping[str, Any]
 
+_UNKNOWN_POINTS = 'points of unknown landmarks'
 _FRAME_HOLDS = 5.0  # s without a message of its frame, after which a topic may have another
 
 
 class KnownPoints(NamedTuple):
-    """Image points of known landmarks; points (N, 3), m; frame: the camera's frame_id."""
+    """Image points of known landmarks; points (N, 3), m; frame: the camera's frame_id.
+
+    tag (N,): that each belongs to, None where landmarks belong to none.
+    """
 
     landmark: Index
     uv: Array
     points: Array
     frame: str
+    tag: Index | None = None
 
 
 class SetValidation:
@@ -105,14 +110,30 @@ class SetValidation:
             self.rejected[f'{topic}: points without a value'] += seen.rejected
             count = len(seen.landmark) + seen.rejected
             texts.append(wording.points_without_value(topic, seen.rejected, count))
+        if seen.doubtful_tags:
+            assert seen.tag is not None
+            self.rejected[f'{topic}: tags left out'] += seen.doubtful_tags
+            count = len(np.unique(seen.tag)) + seen.doubtful_tags
+            texts.append(f'{topic}: {wording.doubtful_tags(seen.doubtful_tags, count)}')
         if np.count_nonzero(known) == known.size:
-            return KnownPoints(seen.landmark, seen.uv, points, seen.frame), texts
-        unknown = seen.landmark[~known]
-        if settings.strict or not known.any():
-            raise ObservationError(wording.unknown_landmark(topic, int(unknown[0])))
-        self.rejected[f'{topic}: points of unknown landmarks'] += len(unknown)
-        texts.append(wording.unknown_landmarks(topic, unknown.tolist(), len(known)))
-        return KnownPoints(seen.landmark[known], seen.uv[known], points[known], seen.frame), texts
+            return KnownPoints(seen.landmark, seen.uv, points, seen.frame, seen.tag), texts
+        texts.append(self._tell_unknown(topic, seen, known, settings.strict))
+        tag = None if seen.tag is None else seen.tag[known]
+        return (
+            KnownPoints(seen.landmark[known], seen.uv[known], points[known], seen.frame, tag),
+            texts,
+        )
+
+    def _tell_unknown(self, topic: str, seen: ImagePoints, known: Mask, strict: bool) -> str:
+        """Count and name the points (N,) that are not known; raise ObservationError, see check."""
+        tags = seen.tag is not None
+        number = seen.landmark if seen.tag is None else seen.tag
+        unknown = np.unique(number[~known]).tolist() if tags else number[~known].tolist()
+        if strict or not known.any():
+            raise ObservationError(wording.unknown_landmark(topic, unknown[0], tags))
+        self.rejected[f'{topic}: {"unknown tags" if tags else _UNKNOWN_POINTS}'] += len(unknown)
+        of = len(np.unique(number)) if tags else len(number)
+        return wording.unknown_landmarks(topic, unknown, of, tags)
 
     def _check_camera(self, topic: str, frame: str) -> None:
         """Raise ObservationError for image points of another camera than those before."""

@@ -26,7 +26,7 @@ def generalized_equations(
     uv (S, N, 2), px: predicted, jacobian (S, N, 2, 6): their derivatives by the pose, of views
     that have a landmark_covariance.
     """
-    j, noise = _whiten(jacobian, views)
+    j, noise = whiten(jacobian, views)
     with np.errstate(invalid='ignore'):
         off = np.where(views.weight[..., None] > 0, (uv - views.uv) * views.weight[..., None], 0.0)
     r = off.reshape(*j.shape[:2], 1)
@@ -48,7 +48,7 @@ def with_own_errors(model: ForwardModel, views: Views, pose: Pose) -> Views:
     if views.landmark_covariance is None:
         return views
     linear = model.linearize(pose, views)
-    j, noise = _whiten(model.d_pose(linear, views), views)
+    j, noise = whiten(model.d_pose(linear, views), views)
     solved = np.linalg.solve(noise, j)
     transposed = np.swapaxes(j, -1, -2)
     relative, scale = with_unit_diagonal(transposed @ solved, 0.0)
@@ -61,13 +61,15 @@ def with_own_errors(model: ForwardModel, views: Views, pose: Pose) -> Views:
     return views._replace(weight=weight, landmark_covariance=None)
 
 
-def _whiten(jacobian: Array, views: Views) -> tuple[Array, Array]:
+def whiten(jacobian: Array, views: Views) -> tuple[Array, Array]:
     """Return the Jacobian (S, 2N, 6) and the noise (S, 2N, 2N) in units of 1 / weight."""
     systems, points = views.weight.shape
     weight = views.weight[..., None, None]
     j = np.where((weight > 0) & np.isfinite(jacobian), jacobian * weight, 0.0)
+    if views.landmark_covariance is None:
+        noise = np.broadcast_to(np.eye(2 * points), (systems, 2 * points, 2 * points))
+        return j.reshape(systems, 2 * points, -1), noise
     by_landmark = -j[..., :3]  # a point moves the image as the camera moves it the other way
-    assert views.landmark_covariance is not None
     covariance = views.landmark_covariance.reshape(systems, points, 3, 3 * points)
     moved = (by_landmark @ covariance).reshape(systems, 2 * points, points, 3)
     noise = np.swapaxes(moved, 1, 2) @ np.swapaxes(by_landmark, -1, -2)  # (S, N, 2N, 2)

@@ -32,6 +32,7 @@ _RIDGE = 2e-14  # beyond rounding, and less than what counts as determined
 _FLOOR = 1e-15  # keeps an exactly singular system solvable; far below any data's weight
 # Of the cost: what a step promises where derivatives that are not exact end
 _STALL_TOLERANCE = 1e-6
+FALSE_ALARM = 1e-4  # probability that sound observations fail the test of their misfit
 _SINGULAR = 1e-14  # relative eigenvalue below which shared parameters are left where they are
 
 
@@ -135,6 +136,13 @@ def never_singular(operation: Callable[[Array], Any], scaled: Array) -> Array:
         return np.asarray(operation(scaled))
     except np.linalg.LinAlgError:
         return np.asarray(operation(scaled + _RIDGE * np.eye(scaled.shape[-1])))
+
+
+def misfit_fails(cost: Array, freedom: Array) -> Mask:
+    """Say whether whitened sums of squares are more than degrees of freedom allow."""
+    from scipy.special import chdtri  # takes a third of the time that `--help` may take
+
+    return np.asarray(cost > chdtri(np.maximum(freedom, 1), FALSE_ALARM))
 
 
 def with_unit_diagonal(hessian: Array, damping: Array | float) -> tuple[Array, Array]:

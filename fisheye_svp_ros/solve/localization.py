@@ -39,7 +39,7 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
     Kita, section 3: bundle adjustment of one camera against known landmarks.  A flat target seen
     small looks, tilted to one side, like tilted to the other, and the misfit has a minimum on
     either side (Schweighofer and Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014): both are tried.
-    So are all minima of views with fewer than FEW_POINTS points.
+    So are all minima of views with fewer than FEW_POINTS points that are not flat.
     Landmarks that have a covariance are weighed by it (`solve.landmark_errors`).
     What a lens has that follows from motion (a rolling shutter) needs times: velocities are those
     between the poses of neighboring views.
@@ -97,13 +97,14 @@ def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localiza
         check_views(views, MIN_POINTS)
         start = start_poses(model, views)
     found, some_flat = _solve_from(model, views, start)
+    flat: Index = np.zeros(0, dtype=np.int64)
     if some_flat:
         flat, center, normal = _flat_targets(views)
         if flat.size:
             reflected = _mirror_image(found.pose.take(flat), center, normal)
             _improve(model, views, found, flat, reflected.reshape(len(flat), 1))
     if anywhere:
-        few = np.flatnonzero((views.weight > 0).sum(axis=1) < FEW_POINTS)
+        few = np.setdiff1d(np.flatnonzero((views.weight > 0).sum(axis=1) < FEW_POINTS), flat)
         if few.size:
             some = views.take(few)
             direction = model.back_project(some.uv).direction

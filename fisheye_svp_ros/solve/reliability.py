@@ -8,6 +8,8 @@ Kittler, DAGM 2003).  Views that pass pay for no search.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +20,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.landmark_errors import with_own_errors
+from fisheye_svp_ros.solve.least_squares import misfit_fails
 from fisheye_svp_ros.solve.localization import (
     MIN_POINTS,
     Localization,
@@ -26,9 +29,15 @@ from fisheye_svp_ros.solve.localization import (
     residuals,
 )
 from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
+from fisheye_svp_ros.solve.tag_units import (
+    TagChoices,
+    choose_tags,
+    cover_choices,
+    holds_tags,
+    tags_agree,
+)
 from fisheye_svp_ros.solve.weak_geometry import hold_weak_geometry
 
-_FALSE_ALARM = 1e-4  # probability that a clean view fails the test of its misfit
 _MAX_RESIDUAL_RATIO = 3.8  # a residual beside the root mean square of all, which starts a search
 _GROSS = 5.0  # standard deviations
 _MIN_AGREEMENT = 0.6  # of the points must agree on a pose
@@ -52,7 +61,7 @@ class Examination(NamedTuple):
     observations left out as outliers; reasons (S,): why a pose should not be relied on as it
     is, '' for a reliable one; sigma: noise of u and of v, px, estimated from the
     views that pass, None where weights are known; excess (S,): factor by which residuals are more
-    than that, where the covariance is scaled by its square.
+    than that, where the covariance is scaled by its square; choices: of tags, by view.
     """
 
     result: Localization
@@ -60,6 +69,7 @@ class Examination(NamedTuple):
     reasons: tuple[str, ...]
     sigma: float | None
     excess: Array
+    choices: Mapping[int, TagChoices] = MappingProxyType({})
 
 
 def examine(
@@ -68,18 +78,19 @@ def examine(
     localization: Localization,
     sigma_known: bool = True,
     searched: bool = True,
+    tags: bool = False,
 ) -> Examination:
     """Test the poses that `localize` found, and look for outliers where they fail.
 
     sigma_known: whether weights are 1 / sigma; if not, views are held against each other, a
     single one against its own median residual, and covariances are scaled by the estimate.
-    searched: look for outliers; without, a view that fails is only said to.
+    searched: look for outliers; without, a view that fails is only said to.  tags: the boards of
+    the views are tags, whose points stand or fall together.
     """
     model = model.seeing(views)
     if sigma_known:
-        checked = _examine(model, views, localization, 1.0, 1.0, searched)
-        inliers, result = _inliers(views, checked), checked.result
-        return checked._replace(result=hold_weak_geometry(model, inliers, result, checked.excess))
+        checked = _examine(model, views, localization, 1.0, 1.0, searched, tags)
+        return _hold_covariances(model, views, checked, 1.0)
     freedom = np.maximum(2 * (views.weight > 0).sum(axis=1) - 6, 1)
     usual = float(np.sqrt(np.median(localization.cost / freedom)))
     if len(freedom) < _OTHERS:
@@ -97,13 +108,29 @@ def examine(
             'image size, landmarks and their unit'
         )
         reasons = tuple(_join_reasons(noisy, reason) for reason in reasons)
-    result = result._replace(covariance=result.covariance * sigma**2)
-    result = hold_weak_geometry(model, _inliers(views, checked), result, sigma * checked.excess)
-    return Examination(result, checked.gross, reasons, sigma, checked.excess)
+    return _hold_covariances(model, views, checked._replace(reasons=reasons, sigma=sigma), sigma)
 
 
-def _inliers(views: Views, checked: Examination) -> Views:
-    return views._replace(weight=np.where(checked.gross, 0.0, views.weight))
+def _hold_covariances(
+    model: ForwardModel, views: Views, checked: Examination, sigma: float
+) -> Examination:
+    """Return covariances that hold for weak geometry and cover each choice of tags.
+
+    sigma: in units of 1 / weight, which they are scaled by.
+    """
+
+    def hold(seen: Views, solution: Localization, excess: Array) -> Localization:
+        if sigma != 1.0:
+            solution = solution._replace(covariance=solution.covariance * sigma**2)
+        return hold_weak_geometry(model, seen, solution, sigma * excess)
+
+    inliers = views._replace(weight=np.where(checked.gross, 0.0, views.weight))
+    result = hold(inliers, checked.result, checked.excess)
+    for i, choices in checked.choices.items():
+        held = hold(choices.views, choices.solution, np.ones(len(choices.odds)))
+        covered = cover_choices(choices, held)
+        result.put([i], covered._replace(residual=result.residual[[i]]))
+    return checked._replace(result=result)
 
 
 def _examine(
@@ -113,29 +140,39 @@ def _examine(
     sigma: float,
     tolerance: float,
     searched: bool = True,
+    tags: bool = False,
 ) -> Examination:
     """Examine with a sigma in units of 1 / weight; tolerance: of the misfit, as a factor."""
     freedom = 2 * (views.weight > 0).sum(axis=1) - 6
     allowed = (tolerance * sigma) ** 2
     own = with_own_errors(model, views, localization.pose)
     suspect = ~localization.converged | _suspect(own, localization, freedom, allowed)
+    if tags:
+        suspect |= ~tags_agree(model, views, localization, allowed)
     result, reasons = localization, _far_reasons(views, localization)
     gross = np.zeros(views.used.shape, dtype=bool)
     if not suspect.any():
         return Examination(result, gross, tuple(reasons), None, np.ones(len(freedom)))
     result, excess = Localization.concatenate([localization]), np.ones(len(freedom))  # a copy
+    choices: dict[int, TagChoices] = {}
     for i in np.flatnonzero(suspect):
-        view = views.take([i])
-        other = (
-            _consensus_pose(model, view, own.take([i]), localization.take([i]), sigma, tolerance)
-            if searched
-            else None
-        )
+        view, other = views.take([i]), None
+        if searched and tags and holds_tags(view):
+            if (chosen := choose_tags(model, view, allowed)) is not None:
+                choices[int(i)], other = chosen, chosen.inliers
+        elif searched:
+            other = _consensus_pose(
+                model, view, own.take([i]), localization.take([i]), sigma, tolerance
+            )
         if other is not None:
             result.put([i], other)
             gross[i] = (view.weight[0] > 0) & np.isnan(other.residual[0, :, 0])
             result.residual[i] = residuals(model, other.pose, view)[0]
-            why = _gross_reason(view, gross[i], result.residual[i])
+            why = (
+                _tags_reason(choices[int(i)], result.residual[i])
+                if int(i) in choices
+                else _gross_reason(view, gross[i], result.residual[i], tags)
+            )
             reasons[i] = _join_reasons(why, reasons[i])
         elif result.converged[i] and misfit_fails(result.cost[i] / allowed, freedom[i]):
             variance = float(result.cost[i]) / max(freedom[i], 1) / sigma**2
@@ -145,7 +182,7 @@ def _examine(
                 f'{misfit_reason(variance, int(freedom[i]))}; the covariance is scaled by it',
                 reasons[i],
             )
-    return Examination(result, gross, tuple(reasons), None, excess)
+    return Examination(result, gross, tuple(reasons), None, excess, choices)
 
 
 def doubt_of_pairs(
@@ -179,13 +216,6 @@ def doubt_of_pairs(
         off = np.sqrt(cost[gross]) * sigma
         return f'pairs that do not match: {_landmark_names(ids[gross], off)}'
     return misfit_reason(float(cost.sum()) / len(cost), len(cost))
-
-
-def misfit_fails(cost: Array, freedom: Array) -> Mask:
-    """Say whether whitened sums of squares are more than degrees of freedom allow."""
-    from scipy.special import chdtri  # takes a third of the time that `--help` may take
-
-    return np.asarray(cost > chdtri(np.maximum(freedom, 1), _FALSE_ALARM))
 
 
 def misfit_reason(excess: float, freedom: int) -> str:
@@ -307,22 +337,37 @@ def _noise_from_median(views: Views, localization: Localization) -> Array:
         return np.asarray(_median(length * views.weight, views) / _MEDIAN * hidden)
 
 
-def _gross_reason(view: Views, gross: Mask, residual: Array) -> str:
+def _tags_reason(choices: TagChoices, residual: Array) -> str:
+    """Say which tags are left out; residual (N, 2), px, from the likeliest pose."""
+    each = choices.rejected
+    if len(each) > 1:
+        names = ' or '.join(' and '.join(map(str, tags)) for tags in each[:_MAX_NAMES])
+        return (
+            f'tags contradict each other: without tag {names} the others agree; the covariance '
+            'covers each choice; check the tag map'
+        )
+    size = np.nan_to_num(np.linalg.norm(residual, axis=-1), nan=np.inf)
+    largest = [size[choices.views.board[0] == tag].max() for tag in each[0]]
+    return f'outliers rejected: {_landmark_names(np.array(each[0]), np.array(largest), "tag")}'
+
+
+def _gross_reason(view: Views, gross: Mask, residual: Array, tags: bool) -> str:
     size = np.where(gross, np.nan_to_num(np.linalg.norm(residual, axis=-1), nan=np.inf), 0.0)
     worst = np.argsort(-size, kind='stable')[: gross.sum()]
     if not len(worst):
         return ''
-    return f'outliers rejected: {_landmark_names(view.landmark[0, worst], size[worst])}'
+    number, kind = (view.board, 'tag') if tags else (view.landmark, 'landmark')
+    return f'outliers rejected: {_landmark_names(number[0, worst], size[worst], kind)}'
 
 
-def _landmark_names(landmark: Index, size: Array) -> str:
-    """Return landmarks by name, each with its residual, px; the first of many."""
+def _landmark_names(landmark: Index, size: Array, kind: str = 'landmark') -> str:
+    """Return landmarks, or tags, by name, each with its residual, px; the first of many."""
     names = ', '.join(
         f'{one} ({px:.3g} px)'
         for one, px in zip(landmark[:_MAX_NAMES], size[:_MAX_NAMES], strict=True)
     )
     more = f' and {len(landmark) - _MAX_NAMES} more' if len(landmark) > _MAX_NAMES else ''
-    return f'landmark{"s" if len(landmark) > 1 else ""} {names}{more}'
+    return f'{kind}{"s" if len(landmark) > 1 else ""} {names}{more}'
 
 
 def _far_reasons(views: Views, localization: Localization) -> list[str]:

@@ -22,9 +22,10 @@ from fisheye_svp_ros.scene.observations import Observations, select_cameras, sel
 from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust, rig_covariance
 from fisheye_svp_ros.solve.hand_eye import MIN_FRAMES, Transforms, solve_hand_eye, turn_sizes
 from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.least_squares import misfit_fails
 from fisheye_svp_ros.solve.measured_poses import sigma_known
 from fisheye_svp_ros.solve.outliers import FRAME, find_outliers
-from fisheye_svp_ros.solve.reliability import misfit_fails, misfit_reason
+from fisheye_svp_ros.solve.reliability import misfit_reason
 from fisheye_svp_ros.solve.rig_checks import contradicted_views, is_unrelated
 from fisheye_svp_ros.solve.rig_state import (
     Linearization,

@@ -203,6 +203,20 @@ class LocalizerSettings(RobotSettings):
         choices=('apriltag_msgs', 'vision_msgs'),
         fixed=True,
     )
+    max_hamming: int = parameter(
+        1,
+        'Largest number of bits that the detector corrected in a tag of `detections` '
+        '(apriltag_msgs); others are left out and counted',
+        span=(0, 255),
+        fixed=True,
+    )
+    min_decision_margin: float = parameter(
+        10.0,
+        'Smallest decision margin of a tag of `detections` (apriltag_msgs), where one is stated; '
+        'others are left out and counted',
+        span=(0.0, 1e6),
+        fixed=True,
+    )
     map_frame: str = parameter('map', 'Frame id of the tag map', fixed=True, frame=True)
     model_error: bool = parameter(
         False,

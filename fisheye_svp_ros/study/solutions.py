@@ -17,8 +17,9 @@ from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.decoding import RESIDUALS, Points, structured_array
 from fisheye_svp_ros.pose import Pose, axis_angle_between
 from fisheye_svp_ros.scene.observations import Views
+from fisheye_svp_ros.solve.least_squares import misfit_fails
 from fisheye_svp_ros.solve.localization import Localization, localize, sight
-from fisheye_svp_ros.solve.reliability import examine, misfit_fails, misfit_reason
+from fisheye_svp_ros.solve.reliability import examine, misfit_reason
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate, triangulate_optimally
 from fisheye_svp_ros.solve.weak_geometry import hold_weak_geometry, is_ambiguous, pose_odds
@@ -105,6 +106,7 @@ def localize_sets(
     start: Pose | None = None,
     examined: bool = False,
     searched: bool = True,
+    tags: bool = False,
 ) -> SetSolutions[Localization]:
     """Localize the camera of every view (S,); true, start: poses (S,) where they are known.
 
@@ -115,7 +117,7 @@ def localize_sets(
     localization = localize(model, views, start)
     residual, reasons = localization.residual, ('',) * len(localization.cost)
     if examined:
-        checked = examine(model, views, localization, searched=searched)
+        checked = examine(model, views, localization, searched=searched, tags=tags)
         localization, reasons = checked.result, checked.reasons
         residual = np.where(checked.gross[..., None], np.nan, localization.residual)
     else:

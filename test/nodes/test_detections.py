@@ -17,14 +17,16 @@ from geometry_msgs.msg import PoseWithCovarianceStamped  # isort: skip
 
 from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.io.decoding import read_pose
+from fisheye_svp_ros.io.decoding import ImagePoints, LandmarkSet, read_pose
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.io.tag_maps import CENTER_OFFSET, map_of_size, write_tag_map
+from fisheye_svp_ros.io.tag_maps import CENTER_OFFSET, map_of_size, read_tag_map, write_tag_map
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.detections import read_apriltags, read_detections
+from fisheye_svp_ros.nodes.detections import TagLimits, read_apriltags, read_detections
 from fisheye_svp_ros.nodes.localizer import Localizer
+from fisheye_svp_ros.nodes.validation import KnownPoints, SetValidation
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.study.settings import LocalizerSettings
 
 LENS = load_lens(lens_path('fish180'))
 TAGS = map_of_size(
@@ -91,6 +93,60 @@ def test_middles_of_vision_msgs_are_read() -> None:
     assert found.rejected == 1 and found.frame == 'cam'
     with pytest.raises(ObservationError, match='holds no tag'):
         read_apriltags(SimpleNamespace(header=message.header, detections=[]))
+
+
+def found_tags(*tags: tuple[int, int, float], family: str = 'tag36h11') -> Any:
+    """Return a message of tags, each by id, hamming and decision margin."""
+    corners = [SimpleNamespace(x=float(i), y=float(2 * i)) for i in range(4)]
+    detections = [
+        SimpleNamespace(
+            id=number, hamming=bits, decision_margin=margin, corners=corners, family=family
+        )
+        for number, bits, margin in tags
+    ]
+    return SimpleNamespace(header=SimpleNamespace(frame_id='cam'), detections=detections)
+
+
+def test_tags_that_the_detector_is_not_sure_of_are_left_out() -> None:
+    limits = TagLimits(max_hamming=1, min_decision_margin=20.0)
+    message = found_tags((3, 0, 50.0), (4, 2, 50.0), (5, 1, 19.0), (6, 1, 0.0), (7, 0, 50.0))
+    found = read_apriltags(message, limits=limits)
+    assert np.unique(found.tag).tolist() == [3, 6, 7], 'a margin of 0 is one that is not stated'
+    assert found.doubtful_tags == 2
+    with pytest.raises(ObservationError, match='1 of 1 tags left out'):
+        read_apriltags(found_tags((4, 2, 50.0)), limits=limits)
+    twice = read_apriltags(found_tags((3, 0, 50.0), (3, 0, 50.0), (8, 0, 50.0)))
+    assert np.unique(twice.tag).tolist() == [8]
+
+
+def test_tags_of_another_family_than_the_map_are_refused(tmp_path: Path) -> None:
+    write_tag_map(TAGS._replace(family='36h11'), tmp_path / 'tags.yaml')
+    limits = TagLimits(family=read_tag_map(tmp_path / 'tags.yaml').family)
+    for name in ('tag36h11', '36h11', 'DICT_APRILTAG_36H11', ''):
+        read_apriltags(found_tags((3, 0, 50.0), family=name), limits=limits)
+    other = found_tags((3, 0, 50.0), family='tagStandard41h12')
+    with pytest.raises(ObservationError, match="'tagStandard41h12', those of the map of '36h11'"):
+        read_apriltags(other, limits=limits)
+    assert read_apriltags(other).tag is not None, 'the map states none'
+
+
+def validate(points: ImagePoints, strict: bool = False) -> tuple[KnownPoints, list[str]]:
+    """Return what is used of image points, and what is told of the others."""
+    check = SetValidation(['detections'], [], lambda *_: None, lambda *_: None)
+    landmarks = LandmarkSet(TAGS.landmarks(), 'map')
+    settings = LocalizerSettings(strict=strict)
+    items, texts = check.check({'detections': points}, landmarks, settings, 1)
+    return items['detections'], texts
+
+
+def test_tags_are_called_by_their_ids() -> None:
+    found = read_apriltags(found_tags((4, 0, 50.0), (77, 0, 50.0), (9, 3, 50.0)))
+    used, texts = validate(found)
+    assert used.tag is not None and used.tag.tolist() == [4] * 4
+    assert texts[0].startswith('detections: 1 of 3 tags left out: seen twice, hamming above')
+    assert texts[1] == 'detections: 1 of 2 tags left out: not in the map 77'
+    with pytest.raises(ObservationError, match='tag 77 is not in the tag map'):
+        validate(found, strict=True)
 
 
 def test_a_missing_package_is_named(

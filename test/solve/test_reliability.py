@@ -18,9 +18,10 @@ from fisheye_svp_ros.solve.initial_pose import (
     _problem,
     initial_poses,
 )
+from fisheye_svp_ros.solve.least_squares import misfit_fails
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured_poses import localize_measured
-from fisheye_svp_ros.solve.reliability import doubt_of_pairs, examine, misfit_fails
+from fisheye_svp_ros.solve.reliability import doubt_of_pairs, examine
 from fisheye_svp_ros.study.solutions import localize_sets
 
 

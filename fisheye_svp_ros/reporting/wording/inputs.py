@@ -16,17 +16,30 @@ def points_without_value(topic: str, count: int, of: int) -> str:
     return f'{topic}: {count} of {of} points left out: no finite value, or beyond the limit'
 
 
-def unknown_landmark(topic: str, landmark: int) -> str:
-    """Tell of a set that is refused for the sake of one landmark, or of all."""
-    return f'{topic}: landmark {landmark} is not one of the landmarks'
-
-
-def unknown_landmarks(topic: str, landmarks: Sequence[int], of: int) -> str:
-    """Tell of points whose landmarks nobody has published."""
-    names = ', '.join(map(str, landmarks[:_MAX_NAMES])) + (
-        ', ...' if len(landmarks) > _MAX_NAMES else ''
+def doubtful_tags(count: int, of: int) -> str:
+    """Tell of tags that the detector is not sure of."""
+    return (
+        f'{count} of {of} tags left out: seen twice, hamming above max_hamming or margin below '
+        'min_decision_margin'
     )
-    return f'{topic}: {len(landmarks)} of {of} points left out: unknown landmarks {names}'
+
+
+def unknown_landmark(topic: str, number: int, of_tags: bool = False) -> str:
+    """Tell of a set that is refused for the sake of one landmark or tag, or of all."""
+    if of_tags:
+        return f'{topic}: tag {number} is not in the tag map'
+    return f'{topic}: landmark {number} is not one of the landmarks'
+
+
+def unknown_landmarks(topic: str, numbers: Sequence[int], of: int, of_tags: bool = False) -> str:
+    """Tell of points whose landmarks nobody has published, or of tags not in the map."""
+    what, why = ('tags', 'not in the map') if of_tags else ('points', 'unknown landmarks')
+    return f'{topic}: {len(numbers)} of {of} {what} left out: {why} {_first_names(numbers)}'
+
+
+def _first_names(numbers: Sequence[int]) -> str:
+    more = ', ...' if len(numbers) > _MAX_NAMES else ''
+    return ', '.join(map(str, numbers[:_MAX_NAMES])) + more
 
 
 def landmarks_refused(reason: str) -> str:
