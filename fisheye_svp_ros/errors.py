@@ -1,4 +1,4 @@
-"""The errors of this package: one root, one subclass a kind of bad input."""
+"""The errors of this package: one root, one subclass a kind of bad input; texts of one line."""
 
 import re
 from collections.abc import Callable
@@ -12,6 +12,11 @@ _MAX_LENGTH = 1500  # characters; what is quoted may be a whole file
 _CONTROL_CHARACTERS = re.compile(r'\s*[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]+\s*')
 
 
+def one_line(text: str) -> str:
+    """Return a text without control characters, which a name may bring to a terminal or log."""
+    return _CONTROL_CHARACTERS.sub(' ', text)
+
+
 class FisheyeSvpError(Exception):
     """Root of all errors raised on purpose; its text is one line that names the remedy."""
 
@@ -19,7 +24,7 @@ class FisheyeSvpError(Exception):
         text = str(text)
         if len(text) > _MAX_LENGTH:
             text = f'{text[: _MAX_LENGTH // 2]} ... {text[-_MAX_LENGTH // 2 :]}'
-        super().__init__(_CONTROL_CHARACTERS.sub(' ', text))
+        super().__init__(one_line(text))
 
 
 class LensError(FisheyeSvpError):

@@ -89,8 +89,6 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.reporting.terminal import UNITS, draw_or_note, print_table
     from fisheye_svp_ros.reporting.wording import shots
 
-    if not args.noise > 0:
-        raise ParameterError('--noise must be above 0')
     lens, pattern = _lens(args), parse_pattern(args.board)
     planned = plan(
         lens, pattern.points, view_limits(args.room), args.count, args.number, args.noise

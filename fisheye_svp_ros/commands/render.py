@@ -17,6 +17,7 @@ from fisheye_svp_ros.errors import GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.files import keep_existing, write_together
 from fisheye_svp_ros.io.image_files import write_png
 from fisheye_svp_ros.io.lens_files import cameras_in
+from fisheye_svp_ros.io.paths import visible_paths
 from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses
 from fisheye_svp_ros.io.rig_files import cameras_in_first, rigs_of_lenses
 from fisheye_svp_ros.io.share import typed_lens_path
@@ -106,10 +107,9 @@ def run(args: argparse.Namespace) -> None:
     if pattern.kind != 'chessboard':
         raise ParameterError(f'--board {args.board}: only chessboards can be rendered')
     count, ranges = _of_random_poses(args)
-    if not all(0 <= value < np.inf for value in (args.blur, args.noise, args.seed, abs(args.bow))):
-        raise ParameterError(
-            '--blur, --noise and --seed must be finite and not below 0, --bow finite'
-        )
+    if args.seed < 0 or not abs(args.bow) < np.inf:
+        raise ParameterError('--seed must not be below 0, --bow finite')
+    exposure = Exposure(blur=args.blur, noise=args.noise)
     cameras, rng = _cameras(args.lens), np.random.default_rng(args.seed)
     printed = Print(pattern.columns, pattern.rows, pattern.size)
     if args.bow:
@@ -129,12 +129,14 @@ def run(args: argparse.Namespace) -> None:
             cameras,
             boards,
             poses,
-            Exposure(blur=args.blur, noise=args.noise),
+            exposure,
             args.seed,
             args.output,
             args.output,
         )
-    others = sum(len(list((args.output / name).glob('*.png'))) for name in cameras) - count
+    others = (
+        sum(len(visible_paths((args.output / name).glob('*.png'))) for name in cameras) - count
+    )
     if others:
         say(f'{args.output}: {others} other photographs are in it too; `detect` takes them all')
     print(

@@ -179,7 +179,7 @@ def _chessboard(spec: str, words: list[str]) -> Pattern:
 
 
 def _charuco(spec: str, words: list[str]) -> Pattern:
-    dictionary = words.pop().upper() if len(words) > 3 else 'DICT_5X5_100'
+    dictionary = words.pop(3).upper() if len(words) > 3 else 'DICT_5X5_100'
     (columns, rows), (size, marker) = _numbers(spec, words, 2, least=3)
     if marker >= size:
         raise ParameterError(f'board {spec!r}: the marker must be smaller than its square')
@@ -291,20 +291,38 @@ PATTERNS: dict[str, Callable[[str, list[str]], Pattern]] = {
 }
 
 
+_EXAMPLES = {
+    'chessboard': 'chessboard:9x6:24mm',
+    'charuco': 'charuco:7x5:30mm:22mm',
+    'circles': 'circles:7x5:20mm',
+    'squares': 'squares:3x4:30mm:30mm',
+}
+_MAY_FOLLOW = {
+    'charuco': ', then the dictionary, as in DICT_5X5_100',
+    'circles': ', after which only `asymmetric` may follow',
+}
+
+
 def _numbers(
     spec: str, words: list[str], lengths: int, least: int
 ) -> tuple[tuple[int, int], list[float]]:
     size = _SIZE.fullmatch(words[0]) if words else None
-    if size is None or len(words) != 1 + lengths:
+    kind = spec.partition(':')[0]
+    if size is None or len(words) < 1 + lengths:
         raise ParameterError(
             f'board {spec!r}: columns x rows and {lengths} '
-            f'length{"s"[: lengths - 1]} are needed, as in chessboard:9x6:24mm'
+            f'length{"s"[: lengths - 1]} are needed, as in {_EXAMPLES[kind]}'
+        )
+    if excess := words[1 + lengths :]:
+        raise ParameterError(
+            f'board {spec!r}: {excess[-1]!r} is too much; the form is {_EXAMPLES[kind]}'
+            + _MAY_FOLLOW.get(kind, '')
         )
     columns, rows = int(size[1]), int(size[2])
     if min(columns, rows) < least or columns * rows > _MAX_POINTS:
         raise ParameterError(
-            f'board {spec!r}: {words[0]} points; at least {least} each way and '
-            f'{_MAX_POINTS} in all are needed'
+            f'board {spec!r}: {words[0]} points; at least {least} each way, and at most '
+            f'{_MAX_POINTS} in all, are needed'
         )
     return (columns, rows), [_length(spec, word) for word in words[1:]]
 

@@ -21,10 +21,13 @@ from fisheye_svp_ros.detect.rig_photographs import alike_series, names_a_camera,
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.files import read_bytes
+from fisheye_svp_ros.io.paths import visible_paths
 from fisheye_svp_ros.io.recording_files import ROS1_SUFFIX, is_recording
 from fisheye_svp_ros.scene.observations import STEREO
 
 Pixels = NDArray[Any]  # (H, W), uint8 or uint16, grey
+
+os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', '-8')  # a broken video is named by its path
 
 IMAGES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp', '.jp2')
 VIDEOS = ('.mp4', '.avi', '.mov', '.mkv', '.webm', '.m4v')
@@ -141,7 +144,7 @@ def doubtful_folders(paths: Sequence[str]) -> Iterator[str]:
 
 
 def _no_photograph(path: Path) -> str:
-    bags = [p.name for p in path.glob(f'*{ROS1_SUFFIX}')] if path.is_dir() else []
+    bags = [p.name for p in visible_paths(path.glob(f'*{ROS1_SUFFIX}'))] if path.is_dir() else []
     if bags:
         return f'{path}: bags of ROS 1 are given as files, such as {path / bags[0]}'
     return f'{path}: it and its folders hold no photograph; images are {" ".join(IMAGES)}'
@@ -160,7 +163,7 @@ def _equal_names(folders: Sequence[Path]) -> Iterator[str]:
 def _unsearched_media(folder: Path, given: Sequence[Path]) -> Iterator[str]:
     """Yield which subfolders, and videos beside images, are not searched."""
     for above in photograph_folders(folder):
-        for sub in (p for p in sorted(above.iterdir()) if p.is_dir() and p not in given):
+        for sub in (p for p in visible_paths(above.iterdir()) if p.is_dir() and p not in given):
             if count := sum(len(_media(one)) for one in (sub, *_folders(sub))):
                 yield (
                     f'{sub}: its {count} images are skipped, since the folder above holds '
@@ -201,8 +204,7 @@ def _doubtful_names(where: str, files: Sequence[Path]) -> Iterator[str]:
 def is_photographs(path: Path) -> bool:
     """Say whether a path is taken for photographs rather than for observations."""
     if path.is_dir():
-        kinds = (*IMAGES, *VIDEOS)
-        return any(p.suffix.lower() in kinds for p in (*path.glob('*'), *path.glob('*/*')))
+        return bool(photograph_folders(path))
     return path.suffix.lower() in (*IMAGES, *VIDEOS)
 
 
@@ -337,7 +339,9 @@ def _open(path: Path, camera: str = '', key: str = '') -> Iterator[Photograph]:
 
 
 def _files(path: Path, kinds: Sequence[str]) -> list[Path]:
-    return sorted((p for p in path.iterdir() if p.suffix.lower() in kinds), key=_natural)
+    return sorted(
+        (p for p in visible_paths(path.iterdir()) if p.suffix.lower() in kinds), key=_natural
+    )
 
 
 def _images(path: Path) -> list[Path]:
@@ -350,7 +354,7 @@ def _media(path: Path) -> list[Path]:
 
 
 def _folders(path: Path) -> list[Path]:
-    return [p for p in sorted(path.iterdir()) if p.is_dir() and _media(p)]
+    return [p for p in visible_paths(path.iterdir()) if p.is_dir() and _media(p)]
 
 
 def _folder(path: Path) -> Iterator[Photograph]:
@@ -395,6 +399,8 @@ def _video(path: Path, camera: str = '', key: str = '') -> Iterator[Photograph]:
         yield Photograph(f'{path} #{number}', name, camera, t, grey)
         number += 1
     video.release()
+    if not number:
+        raise ObservationError(f'{path}: the video is empty or cannot be decoded')
 
 
 def _recording(path: Path) -> Iterator[Photograph]:

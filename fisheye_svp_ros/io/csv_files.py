@@ -20,16 +20,23 @@ from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.io.files import read_text, write_text
+from fisheye_svp_ros.io.files import parse_number, read_text, write_text
 from fisheye_svp_ros.io.paths import path_of
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_quaternion
-from fisheye_svp_ros.scene.observations import MOST_LANDMARK, Observations, make_observations
+from fisheye_svp_ros.scene.observations import (
+    CAMERA_NAME,
+    MOST_LANDMARK,
+    Observations,
+    is_camera_name,
+    make_observations,
+)
 from fisheye_svp_ros.scene.table_checks import SIGMA_BOUND, implausible_sigma
 
 _MAX_HEADER = 60  # characters of a header
 _RECENT = 1e9  # s since 1970, in 2001
 _PER_SECOND = {'nanoseconds': 1e9, 'microseconds': 1e6, 'milliseconds': 1e3}
 _MAX_VALUE = 1e12  # m, px or s; squares and products of anything larger are soon no numbers
+_MAX_PIXEL = 1e6  # px; no image reaches so far
 _MIN_UNSEEN_ROWS = 5
 
 REQUIRED_COLUMNS = ('frame', 'landmark', 'u', 'v', 'x', 'y', 'z')
@@ -114,7 +121,8 @@ class CsvTable:
         if rows.size:
             cell = self._columns[name][rows[0]]
             raise ObservationError(
-                f'{self.path}, line {self.line(rows[0])}: {name} is {cell!r}; {needed} is needed'
+                f'{self.path}, line {self.line(rows[0])}: {name} is {cell!r:.80}; '
+                f'{needed} is needed'
             )
 
     def line(self, row: int) -> int:
@@ -157,6 +165,8 @@ class CsvTable:
     def _numbers(self, name: str) -> Array:
         cells = self._columns[name]
         try:
+            if any('_' in cell for cell in cells):  # Python reads 1_00 as 100
+                raise ValueError
             values = np.array(cells, dtype=float)
         except ValueError:
             comma = ', with a decimal point,' if any(',' in cell for cell in cells) else ''
@@ -192,7 +202,7 @@ def _separator(lines: Sequence[str]) -> str:
 
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        parse_number(cell)
     except ValueError:
         return False
     return True
@@ -216,12 +226,7 @@ def read(path: str | Path) -> Observations:
     frame, landmark = table.integers('frame'), table.integers('landmark', MOST_LANDMARK)
     names = table.text('camera') if 'camera' in table else ('',) * len(frame)
     cameras = tuple(dict.fromkeys(names))
-    # Results of a camera go to a folder of its name, in that of all.
-    table.refuse(
-        [name.startswith('/') or '..' in name.split('/') for name in names],
-        'camera',
-        'a name without .. that does not begin with /',
-    )
+    table.refuse([not is_camera_name(name) for name in names], 'camera', CAMERA_NAME)
     if len(cameras) > 1:
         named = next(filter(None, cameras))
         table.refuse([not name for name in names], 'camera', f'a name, as {named!r} elsewhere,')
@@ -230,6 +235,10 @@ def read(path: str | Path) -> Observations:
         np.stack([frame, camera, landmark], axis=-1), 'frame, camera and landmark'
     )
     uv = table.numbers('u', 'v')
+    for name, column in zip('uv', uv.T, strict=True):
+        table.refuse(
+            np.abs(column) > _MAX_PIXEL, name, f'a place in an image, up to {_MAX_PIXEL:g} px,'
+        )
     _refuse_unseen(table, np.stack([frame, camera], axis=-1), uv)
     sigma = table.known_numbers('sigma') if 'sigma' in table else None
     if sigma is not None:

@@ -11,14 +11,16 @@ import filecmp
 import json
 import math
 import os
+import platform
 import re
 import signal
 import stat
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from functools import cache
 from pathlib import Path
 from typing import IO, Any, ClassVar
 
@@ -31,6 +33,8 @@ from fisheye_svp_ros.io.paths import final_path
 MAX_BYTES = 1 << 30  # bytes of a table or a photograph
 
 _BLOCK_BYTES = 1 << 20  # bytes
+_HOST = re.sub(r'\W', '', platform.node())[:16]
+_TEMPORARY = re.compile(r'\..+\.(\w*)-(\d+)\.\w{8}(\.\w+)?')  # host and process that wrote it
 _waiting: ContextVar[dict[Path, Path] | None] = ContextVar('_waiting', default=None)
 _keeping: ContextVar[bool] = ContextVar('_keeping', default=False)
 LARGEST_YAML = 1 << 22  # characters
@@ -89,8 +93,11 @@ def replacing(path: str | Path) -> Iterator[Path]:
     temporary = None
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        _remove_leftovers(target.parent)
         handle, name = tempfile.mkstemp(
-            prefix=f'.{target.name}.', suffix=target.suffix, dir=target.parent
+            prefix=f'.{target.name}.{_HOST}-{os.getpid()}.',
+            suffix=target.suffix,
+            dir=target.parent,
         )
         os.close(handle)
         temporary = Path(name)
@@ -111,6 +118,27 @@ def replacing(path: str | Path) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+@cache
+def _remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files of processes of this machine that were killed."""
+    with suppress(OSError):
+        for path in folder.iterdir():
+            match = _TEMPORARY.fullmatch(path.name)
+            if match and match[1] == _HOST and not _runs(int(match[2])):
+                path.unlink()
+
+
+def _runs(process: int) -> bool:
+    """Whether a process of this machine runs, be it another user's."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        pass
+    return True
 
 
 @contextmanager
@@ -293,6 +321,13 @@ def dump_yaml(document: Any, **style: Any) -> str:
     """Return a document as YAML that `parse_yaml` reads back."""
     text: str = yaml.dump(document, Dumper=_Dumper, sort_keys=False, **style)
     return text
+
+
+def parse_number(text: str) -> float:
+    """Return the number that a word of a data file is; raise ValueError for any other word."""
+    if '_' in text:  # Python alone reads 1_00 as 100
+        raise ValueError(f'could not convert to a number: {text!r}')
+    return float(text)
 
 
 def parse_json(text: str, where: str | Path, error: type[FisheyeSvpError]) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from fisheye_svp_ros.effects.extension import LANDMARKS, Target, extend_lens
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.files import dump_yaml, parse_yaml, read_text, write_text
 from fisheye_svp_ros.io.lens_formats import READABLE, Foreign, read_foreign
+from fisheye_svp_ros.io.paths import visible_paths
 from fisheye_svp_ros.io.share import without_camera
 from fisheye_svp_ros.optics.curve_base import Curve, ViewpointShift
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
@@ -202,7 +203,7 @@ def _in_folder(folder: Path) -> dict[str, Path]:
             paths
             or {
                 str(file.relative_to(folder).with_suffix('')): file
-                for file in sorted(folder.glob(f'{above}*.yaml'))
+                for file in visible_paths(folder.glob(f'{above}*.yaml'))
                 if file.stem not in FILES_OF_RIG
             }
             or {

@@ -120,6 +120,8 @@ def _groups(stream: IO[bytes], path: Path, note: _Note) -> Iterator[list[Any]]:
             note(
                 f'{path.name} cannot be read from byte {place} on ({cause!s:.100}); '
                 f'`mcap recover {path.name} -o FILE` may save more'
+                if place
+                else f'{path.name} is empty, or no MCAP file'
             )
             return
         try:

@@ -16,7 +16,8 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import ObservationError
-from fisheye_svp_ros.io.files import read_text
+from fisheye_svp_ros.io.files import parse_number, read_text
+from fisheye_svp_ros.io.paths import visible_paths
 from fisheye_svp_ros.scene.observations import MOST_LANDMARK, Observations, make_observations
 
 _CM, _MM = 0.01, 0.001
@@ -39,7 +40,7 @@ def read(path: str | Path) -> Observations:
     time.  Raises ObservationError, naming file, line and field.
     """
     given = Path(path)
-    files = sorted(given.glob('*.orpc')) if given.is_dir() else [given]
+    files = visible_paths(given.glob('*.orpc')) if given.is_dir() else [given]
     folder = given if given.is_dir() else given.parent
     description = _description(folder)
     boards = _read_boards(description)
@@ -62,7 +63,7 @@ def read(path: str | Path) -> Observations:
 
 def _description(folder: Path) -> Path:
     for place in (folder, *list(folder.resolve().parents)[:2]):
-        descriptions = sorted(place.glob('*.dsc'))
+        descriptions = visible_paths(place.glob('*.dsc'))
         if len(descriptions) > 1:
             raise ObservationError(f'{place}: several .dsc files; keep the one of this target')
         if descriptions:
@@ -150,7 +151,7 @@ def _read_corners(path: Path, boards: dict[int, BoardCorners]) -> Array:
 def _image_times(files: list[Path], dataset: Path) -> Array:
     """Return the seconds (F,) from the earliest image of the data set; NaN without times."""
     mine = [_time(file) for file in files]
-    everywhere = [_time(file) for file in dataset.rglob('*.orpc')]
+    everywhere = [_time(file) for file in visible_paths(dataset.rglob('*.orpc'))]
     known = [time for time in (*mine, *everywhere) if time is not None]
     return np.array(
         [
@@ -190,7 +191,7 @@ def _parse_int(path: Path, line: int, field: str) -> int:
 
 def _numbers(path: Path, line: int, fields: list[str]) -> list[float]:
     try:
-        values = [float(field) for field in fields]
+        values = [parse_number(field) for field in fields]
     except ValueError as cause:
         raise ObservationError(f'{path}, line {line}: {cause}') from cause
     if not np.isfinite(values).all():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from fisheye_svp_ros.errors import OutputError, ParameterError
@@ -13,6 +14,11 @@ def path_of(given: str | Path) -> Path:
     if not isinstance(given, str | os.PathLike):
         raise ParameterError(f'a {type(given).__name__} is no path; the name of a file is needed')
     return Path(given)
+
+
+def visible_paths(paths: Iterable[Path]) -> list[Path]:
+    """Return the paths, in order, whose names do not begin with a dot, as temporary ones do."""
+    return sorted(path for path in paths if not path.name.startswith('.'))
 
 
 def final_path(path: str | Path) -> Path:

@@ -20,7 +20,7 @@ from fisheye_svp_ros.io.csv_files import (
     write_poses,
 )
 from fisheye_svp_ros.io.files import read_json
-from fisheye_svp_ros.io.paths import path_of
+from fisheye_svp_ros.io.paths import path_of, visible_paths
 from fisheye_svp_ros.io.recording_files import is_recording
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.registry import Registry
@@ -120,7 +120,7 @@ READERS: Registry[Reader] = Registry(
             Reader('an .orpc file', lambda path: path.suffix == '.orpc', f'{_PACKAGE}.orpc'),
             Reader(
                 'a folder of .orpc files',
-                lambda path: path.is_dir() and any(path.glob('*.orpc')),
+                lambda path: path.is_dir() and bool(visible_paths(path.glob('*.orpc'))),
                 f'{_PACKAGE}.orpc',
             ),
             Reader('a recording (rosbag2, ROS 1)', is_recording, f'{_PACKAGE}.recording'),

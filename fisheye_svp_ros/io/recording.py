@@ -205,15 +205,15 @@ def _table(
 ) -> Observations:
     stamps = sorted({one.stamp for one in sets})
     frames = {stamp: frame for frame, stamp in enumerate(stamps)}
-    cameras = tuple(dict.fromkeys(one.camera.removeprefix(world).lstrip('/') for one in sets))
+    named = [one.camera.removeprefix(world).lstrip('/').replace('/', '_') for one in sets]
+    cameras = tuple(dict.fromkeys(named))
     counts = [len(one.points.landmark) for one in sets]
-    names = [cameras.index(one.camera.removeprefix(world).lstrip('/')) for one in sets]
     return make_observations(
         np.repeat([frames[one.stamp] for one in sets], counts),
         np.concatenate([one.points.landmark for one in sets]),
         np.concatenate([one.points.uv for one in sets]),
         np.concatenate([_landmark_points(one, landmarks, source) for one in sets]),
-        camera=np.repeat(names, counts),
+        camera=np.repeat([cameras.index(name) for name in named], counts),
         t=np.repeat([one.stamp / 1e9 for one in sets], counts),
         cameras=cameras,
         source=source,

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.files import read_yaml
+from fisheye_svp_ros.io.paths import visible_paths
 
 ROS1_SUFFIX = '.bag'
 _SUFFIXES = ('.mcap', '.db3', '.mcap.zstd', '.db3.zstd')
@@ -45,5 +46,5 @@ def metadata_topics(folder: Path) -> set[tuple[str, str]]:
 
 def _files_in(folder: Path) -> list[Path]:
     """Return the files of a recording; of one that is there both ways, as it plays, the plain."""
-    files = [file for file in folder.iterdir() if file.name.endswith(_SUFFIXES)]
+    files = [file for file in visible_paths(folder.iterdir()) if file.name.endswith(_SUFFIXES)]
     return [file for file in files if file.suffix != '.zstd' or file.with_suffix('') not in files]

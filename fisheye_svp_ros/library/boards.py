@@ -17,12 +17,12 @@ from fisheye_svp_ros.io.lens_formats import write_foreign
 from fisheye_svp_ros.io.rig_files import load_cameras
 from fisheye_svp_ros.library.checks import (
     check_count,
+    check_number,
     check_numbers,
     check_pair,
     check_pose,
     check_type,
     check_whole_numbers,
-    is_at_most,
 )
 from fisheye_svp_ros.library.functions import (
     AnyLens,
@@ -110,12 +110,9 @@ def render(
     if pattern.kind != 'chessboard':
         raise ParameterError(f'board {board!r}: only chessboards can be rendered')
     pose = check_pose(pose, 'pose')
-    if not noise >= 0:
-        raise ParameterError(f'noise is {noise!r}; 0 or more grey levels are needed')
+    exposure = Exposure(noise=check_number(noise, 'noise', 'a number of gray levels'))
     printed = Print(pattern.columns, pattern.rows, pattern.size)
-    return expose(
-        load_lens(lens), printed, pose, Exposure(noise=noise), np.random.default_rng(seed)
-    )
+    return expose(load_lens(lens), printed, pose, exposure, np.random.default_rng(seed))
 
 
 def plan(
@@ -142,15 +139,13 @@ def plan(
             f'room is {room!r}; two distances above 0, m, are needed, the nearer first'
         )
     count = check_count(count, MAX_VIEWS, 'count')
-    if not is_at_most(noise_px, np.finfo(float).max) or not noise_px > 0:
-        raise ParameterError(f'noise_px is {noise_px!r}; a number above 0 px is needed')
     return choose(
         load_lens(lens),
         parse_pattern(board).points,
         ViewLimits(near, far),
         count,
         number,
-        noise_px,
+        check_number(noise_px, 'noise_px', 'a number of px'),
     )
 
 

@@ -23,6 +23,7 @@ from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, OutputErro
 from fisheye_svp_ros.io.csv_files import write_observations
 from fisheye_svp_ros.io.files import replacing
 from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.paths import visible_paths
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
@@ -62,7 +63,7 @@ class Guiding:
         self._folder = Path(settings.guide_output).absolute()
         with suppress(OSError):
             self._folder.mkdir(parents=True, exist_ok=True)
-        if not (self._folder.is_dir() and os.access(self._folder, os.W_OK)) or any(
+        if not (self._folder.is_dir() and os.access(self._folder, os.W_OK)) or visible_paths(
             self._folder.iterdir()
         ):
             raise ParameterError(

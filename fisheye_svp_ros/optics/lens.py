@@ -194,6 +194,8 @@ def field_of_view(lens: Lens) -> float:
 def check_lens(lens: Lens, where: str) -> Lens:
     """Return the lens; raise LensError, naming `where` and the field, if it is impossible."""
     wrong, limit = lens.check(), curve_limit(lens)
+    if not lens.name.isprintable():
+        wrong = f'name is {lens.name!r}; printable characters are needed'
     if not wrong and not 0 < lens.max_incidence <= limit + 1e-9:
         wrong = (
             f'max_incidence_deg is {np.degrees(lens.max_incidence):.6g}; '

@@ -348,7 +348,7 @@ def candidate_shots(
     if not possible.size:
         raise GeometryError(
             f'lens {lens.name!r} does not see the whole board from {room.near:g} to '
-            f'{room.far:g} m; choose another room (--room NEAR FAR_POINT) or a smaller board'
+            f'{room.far:g} m; choose other distances (--room NEAR FAR) or a smaller board'
         )
     return shots.take(possible)
 

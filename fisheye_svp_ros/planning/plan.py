@@ -31,6 +31,7 @@ from fisheye_svp_ros.planning.optimal_design import (
 )
 from fisheye_svp_ros.pose import identity, quaternion_from_rotation
 from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.table_checks import check_noise
 from fisheye_svp_ros.simulate.simulation import blank_views
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
@@ -227,8 +228,9 @@ def plan(
 
     number: whose error is to be small, the whole lens by default; a viewpoint shift is left open.
     Raises GeometryError where the lens does not see the board, ParameterError for a number that
-    it does not have.
+    it does not have and for impossible noise.
     """
+    check_noise(noise)
     board = FlatBoard(np.arange(len(points)), points, np.zeros(len(points), int), np.eye(3))
     state = RigState(identity(1), identity(1), lens, ())
     if lens.calibrated_angle is not None:

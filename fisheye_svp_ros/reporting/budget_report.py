@@ -175,18 +175,19 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: BudgetReque
                 cmap='Blues',
             )
             _label(figure.colorbar(mesh, ax=axis, label=unit), error)
-            _draw_limit(axis, budget, point, point.quantity in asked.given)
+            title = f'{_LABELS[point.quantity]}: no limit'
+            if point in asked.relevant_points(points):
+                _draw_limit(axis, budget, point, point.quantity in asked.given)
+                kept = {True: 'kept', False: 'broken', None: 'not known'}[point.kept]
+                limit = f'limit {factor * point.limit:.3g} {unit}'
+                title = f'{_LABELS[point.quantity]}: {limit}, {kept}'
             axis.plot(
                 asked.working_range, np.degrees(asked.spread), '*', color=PUBLISHED, markersize=11
             )
-            kept = {True: 'kept', False: 'broken', None: 'not known'}[point.kept]
-            axis.set_title(
-                f'{_LABELS[point.quantity]}: limit {factor * point.limit:.3g} {unit}, {kept}',
-                fontsize=9.5,
-            )
+            axis.set_title(title, fontsize=9.5)
             axis.set(xscale='log', xlabel='range / m', ylabel='spread / degree')
             axis.grid(visible=False)
-        _explain(axes.flat[len(points)], asked.model)
+        _explain(axes.flat[len(points)], asked)
 
 
 def _label(bar: Any, error: Array) -> None:
@@ -208,14 +209,15 @@ def _draw_limit(axis: Any, budget: Budget, point: Point, given: bool) -> None:
     axis.contour(*place, excess, levels=[0], colors=OURS, linewidths=1.8)
 
 
-def _explain(axis: Any, model: str) -> None:
+def _explain(axis: Any, asked: BudgetRequest) -> None:
     axis.axis('off')
+    limits = '' if asked.given else '\nLimits: the errors caused by noise.'
     axis.text(
         0.02,
         0.95,
-        f'Color: error caused by {model}.\nHatched: above the limit.\nLine: at the limit.\nStar: '
-        'your range and spread.\nDefault limits: the errors caused by noise.\n\nSpread: largest '
-        'incidence angle of the\nlandmarks, which surround the axis.',
+        f'Color: error caused by {asked.model}.\nHatched: above the limit.\nLine: at the limit.\n'
+        f'Star: your range and spread.{limits}\n\nSpread: largest incidence angle of the\n'
+        'landmarks, which surround the axis.',
         va='top',
         transform=axis.transAxes,
         linespacing=1.5,

@@ -14,13 +14,8 @@ from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.reporting.blocks import page, png_uri
 from fisheye_svp_ros.reporting.calibrated_camera import CalibratedCamera
-from fisheye_svp_ros.reporting.plots import (
-    FAINT,
-    OURS,
-    PUBLISHED,
-    drawing,
-    round_number,
-)
+from fisheye_svp_ros.reporting.diagnosis_plots import draw_arrows
+from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, drawing
 from fisheye_svp_ros.reporting.terminal import draw_or_note
 from fisheye_svp_ros.reporting.wording.calibration import (
     ANY_TARGET,
@@ -146,18 +141,9 @@ def _residuals(figure: Any, camera: CalibratedCamera) -> None:
     step = max(1, len(uv) // _ARROWS)
     size = np.linalg.norm(residual, axis=1)
     typical = max(float(np.quantile(size, 0.9)), 1e-9)
-    key = image.quiver(
-        *uv[::step].T,
-        *residual[::step].T,
-        angles='xy',
-        scale_units='xy',
-        scale=typical / (_ARROW_LENGTH * lens.width),
-        color=OURS,
-        width=0.002,
-    )
-    length = round_number(typical)
-    image.quiverkey(key, 0.8, 1.04, length, f'{length:g} px', labelpos='E')
+    draw_arrows(image, uv[::step], residual[::step], typical, _ARROW_LENGTH * lens.width, OURS)
     _image(image, lens)
+    image.set_title('residuals', loc='left')  # and room for the key to their scale
     arm = uv - (lens.cx, lens.cy)
     radial = (residual * arm).sum(axis=1) / np.maximum(np.linalg.norm(arm, axis=1), 1e-9)
     points = camera.result.adjusted.pose.into_body(views.points)[views.used]

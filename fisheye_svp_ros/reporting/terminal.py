@@ -20,7 +20,7 @@ from rich.padding import Padding
 from rich.progress import Progress
 from rich.table import Table
 
-from fisheye_svp_ros.errors import FisheyeSvpError
+from fisheye_svp_ros.errors import FisheyeSvpError, one_line
 
 UNITS = {  # of the parameters of a lens; 1 where there is none
     **dict.fromkeys(('f', 'fx', 'fy', 'cx', 'cy'), 'px'),
@@ -63,8 +63,8 @@ def print_table(
 
 
 def print_note(note: str) -> None:
-    """Print what there is to say beside the results, on standard error."""
-    print(f'fisheye-svp: note: {note}', file=sys.stderr, flush=True)
+    """Print what there is to say beside the results, on standard error, as one line."""
+    print(f'fisheye-svp: note: {one_line(note)}', file=sys.stderr, flush=True)
 
 
 def draw_or_note(path: Path, draw: Callable[..., None], *arguments: Any) -> bool:

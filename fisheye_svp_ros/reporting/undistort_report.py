@@ -141,7 +141,7 @@ def draw_remaining(path: Path, side: Rectification, left: Remaining, what: str) 
             xscale='log',
             xlabel='range, m',
             ylabel=f'{what}, px',
-            ylim=(0, 1.1 * top),
+            ylim=(0, 1.1 * top or 1.0),  # of a camera of one pixel nothing is off
             title=tolerated_text(left),
         )
         curve.legend()

@@ -116,7 +116,19 @@ class Observations:
 
 
 STEREO = ('left', 'right')
+_MAX_CAMERA_NAME = 100  # bytes; of files that are named after cameras, file systems allow 255
+CAMERA_NAME = f'a printable name of at most {_MAX_CAMERA_NAME} bytes, without / and not .name,'
 _HEADER = ('cameras', 'source', 'photographs')
+
+
+def is_camera_name(name: str) -> bool:
+    """Whether files of results, and lines of a terminal, can hold the name of a camera."""
+    return (
+        name.isprintable()
+        and not {'/', '\\'} & {*name}
+        and not name.startswith('.')
+        and len(name.encode()) <= _MAX_CAMERA_NAME
+    )
 
 
 def make_observations(
@@ -132,7 +144,12 @@ def make_observations(
     cameras: tuple[str, ...] = ('',),
     source: str = 'observations',
 ) -> Observations:
-    """Build a table from its columns, with the optional ones filled in."""
+    """Build a table from its columns, with the optional ones filled in.
+
+    Raises ObservationError for names of cameras that no file can have.
+    """
+    if bad := [name for name in cameras if not is_camera_name(name)]:
+        raise ObservationError(f'{source}: camera is {bad[0]!r:.80}; {CAMERA_NAME} is needed')
     count = len(frame)
     zeros = np.zeros(count, dtype=np.int64)
     unknown = np.full(count, np.nan)

@@ -8,11 +8,12 @@ from itertools import combinations
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras, select_cameras
 
 ROUNDING = 1e-7  # px: what is simulated without noise scatters by less, nothing measured does
 MAX_TARGET_SIZE = 20.0  # m; a target larger than this was measured in other units
+MAX_NOISE = 1e3  # px, of an image point: beyond it nothing is measured
 _MIN_SIGMA, _MIN_SIGMA_SHARE = 1e-6, 1e-3  # px, and of the median
 SIGMA_BOUND = f'{_MIN_SIGMA:g} px or more, and {_MIN_SIGMA_SHARE:g} of the median or more'
 _COPIED_SHARE = 0.5  # of the image points: no two photographs have so many alike
@@ -26,6 +27,12 @@ _MANY_POINTS, _MIN_POINTS = 1500, 24  # of a thinned table, and of a view that s
 def target_size(table: Observations) -> float:
     """Return the largest extent of the landmarks along x, y or z, m."""
     return float((table.xyz.max(axis=0) - table.xyz.min(axis=0)).max())
+
+
+def check_noise(noise: float) -> None:
+    """Raise ParameterError for a standard deviation of u and of v, px, that nobody means."""
+    if not 0 < noise <= MAX_NOISE:
+        raise ParameterError(f'noise is {noise:g} px; above 0 and up to {MAX_NOISE:g} is needed')
 
 
 def implausible_sigma(sigma: Array) -> Mask:

@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import back_project_corrected, project_corrected
+from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.camera import Rays
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 
+_MAX_BLUR, _MAX_NOISE = 100.0, 255.0  # px, gray levels
 _SAMPLES = 3  # samples along each side of a pixel
 _ROUNDS = 6  # to meet a bowed board
 _DARK, _BRIGHT, _ROOM = 0.08, 0.85, 0.30  # reflectance of ink, paper, what is behind
@@ -115,6 +117,16 @@ class Exposure:
     noise: float = 1.5
     twist: tuple[float, ...] = ()
     line_time: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raise ParameterError for a blur or noise that leaves no picture."""
+        for name, most, unit in (
+            ('blur', _MAX_BLUR, 'px'),
+            ('blur_edge', _MAX_BLUR, 'px'),
+            ('noise', _MAX_NOISE, 'gray levels'),
+        ):
+            if not 0 <= (value := getattr(self, name)) <= most:
+                raise ParameterError(f'{name} is {value:g}; 0 to {most:g} {unit} are needed')
 
 
 def render(

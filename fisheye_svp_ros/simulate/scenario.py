@@ -31,6 +31,7 @@ from fisheye_svp_ros.pose import (
 )
 from fisheye_svp_ros.scene.observations import STEREO, Landmarks, Observations
 from fisheye_svp_ros.scene.rigs import BASELINE, STYLES, calibration_poses, rig_from_angle
+from fisheye_svp_ros.scene.table_checks import MAX_NOISE
 from fisheye_svp_ros.simulate.simulation import (
     add_noise,
     blank_views,
@@ -86,7 +87,7 @@ class Scenario:
         span=(0, 1_000_000),
     )
     noise_px: float = parameter(
-        0.0, 'Standard deviation of the noise of image points', 'px', (0.0, 1e3)
+        0.0, 'Standard deviation of the noise of image points', 'px', (0.0, MAX_NOISE)
     )
     seed: int = parameter(0, 'Seed of the noise', span=(0, 2**31 - 1))
     rig_file: str = parameter(

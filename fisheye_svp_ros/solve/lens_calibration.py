@@ -24,7 +24,7 @@ from fisheye_svp_ros.optics.lens import (
 )
 from fisheye_svp_ros.optics.ports import Port
 from fisheye_svp_ros.pose import Pose, identity
-from fisheye_svp_ros.scene.observations import Observations, Views, views_of
+from fisheye_svp_ros.scene.observations import Observations, Views, frame_name, views_of
 from fisheye_svp_ros.solve.bundle_adjustment import AdjustedLens, adjust_lens, adjust_lens_from
 from fisheye_svp_ros.solve.hand_eye import HandEye, fit_hand_eye, flange_poses
 from fisheye_svp_ros.solve.initial_pose import initial_poses
@@ -34,6 +34,7 @@ from fisheye_svp_ros.solve.reliability import noise_sigma
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
 MAX_OUTSIDE = 0.1  # of its size; how far outside the image a point may be, as tags cut off are
+MAX_WILD_SHARE = 0.05  # of the rows: more of them outside, and the image has another size
 FOCAL_UNCERTAINTY = 0.1  # a focal length that is known no better than this is not known
 _CANDIDATES = 4
 _START_ITERATIONS = 40
@@ -290,13 +291,27 @@ def _check_known(lens: Lens, names: tuple[str, ...]) -> None:
         raise LensError(f'free names a parameter twice: {", ".join(names)}')
 
 
-def _check_inside(observations: Observations, image_size: tuple[int, int]) -> None:
-    outside = np.maximum(-observations.uv, observations.uv - image_size).max(axis=0) / image_size
-    if outside.max() > MAX_OUTSIDE:
+def _check_inside(table: Observations, image_size: tuple[int, int]) -> None:
+    """Raise ObservationError for rows far outside the image, or an image that is not theirs."""
+    outside = (np.maximum(-table.uv, table.uv - image_size) / image_size).max(axis=1)
+    rows = np.flatnonzero(outside > MAX_OUTSIDE)
+    if not len(rows):
+        return
+    image = f'an image of {image_size[0]}x{image_size[1]}'
+    if len(rows) > MAX_WILD_SHARE * len(table):
         raise ObservationError(
-            f'{observations.source}: image points lie far outside an image of '
-            f'{image_size[0]}x{image_size[1]}; check the image size'
+            f'{table.source}: {len(rows)} of {len(table)} image points lie far outside {image}; '
+            'check the image size'
         )
+    first = int(rows[0])
+    u, v = table.uv[first]
+    camera = table.cameras[table.camera[first]] or None
+    more = f', and {len(rows) - 1} more points do' if len(rows) > 1 else ''
+    raise ObservationError(
+        f'{table.source}: {frame_name(table, int(table.frame[first]), camera)}, landmark '
+        f'{table.landmark[first]}: u, v = {u:g}, {v:g} px lies far outside {image}{more}; correct '
+        'or remove the row, or check the image size'
+    )
 
 
 def fit_lens(start: Lens, views: Views, names: tuple[str, ...]) -> AdjustedLens:

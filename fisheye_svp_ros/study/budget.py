@@ -20,6 +20,7 @@ from fisheye_svp_ros.optics.camera import back_project, unique_range
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, axis_angle_between, identity
 from fisheye_svp_ros.scene.observations import views_of
+from fisheye_svp_ros.scene.table_checks import check_noise
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate, triangulate_optimally
 from fisheye_svp_ros.study.solutions import known_mean
@@ -127,8 +128,7 @@ def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
             f'lens {lens.name!r} has no viewpoint_shift, so nothing is known of the error '
             'that SVP makes; `fisheye-svp diagnose` measures it: give its extended_lens.yaml'
         )
-    if not (np.isfinite(setup.noise) and setup.noise > 0):
-        raise ParameterError(f'noise is {setup.noise} px; it must be above 0')
+    check_noise(setup.noise)
     baseline = float(np.linalg.norm(setup.rig.position))
     if not _BASELINES[0] <= baseline <= _BASELINES[1]:
         raise ParameterError(

@@ -213,6 +213,11 @@ def test_pictures_do_not_depend_on_the_backend_of_the_environment(
     assert 'error_against_radius.png' in results(out)
 
 
+@pytest.mark.filterwarnings('error')
+def test_rectified_images_may_have_one_pixel(tmp_path: Path) -> None:
+    assert main(['undistort', 'fish214', '--size', '1x1', '-o', str(tmp_path)]) == 0
+
+
 def png(path: Path, side: int = 1536) -> bytes:
     """Write a photograph of a user; return its bytes."""
     write_png(path, np.eye(side, dtype=np.uint8))

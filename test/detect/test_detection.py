@@ -609,6 +609,16 @@ class TestPhotographs:
         table = detect(find_photographs([str(path)], every=2), PATTERN).observations
         assert np.unique(table.t).tolist() == pytest.approx([0.0, 0.2])
 
+    @pytest.mark.parametrize('name', ['a.mp4', 'a.avi', 'a.mkv'])
+    @pytest.mark.parametrize('size', [0, 5000])
+    def test_a_broken_video(
+        self, name: str, size: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    ) -> None:
+        (tmp_path / name).write_bytes(np.random.default_rng(0).bytes(size))
+        with pytest.raises(ObservationError, match='the video is empty or cannot be decoded'):
+            list(find_photographs([str(tmp_path / name)]))
+        assert capfd.readouterr().err == ''
+
     def test_exif(self) -> None:
         entry = b'\x12\x01\x03\x00\x01\x00\x00\x00\x06\x00\x00\x00'
         head = b'\xff\xd8\xff\xe1\x00\x22Exif\0\0II*\0\x08\0\0\0\x01\0'

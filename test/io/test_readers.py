@@ -181,8 +181,23 @@ class TestObservationsCsv:
     @pytest.mark.parametrize(
         ('name', 'cell', 'says'),
         [
-            ('camera', '../left', "camera is '../left'; a name without .."),
-            ('camera', '/left', "camera is '/left'; a name without .."),
+            *(
+                ('camera', cell, f'camera is {cell!r}; a printable name of at most 100 bytes')
+                for cell in (
+                    '../left',
+                    '/left',
+                    'a/b',
+                    'a\\b',
+                    '.left',
+                    '\x1b[31mred',
+                    'l\u202eft',
+                )
+            ),
+            ('camera', 'c' * 300, "camera is 'ccc"),
+            *(
+                ('sigma', cell, f'sigma is {cell!r}; a number')
+                for cell in ('1_00.0', '_1', '1__0', '1_0e2')
+            ),
             ('camera', '', "camera is ''; a name, as '1' elsewhere, is needed"),
             ('sigma', '0', "sigma is '0'; a number above 0"),
             ('sigma', '-0.1', "sigma is '-0.1'; a number above 0"),

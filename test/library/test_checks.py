@@ -65,13 +65,13 @@ SIDE, IMAGE = fsvp.undistort_maps(LENS), np.zeros((400, 424), np.uint8)
         ),
         (
             lambda: fsvp.plan(LENS, BOARD, ROOM, noise_px=-1),
-            'noise_px is -1; a number above 0 px is',
+            'noise is -1 px; above 0 and up to 1000',
         ),
         (lambda: fsvp.render(LENS, BOARD, None), 'pose is of type NoneType; a Pose is needed'),
         (lambda: fsvp.render(LENS, BOARD, poses(4)), 'pose holds 4 poses; one is needed'),
         (
             lambda: fsvp.render(LENS, BOARD, poses(4).take(0), noise=-1),
-            'noise is -1; 0 or more grey',
+            'noise is -1; 0 to 255 gray levels',
         ),
         (
             lambda: fsvp.undistort_maps(LENS, size=(10,)),

@@ -11,7 +11,7 @@ from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, true_co
 from fisheye_svp_ros.detect.corner_fit import fit_corners
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.points import find_points, local_axes
-from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.simulate.render import Exposure, Field, Print, pixel_rays, render
 from fisheye_svp_ros.simulate.targets import TARGETS, board_views, target_views, visible
@@ -152,3 +152,9 @@ def test_a_face_that_looks_away_is_not_seen() -> None:
     for i in range(5):
         seen = visible(LENS, boards, poses.take(i))[1].any(axis=1).reshape(3, 2)
         assert not seen.all(axis=1).any()
+
+
+@pytest.mark.parametrize('values', [{'blur': 1e9}, {'noise': 256.0}, {'blur': float('nan')}])
+def test_an_exposure_that_leaves_no_picture_is_refused(values: dict[str, float]) -> None:
+    with pytest.raises(ParameterError, match=r'(blur|noise) is .* are needed'):
+        Exposure(**values)

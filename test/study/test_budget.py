@@ -1,11 +1,13 @@
 """The budget of the SVP error, and the command that tells it."""
 
 import json
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.nodes import ROOT
+from matplotlib.figure import Figure
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -152,9 +154,9 @@ def test_a_lens_without_a_shift_needs_no_budget():
         make_budget(Setup(LENS.svp(), rig('parallel'), 0.3))
 
 
-@pytest.mark.parametrize('noise', [0.0, -1.0, float('nan')])
+@pytest.mark.parametrize('noise', [0.0, -1.0, float('nan'), 1e9])
 def test_impossible_noise(noise):
-    with pytest.raises(ParameterError, match=r'noise is .* px; it must be above 0'):
+    with pytest.raises(ParameterError, match=r'noise is .* px; above 0 and up to'):
         make_budget(Setup(LENS, rig('parallel'), noise))
 
 
@@ -233,6 +235,26 @@ def test_what_no_camera_pair_sees_breaks_no_limit(limits, negligible, answer, tm
     written = json.loads((tmp_path / 'budget.json').read_text(encoding='utf-8'))
     assert written['negligible'] is negligible
     assert [row['kept'] for row in written['at_point']][-1] is None
+
+
+def test_the_picture_draws_the_limits_that_hold(tmp_path, monkeypatch):
+    figures = []
+
+    @contextmanager
+    def kept(*_):
+        figures.append(Figure(layout='constrained'))
+        yield figures[-1]
+
+    monkeypatch.setattr('fisheye_svp_ros.reporting.budget_report.picture', kept)
+    limits = ['--max-position', '2', '--max-epipolar', '0.5']
+    for given in (limits, []):
+        assert main(['budget', '--lens', 'fish214', *given, '-o', str(tmp_path)]) == 0
+    titles = [[axis.get_title() for axis in figure.axes] for figure in figures]
+    named = {title.partition(':')[0] for title in titles[0] if ': limit' in title}
+    assert named == {'position of the camera', 'epipolar distance'}
+    assert sum(': limit' in title for title in titles[1]) == 5
+    texts = [' '.join(t.get_text() for a in figure.axes for t in a.texts) for figure in figures]
+    assert ['caused by noise' in text for text in texts] == [False, True]
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Sequence
 
 from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.files import parse_number
 from fisheye_svp_ros.io.lens_formats import Foreign, models
 from fisheye_svp_ros.optics.lens import Lens
 
@@ -84,7 +85,9 @@ def read(text: str, where: str) -> Foreign:
         camera, model, rest = row.groups()
         place = f'{where}: camera {camera}'
         try:
-            width, height, *values = (float(word) for word in rest.replace(',', ' ').split())
+            width, height, *values = (
+                parse_number(word) for word in rest.replace(',', ' ').split()
+            )
         except ValueError as cause:
             raise LensError(
                 f'{place}: width, height and the parameters of {model} must be numbers ({cause})'

@@ -10,6 +10,7 @@ import re
 from xml.etree.ElementTree import Element
 
 from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.files import parse_number
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 
@@ -67,7 +68,7 @@ def _lens(name: str, calibration: Element, where: str) -> tuple[Lens, float]:
     values = {}
     for tag in ('width', 'height', *_NAMES):
         try:
-            values[tag] = float(words.get(tag) or '')
+            values[tag] = parse_number(words.get(tag) or '')
         except ValueError as cause:
             raise LensError(f'{where}: {tag} is {words.get(tag)!r}; a number is needed') from cause
     width, height = values['width'], values['height']

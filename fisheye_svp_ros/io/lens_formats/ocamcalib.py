@@ -13,6 +13,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.files import parse_number
 from fisheye_svp_ros.io.lens_formats import Foreign, models
 from fisheye_svp_ros.io.lens_formats.fields import MAX_NUMBER
 
@@ -35,7 +36,7 @@ def read(text: str, where: str) -> Foreign:
             'OCamCalib has five lines of numbers'
         )
     try:
-        rows = [np.array([float(word) for word in line.split()]) for line in lines]
+        rows = [np.array([parse_number(word) for word in line.split()]) for line in lines]
         direct, (row, column) = rows[0], rows[2]
         (c, d, e), (height, width) = rows[3], rows[4]
     except ValueError as cause:

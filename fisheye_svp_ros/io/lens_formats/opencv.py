@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.files import parse_json
+from fisheye_svp_ros.io.files import parse_json, parse_number
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -236,7 +236,7 @@ def _from_xml(text: str, where: str) -> dict[str, Any]:
 def _parse_numbers(text: str | None, always_listed: bool) -> Any:
     """Return the numbers in a text: a list, or a number alone; the text if it holds others."""
     try:
-        numbers = [float(word) for word in (text or '').split()]
+        numbers = [parse_number(word) for word in (text or '').split()]
     except ValueError:
         return text
     return numbers if always_listed or len(numbers) != 1 else numbers[0]

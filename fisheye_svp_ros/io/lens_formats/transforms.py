@@ -14,7 +14,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.files import dump_yaml, parse_yaml
+from fisheye_svp_ros.io.files import dump_yaml, parse_number, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields
 from fisheye_svp_ros.pose import (
     Pose,
@@ -87,7 +87,7 @@ def _urdf(text: str, where: str) -> Iterator[_Joint]:
 def _numbers(text: str, where: str) -> Array:
     words: list[Any] = text.split()
     with suppress(ValueError):
-        words = [float(word) for word in words]
+        words = [parse_number(word) for word in words]
     return np.array(fields.numbers({'origin': words}, 'origin', 3, where))
 
 
