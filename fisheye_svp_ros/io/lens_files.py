@@ -26,10 +26,12 @@ from fisheye_svp_ros.optics.lens import (
     IMAGE_FIELD,
     INTRINSICS,
     PORT,
+    TANGENTIAL,
     Lens,
     check_lens,
     field_of_view,
 )
+from fisheye_svp_ros.optics.pinhole import TangentialDistortion
 from fisheye_svp_ros.optics.ports import PORTS
 from fisheye_svp_ros.registry import Registry
 
@@ -53,6 +55,7 @@ _DEPTH = 3  # folders, one in the other
 _COLMAP_BINARY = 'cameras.bin'
 FILES_OF_RIG = ('rig', 'camchain', 'tf_static')  # beside those of its lenses
 OWN_SECTIONS = re.compile(r'\b(projection|image)\b')  # of our own lens files
+_OF_LENS = (PORT, TANGENTIAL, IMAGE_FIELD)  # corrections that are no effects
 _LEGACY_KEY = 'effects'  # what older files call corrections, of the lens and of the target alike
 
 
@@ -127,6 +130,7 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
         port=None
         if PORT not in own
         else _curve(own[PORT], PORTS, '', 0, f'{where}: corrections.port'),
+        tangential=_tangential(own.get(TANGENTIAL), where),
         image_field=None
         if IMAGE_FIELD not in own
         else ImageField.from_dict(own[IMAGE_FIELD], where),
@@ -141,7 +145,7 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
     if given is not None:
         degrees = _number(document, 'max_incidence_deg', where)
         lens = check_lens(replace(lens, max_incidence=np.radians(degrees).item()), where)
-    own = {name: entry for name, entry in own.items() if name not in (PORT, IMAGE_FIELD)}
+    own = {name: entry for name, entry in own.items() if name not in _OF_LENS}
     for entries in (_effects(document, _LEGACY_KEY, where), own):
         lens = extend_lens(lens, load_effects(entries, where))
     return lens if given is not None else replace(lens, max_incidence=field_of_view(lens))
@@ -164,6 +168,8 @@ def lens_to_dict(lens: Lens) -> dict[str, Any]:
         document['viewpoint_shift'] = parts if len(parts) > 1 else parts[0]
     own = {} if lens.port is None else {PORT: _curve_to_dict(lens.port, PORTS, '')}
     own |= lens.corrections
+    if lens.tangential is not None:
+        own[TANGENTIAL] = lens.tangential.values
     if lens.image_field is not None:
         own[IMAGE_FIELD] = lens.image_field.to_dict()
     document |= {'corrections': own, 'target': dict(lens.target)}
@@ -241,6 +247,14 @@ def _viewpoint_shift(section: Any, where: str) -> ViewpointShift | None:
     place = f'{where}: viewpoint_shift'
     first, *others = (_curve(part, VIEWPOINT_SHIFTS, 'e', 0, place) for part in parts)
     return reduce(ViewpointShift.plus, others, first)
+
+
+def _tangential(section: Mapping[str, Any] | None, where: str) -> TangentialDistortion | None:
+    if section is None:
+        return None
+    where = f'{where}: corrections.{TANGENTIAL}'
+    _refuse_unknown(section, set(TangentialDistortion().values), where)
+    return TangentialDistortion(**{name: _number(section, name, where) for name in section})
 
 
 def _curve(

@@ -63,11 +63,10 @@ class CameraInfos:
         known, own = self._camera(topic, stamp)
         if frames_differ(own, frame):
             raise ObservationError(wording.camera_info_of_another(topic, own, frame))
-        lens, worst = lens_of(*known, topic.replace('/', '_'), topic)
+        lens = lens_of(*known, topic.replace('/', '_'), topic)
         if self._told.get(topic) != known:
             self._told[topic] = known
-            off = f', {worst:.2g} px off at worst' if worst else ''
-            self._tell(f'{topic}: {known.model} of {lens.width}x{lens.height} px{off}')
+            self._tell(f'{topic}: {known.model or "pinhole"} of {lens.width}x{lens.height} px')
         return lens
 
     def _camera(self, topic: str, stamp: int) -> FramedCamera:

@@ -62,7 +62,7 @@ class LinearImage:
     @property
     def d_height(self) -> Array:
         """Derivatives (..., 2) by the image height, px for unit h/f."""
-        return self.through_field(self._along_radius[..., None])[..., 0]
+        return self.through_field(self._along_radius[..., None], of_ray=False)[..., 0]
 
     @property
     def d_shift(self) -> Array:
@@ -76,9 +76,9 @@ class LinearImage:
 
     def d_intrinsics(self) -> dict[str, Array]:
         """Return derivatives (..., 2) by f, fx, fy, cx and cy."""
-        height, _ = self.lens.image_height.value_and_slope(self.incidence.theta)
-        h = self._along_radius * height[..., None]
-        u, v = h[..., 0] / self.lens.fx, h[..., 1] / self.lens.fy
+        lens = self.lens
+        place = lens.displace_tangentially(self._by_curve)
+        u, v = np.moveaxis((place - (lens.cx, lens.cy)) / (lens.fx, lens.fy), -1, 0)
         zero, one = np.zeros_like(u), np.ones_like(u)
         columns = np.stack(
             [
@@ -87,16 +87,22 @@ class LinearImage:
             ],
             axis=-2,
         )
-        columns = self.through_field(columns)
+        if lens.image_field is not None:
+            columns = lens.image_field.carry(place, columns)
         return dict(zip(('f', *INTRINSICS), np.moveaxis(columns, -1, 0), strict=True))
 
-    def through_field(self, columns: Array) -> Array:
-        """Return derivatives (..., 2, P) of image points from those of the ideal ones."""
-        if self.lens.image_field is None:
-            return columns
+    def through_field(self, columns: Array, of_ray: bool = True) -> Array:
+        """Return derivatives (..., 2, P) of image points from those of the curve's alone.
+
+        of_ray: see `Lens.carry`.
+        """
+        return self.lens.carry(self._by_curve, columns, of_ray) if self.lens.displaces else columns
+
+    @property
+    def _by_curve(self) -> Array:
+        """Image points (..., 2), px, as the curve alone gives them."""
         height, _ = self.lens.image_height.value_and_slope(self.incidence.theta)
-        ideal = self._along_radius * height[..., None] + [self.lens.cx, self.lens.cy]
-        return self.lens.image_field.carry(ideal, columns)
+        return self._along_radius * height[..., None] + [self.lens.cx, self.lens.cy]
 
     @property
     def _along_radius(self) -> Array:
@@ -205,7 +211,7 @@ def back_project(lens: Lens, uv: Array) -> Rays:
     camera's origin; theta is that in air.  Image points outside the field of view come back as NaN
     with valid False.
     """
-    uv = uv if lens.image_field is None else lens.image_field.invert(uv)
+    uv = lens.undo_displacement(uv) if lens.displaces else uv
     mx = (np.asarray(uv[..., 0], dtype=float) - lens.cx) / lens.fx
     my = (np.asarray(uv[..., 1], dtype=float) - lens.cy) / lens.fy
     height = np.sqrt(mx * mx + my * my)

@@ -14,6 +14,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.optics import formulas
 from fisheye_svp_ros.optics.curve_base import ImageHeight, Trigonometric, ViewpointShift
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.pinhole import BrownConrady, RationalPolynomial
 from fisheye_svp_ros.registry import Registry
 
 _SAMPLES = 512
@@ -169,6 +170,8 @@ IMAGE_HEIGHTS: Registry[type[ImageHeight]] = Registry(
         'stereographic': Stereographic,
         'perspective': Perspective,
         'kannala_brandt': KannalaBrandt,
+        'brown_conrady': BrownConrady,
+        'rational_polynomial': RationalPolynomial,
     },
     ImageHeight,
 )
@@ -190,7 +193,9 @@ def kannala_brandt_equivalent(lens: Lens) -> Lens:
     five odd powers of theta over the field of view.  Corrections have no place in it.
     """
     curve = lens.image_height
-    bare = replace(lens.svp(), image_field=None, corrections={}, target={})
+    bare = replace(
+        lens.svp(), tangential=None, image_field=None, corrections={}, target={}
+    )
     exact = curve.with_powers(())
     if exact is not None:
         return replace(bare, image_height=exact)

@@ -12,11 +12,13 @@ from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.curve_base import ImageHeight, ViewpointShift
 from fisheye_svp_ros.optics.image_field import ImageField
+from fisheye_svp_ros.optics.pinhole import TangentialDistortion
 from fisheye_svp_ros.optics.ports import Port
 
 INTRINSICS = ('fx', 'fy', 'cx', 'cy')
 PORT = 'port'  # before the names of a port's coefficients, among those of a lens
 IMAGE_FIELD = 'image_field'
+TANGENTIAL = 'tangential'
 _RANGE_MARGIN = 1 - 1e-6  # of the monotone range: at its very end the curve cannot be inverted
 
 
@@ -25,8 +27,9 @@ class Lens:
     """One fisheye lens on its camera; SVP is the same lens without shift and port.
 
     fx, fy, cx, cy in px (pixel centers at whole numbers); max_incidence in rad.  viewpoint_shift
-    is all of it, whatever it is made of, but for what a port brings.  image_field: what moves
-    image points beside curves and port.  corrections: effects of the
+    is all of it, whatever it is made of, but for what a port brings.  tangential: what moves
+    image points of a pinhole otherwise than along the radius; image_field: what moves them beside
+    all of this.  corrections: effects of the
     lens's own that have no other place in it, by name, as `effects.base.Effect.to_dict` gives
     them; target: those of the target that they were found on, and its landmarks, see
     `effects.extension`; both are changed by `effects.extension.extend_lens`.  calibration: where a
@@ -45,6 +48,7 @@ class Lens:
     max_incidence: float
     viewpoint_shift: ViewpointShift | None = None
     port: Port | None = None
+    tangential: TangentialDistortion | None = None
     image_field: ImageField | None = field(default=None, repr=False, hash=False)
     corrections: Mapping[str, Any] = field(default_factory=dict, hash=False)
     target: Mapping[str, Any] = field(default_factory=dict, repr=False, hash=False)
@@ -123,7 +127,50 @@ class Lens:
     @property
     def is_bare(self) -> bool:
         """Whether its curves are all there is, so that an engine solves with it by itself."""
-        return self.port is None and self.image_field is None
+        return self.port is None and not self.displaces
+
+    @property
+    def displaces(self) -> bool:
+        """Whether image points are not where the curve of the image height puts them."""
+        return self.tangential is not None or self.image_field is not None
+
+    def displace(self, uv: Array) -> Array:
+        """Return image points (..., 2), px, of those that the curve alone gives."""
+        uv = self.displace_tangentially(uv)
+        return uv if self.image_field is None else self.image_field.apply(uv)
+
+    def displace_tangentially(self, uv: Array) -> Array:
+        """See `displace`; without the image field."""
+        if self.tangential is None:
+            return uv
+        return self._in_pixels(self.tangential.apply(self.image_height, self._for_unit_focal(uv)))
+
+    def undo_displacement(self, uv: Array) -> Array:
+        """Return the image points (..., 2), px, that the curve alone gives; NaN for none."""
+        uv = uv if self.image_field is None else self.image_field.invert(uv)
+        if self.tangential is None:
+            return uv
+        return self._in_pixels(self.tangential.invert(self.image_height, self._for_unit_focal(uv)))
+
+    def carry(self, uv: Array, columns: Array, of_ray: bool = True) -> Array:
+        """Return derivatives (..., 2, P) of image points from those of the curve's alone at uv.
+
+        of_ray: these move with the ray; otherwise with the curve.
+        """
+        if self.tangential is not None:
+            place = self._for_unit_focal(uv)
+            slope = self.tangential.slope(self.image_height, place, of_ray)
+            focal = np.array([[self.fx], [self.fy]])
+            columns = focal * (slope @ (columns / focal))
+        if self.image_field is None:
+            return columns
+        return self.image_field.carry(self.displace_tangentially(uv), columns)
+
+    def _for_unit_focal(self, uv: Array) -> Array:
+        return np.asarray((uv - (self.cx, self.cy)) / (self.fx, self.fy))
+
+    def _in_pixels(self, place: Array) -> Array:
+        return np.asarray(place * (self.fx, self.fy) + (self.cx, self.cy))
 
     @property
     def focal(self) -> float:
@@ -149,7 +196,7 @@ class Lens:
         for name in ('fx', 'fy', 'width', 'height'):
             if getattr(self, name) <= 0:
                 return f'{name} is {getattr(self, name)}; it must be above 0'
-        parts = (self.image_height, self.viewpoint_shift, self.port)
+        parts = (self.image_height, self.viewpoint_shift, self.port, self.tangential)
         wrong = next((wrong for part in parts if part is not None and (wrong := part.check())), '')
         if wrong or self.image_field is None:
             return wrong
@@ -185,9 +232,13 @@ def monotone_limit(lens: Lens) -> float:
 
 def field_of_view(lens: Lens) -> float:
     """Return the incidence angle of the farthest image corner, rad, within the monotone range."""
-    u = max(lens.cx + 0.5, lens.width - 0.5 - lens.cx) / lens.fx
-    v = max(lens.cy + 0.5, lens.height - 0.5 - lens.cy) / lens.fy
-    corner = float(lens.image_height.angle(np.asarray(np.hypot(u, v))))
+    ends = np.array([[-0.5, lens.width - 0.5], [-0.5, lens.height - 0.5]])
+    corners = np.stack(np.meshgrid(*ends), axis=-1)
+    if lens.tangential is not None:
+        ideal = replace(lens, image_field=None).undo_displacement(corners)
+        corners = np.where(np.isnan(ideal), corners, ideal)
+    place = np.abs((corners - (lens.cx, lens.cy)) / (lens.fx, lens.fy))
+    corner = float(lens.image_height.angle(np.hypot(*np.moveaxis(place, -1, 0)).max()))
     return min(corner, monotone_limit(lens))
 
 

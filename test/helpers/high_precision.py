@@ -16,7 +16,13 @@ _HEIGHTS = {
     'KannalaBrandt': lambda k, a: (
         a + sum(mpmath.mpf(value) * a ** (2 * i + 3) for i, value in enumerate(k))
     ),
+    'BrownConrady': lambda k, a: mpmath.tan(a) * _even(k, a),
+    'RationalPolynomial': lambda k, a: mpmath.tan(a) * _even(k[:3], a) / _even(k[3:], a),
 }
+
+
+def _even(k, a):
+    return 1 + sum(mpmath.mpf(value) * mpmath.tan(a) ** (2 * i) for i, value in enumerate(k, 1))
 
 
 def _gennery(m, c, a):

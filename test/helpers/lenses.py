@@ -18,6 +18,7 @@ from fisheye_svp_ros.optics.curves import (
     Stereographic,
 )
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.pinhole import BrownConrady, RationalPolynomial
 from helpers import high_precision
 
 KITA = [load_lens(lens_path(name)) for name in ('fish180', 'fish214')]
@@ -28,6 +29,8 @@ HEIGHTS = {
     'stereographic': (Stereographic(), 120.0),
     'perspective': (Perspective(), 68.0),
     'kannala_brandt': (KannalaBrandt(-0.02, 0.004, -0.003, 0.0004), 100.0),
+    'brown_conrady': (BrownConrady(-0.28, 0.09, -0.004), 55.0),
+    'rational_polynomial': (RationalPolynomial(0.3, 0.02, 0.001, 0.5, 0.03, 0.002), 70.0),
 }
 SHIFTS = {
     'svp': None,
@@ -40,6 +43,8 @@ STEPS = {
     'k2': 1e-2,
     'k3': 1e-2,
     'k4': 1e-2,
+    'k5': 1e-2,
+    'k6': 1e-2,
     's0': 1e-4,
     'e0': 1e-4,
     'e1': 1e-4,

@@ -183,11 +183,12 @@ def test_a_camera_info_of_no_use(changes: dict[str, Any], reason: str) -> None:
         ('thin_prism', (0.1,), "'thin_prism'; known are equidistant"),
         ('equidistant', (0.1,), 'has 1 coefficients'),
         ('plumb_bob', (0.1,), 'has 1 coefficients'),
-        ('plumb_bob', (-0.9, 0.9, 0.01, 0.02, 0.0), 'calibrate again, as equidistant'),
+        ('rational_polynomial', (0.1,) * 9, 'has 9 coefficients; 4 or 5 or 8 or 12 or 14'),
+        ('', (0.1, 0.0, 0.0, 0.0), "distortion_model is ''; known are"),
         ('equidistant', (0.1, 1e300, 0.0, 5e-324), 'no real lens'),
     ],
 )
-def test_a_model_that_no_lens_comes_near_to(model: str, d: tuple[float, ...], reason: str) -> None:
+def test_a_model_of_no_lens_is_refused(model: str, d: tuple[float, ...], reason: str) -> None:
     with pytest.raises(LensError, match=reason):
         lens_of(model, (640, 480), (380.0, 380.0, 320.0, 240.0), d, 'camera', 'camera_info')
 
@@ -195,33 +196,34 @@ def test_a_model_that_no_lens_comes_near_to(model: str, d: tuple[float, ...], re
 @pytest.mark.parametrize(
     ('model', 'd'),
     [
-        ('equidistant', (0.02, -0.01, 0.003, -0.0005)),
-        ('plumb_bob', ()),
+        ('EQUIDISTANT', (0.02, -0.01, 0.003, -0.0005)),
+        ('', ()),
+        ('Plumb_Bob', ()),
+        ('plumb_bob', (-0.9, 0.9, 0.01, 0.02, 0.0)),
         ('plumb_bob', (0.1, -0.25, 0.001, -0.002, 0.05)),
         ('plumb_bob', (-0.2, 0.05, 0.001, 0.0005)),
         ('rational_polynomial', (0.3, 0.02, 0.0, 0.0, 0.001, 0.5, 0.03, 0.0)),
     ],
 )
 def test_every_model_as_opencv_projects_it(model: str, d: tuple[float, ...]) -> None:
-    lens, worst = lens_of(model, (640, 480), K, d, 'camera', 'camera_info')
+    lens = lens_of(model, (640, 480), K, d, 'camera', 'camera_info')
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 12), np.linspace(-0.4, 0.4, 12))
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
     matrix = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1.0]])
-    through = cv2.fisheye.projectPoints if model == 'equidistant' else cv2.projectPoints
+    through = cv2.fisheye.projectPoints if model == 'EQUIDISTANT' else cv2.projectPoints
     uv, _ = through(rays[:, None], np.zeros(3), np.zeros(3), matrix, np.array(d or [0.0] * 4))
     seen = forward.project_corrected(lens, rays)
     assert seen.valid.sum() > 100
-    off = np.abs(seen.uv - uv[:, 0])[seen.valid].max()
-    assert off < max(1.05 * worst, 1e-5) and worst <= 0.2
+    assert np.abs(seen.uv - uv[:, 0])[seen.valid].max() < 1e-5
 
 
 @pytest.mark.parametrize('d', [(), (0.0,) * 5])
 def test_a_wide_pinhole_is_taken_as_it_is(d: tuple[float, ...]) -> None:
     """Of 137 degrees over the diagonal, as a rectified image has it."""
-    lens, worst = lens_of('plumb_bob', (1280, 800), (300.0, 300.0, 640.0, 400.0), d, 'c', 'info')
+    lens = lens_of('plumb_bob', (1280, 800), (300.0, 300.0, 640.0, 400.0), d, 'c', 'info')
     rays = np.array([[2.1, 1.3, 1.0], [-2.0, 1.2, 1.0], [0.0, 0.0, 1.0]])
     seen = forward.project_corrected(lens, rays)
-    assert worst == 0.0 and seen.valid.all()
+    assert seen.valid.all()
     np.testing.assert_allclose(seen.uv, 300 * rays[:, :2] + (640, 400), atol=1e-9)
 
 
@@ -240,5 +242,5 @@ def test_a_skew_is_taken_over_from_message_and_file(
         rays[:, None], np.zeros(3), np.zeros(3), np.eye(3), np.array(d[:4])
     )
     wanted = plane[:, 0] @ matrix[:2, :2].T + matrix[:2, 2]
-    for lens in (lens_of(*model, 'camera', 'camera_info')[0], load_lens(file)):
+    for lens in (lens_of(*model, 'camera', 'camera_info'), load_lens(file)):
         assert forward.project_corrected(lens, rays).uv == pytest.approx(wanted, abs=1e-5)

@@ -55,7 +55,7 @@ def _lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float
             f'{where}: cameraType is {kind!r}; 0 (perspective) and 1 (fisheye) can be read'
         )
     k = fields.matrix(camera, 'intrinsicMatrix', (3, 3), where)
-    d = models.without_tilt(fields.number_list(camera, 'distortionCoeff', where), where)
+    d = fields.number_list(camera, 'distortionCoeff', where)
     distortion = (
         models.Distortion(models.EQUIDISTANT, d[:4])
         if kind == _FISHEYE

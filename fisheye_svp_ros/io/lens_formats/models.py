@@ -19,15 +19,18 @@ from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.effects.image_effects import DecenteringEffect, SensorTiltEffect, SkewEffect
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_formats.fields import MAX_NUMBER
-from fisheye_svp_ros.optics.curve_base import ViewpointShift
+from fisheye_svp_ros.optics.curve_base import ImageHeight, ViewpointShift
 from fisheye_svp_ros.optics.curves import KannalaBrandt, Perspective, fit_kannala_brandt
 from fisheye_svp_ros.optics.lens import Lens, field_of_view
+from fisheye_svp_ros.optics.pinhole import BrownConrady, RationalPolynomial, TangentialDistortion
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.observations import views_of
 
 HeightFormula = Callable[[Array], Array]  # image height over f of the incidence angle
 
-OPENCV = ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6')  # in its order
+# In OpenCV's order; a thin prism and a tilt come last
+_PRISM, _TILT = ('s1', 's2', 's3', 's4'), ('tau_x', 'tau_y')
+OPENCV = ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6', *_PRISM, *_TILT)
 # What programs call a distortion, without case and separators
 _NAMES = {
     'equidistant': 'equidistant fisheye fisheye4 opencvfisheye kannalabrandt kannalabrandt4 '
@@ -36,11 +39,13 @@ _NAMES = {
     'opencvstandard standard',
     'rational_polynomial': 'rationalpolynomial rational radtan8',
 }
-_COUNTS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,)}  # of coefficients
+# Of coefficients; with a thin prism 12, with a tilt 14
+_COUNTS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (4, 5, 8, 12, 14)}
 _RTABMAP_FISHEYE = 6  # coefficients
 _MODEL_OF = {name: model for model, names in _NAMES.items() for name in names.split()}
 STATED_MODELS = tuple(_NAMES)  # as sensor_msgs/CameraInfo calls them
 RADIAL_TERMS = 4  # radial coefficients that Kannala-Brandt has
+_PINHOLE_TERMS, _PRISM_TERMS = 3, 2  # above and below the line, and of a prism, of OpenCV
 _GRID, _STEPS = 600, 40  # angles of a curve; angles and azimuths of an image
 _ANGLE_MARGIN = 1 - 1e-3  # of the angle at which a curve ends
 _TOLERANCE = 0.01  # px, of a lens written in a form that knows fewer curves
@@ -111,7 +116,8 @@ class Distortion:
     """A base height, and what it is distorted by; coefficients of powers of its square.
 
     stretch, below: above and below the line of a ratio; tangential: p1, p2; growth: of these two;
-    prism: along u, along v; late: what moves sideways starts from the stretched image.
+    prism: along u, along v; late: what moves sideways starts from the stretched image; tilt: of
+    the sensor, rad, as OpenCV has it, which only a lens of OpenCV's own model holds.
     """
 
     base: Base
@@ -121,6 +127,7 @@ class Distortion:
     growth: Sequence[float] = ()
     prism: tuple[Sequence[float], Sequence[float]] = ((), ())
     late: bool = False
+    tilt: tuple[float, float] = (0.0, 0.0)
 
     @property
     def is_kannala_brandt(self) -> bool:
@@ -132,15 +139,17 @@ class Distortion:
         )
 
     @property
-    def is_pinhole(self) -> bool:
-        """Whether there is none, of a pinhole."""
-        factors = (*self.stretch, *self.below)
-        return self.base is PERSPECTIVE and not any(factors) and not self.sideways
-
-    @property
     def sideways(self) -> bool:
         """Whether image points move otherwise than along the radius."""
-        return any(self.tangential) or any(map(any, self.prism))
+        return any(self.tangential) or any(map(any, self.prism)) or any(self.tilt)
+
+    @property
+    def is_opencv(self) -> bool:
+        """Whether OpenCV's pinhole models hold all of it."""
+        beyond = [part[_PINHOLE_TERMS:] for part in (self.stretch, self.below)]
+        beyond += [part[_PRISM_TERMS:] for part in self.prism]
+        other = any(map(any, beyond)) or any(self.growth) or (self.late and self.sideways)
+        return self.base is PERSPECTIVE and not other
 
     def height(self, theta: Array) -> Array:
         """Return the image height for unit focal length, of incidence angles, rad."""
@@ -175,12 +184,17 @@ def _powers(coefficients: Sequence[float], z: Array) -> Array:
 
 
 def brown(base: Base, values: Mapping[str, float]) -> Distortion:
-    """Return the distortion of coefficients by their names in OpenCV: k1 to k6, p1, p2.
+    """Return the distortion of coefficients by their names in OpenCV, see `OPENCV`.
 
     k4 to k6 stand below the line, as in OpenCV's rational model.
     """
     k1, k2, k3, *below = (values.get(f'k{i}', 0.0) for i in range(1, 7))
-    return Distortion(base, (k1, k2, k3), below, (values.get('p1', 0.0), values.get('p2', 0.0)))
+    p1, p2, s1, s2, s3, s4, tau_x, tau_y = (
+        values.get(name, 0.0) for name in ('p1', 'p2', *_PRISM, *_TILT)
+    )
+    return Distortion(
+        base, (k1, k2, k3), below, (p1, p2), (), ((s1, s2), (s3, s4)), tilt=(tau_x, tau_y)
+    )
 
 
 def opencv_distortion(d: Sequence[float], base: Base = PERSPECTIVE) -> Distortion:
@@ -205,20 +219,11 @@ def stated_distortion(model: str, d: Sequence[float], where: str) -> Distortion:
             raise LensError(f'{where}: {model} has {len(d)} coefficients; k1 to k4 are needed')
         return Distortion(EQUIDISTANT, k[:RADIAL_TERMS])
     counts = _COUNTS[model]
-    # More may be those of a thin prism and of a tilt; a model may be stated without distortion.
+    # A model may be stated without distortion, and carry zeros.
     if len(d) not in counts and any(d[counts[-1] :] or d):
-        raise LensError(f'{where}: {model} has {len(d)} coefficients; {counts[-1]} are needed')
+        known = ' or '.join(str(count) for count in counts if count)
+        raise LensError(f'{where}: {model} has {len(d)} coefficients; {known} are needed')
     return opencv_distortion(d)
-
-
-def without_tilt(d: Sequence[float], where: str) -> list[float]:
-    """Return the coefficients of OpenCV up to k6; raise LensError where others are not 0."""
-    if any(d[len(OPENCV) :]):
-        raise LensError(
-            f'{where}: {len(d)} coefficients, with a thin prism or a tilt; the four '
-            'of cv2.fisheye, or five or eight of cv2.calibrateCamera can be read'
-        )
-    return list(d[: len(OPENCV)])
 
 
 def nearest_lens(
@@ -238,20 +243,49 @@ def nearest_lens(
     if distortion.is_kannala_brandt:
         k = (*distortion.stretch, *[0.0] * RADIAL_TERMS)[:RADIAL_TERMS]
         lens, worst = kannala_brandt(name, size, (fx, fy, cx, cy), k, where), 0.0
-    elif distortion.is_pinhole:
-        lens = kannala_brandt(name, size, (fx, fy, cx, cy), [0.0] * RADIAL_TERMS, where)
-        lens, worst = replace(lens, image_height=Perspective()), 0.0
-        lens = replace(lens, max_incidence=field_of_view(lens))
+    elif distortion.is_opencv:
+        lens, worst = _opencv_lens(name, size, (fx, fy, cx, cy), distortion, where), 0.0
+    elif any(distortion.tilt):
+        raise LensError(f'{where}: a tilted sensor; it is known of pinhole models alone')
     else:
         lens, worst = fit_curve(
             name, size, (fx, fy, cx, cy), distortion.height, distortion.base.limit, where
         )
-    if distortion.sideways:
+    if distortion.sideways and not distortion.is_opencv:
         lens, worst = _fit_corrections(lens, (fx, fy), distortion, worst)
     if skew:
         shear = SkewEffect().to_dict(np.array([skew / fx]))
         lens = replace(lens, corrections={**lens.corrections, SkewEffect.name: shear})
     return lens, worst
+
+
+def _opencv_lens(
+    name: str,
+    size: Sequence[float],
+    intrinsics: Sequence[float],
+    distortion: Distortion,
+    where: str,
+) -> Lens:
+    """Return the lens of a pinhole model of OpenCV; raise LensError where it is none."""
+    above, below = distortion.stretch, distortion.below
+    curve: ImageHeight = RationalPolynomial(*_pad(above), *_pad(below))
+    if not any(below):
+        curve = BrownConrady(*above) if any(above) else Perspective()
+    bare = kannala_brandt(name, size, intrinsics, [0.0] * RADIAL_TERMS, where)
+    lens = replace(bare, image_height=curve)
+    if distortion.sideways:
+        along_u, along_v = (_pad(part, _PRISM_TERMS) for part in distortion.prism)
+        tangential = TangentialDistortion(
+            *distortion.tangential, *along_u, *along_v, *distortion.tilt
+        )
+        lens = replace(lens, tangential=tangential)
+    if wrong := lens.check():
+        raise LensError(f'{where}: {wrong}')
+    return replace(lens, max_incidence=field_of_view(lens))
+
+
+def _pad(coefficients: Sequence[float], count: int = _PINHOLE_TERMS) -> tuple[float, ...]:
+    return (*coefficients, *[0.0] * count)[:count]
 
 
 def camera_matrix(lens: Lens) -> Array:

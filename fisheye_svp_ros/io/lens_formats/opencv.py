@@ -188,7 +188,7 @@ def _distortion(d: Sequence[float], named: Mapping[str, Any], where: str) -> mod
         return models.opencv_distortion(d, models.omnidirectional(xi))
     if len(d) == _OF_FISHEYE and all(named.get(name, 1) for name in _IS_FISHEYE):
         return models.Distortion(models.EQUIDISTANT, d)
-    return models.opencv_distortion(models.without_tilt(d, where))
+    return models.opencv_distortion(d)
 
 
 def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[float]:

@@ -34,7 +34,7 @@ def read(text: str, where: str) -> Foreign:
                 'camera',
                 size,
                 (k[0], k[4], k[2], k[5], k[1]),
-                models.opencv_distortion(models.without_tilt(d, where)),
+                models.opencv_distortion(d),
                 where,
             )
         },

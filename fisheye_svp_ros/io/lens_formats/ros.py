@@ -1,4 +1,4 @@
-"""ROS camera_info, as YAML of camera_calibration and as message: equidistant, or near to it.
+"""ROS camera_info, as YAML of camera_calibration and as message.
 
 A file may hold either, the message as `ros2 topic echo` prints it (or `rostopic echo`, which has
 capitals).
@@ -21,7 +21,6 @@ from fisheye_svp_ros.io.files import dump_yaml, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, models
 from fisheye_svp_ros.optics.lens import Lens
 
-_TOLERANCE = 0.2  # px, of a perspective lens as one of ours
 _MESSAGE = re.compile('^[kK]:', re.MULTILINE)
 
 
@@ -59,7 +58,7 @@ def read(text: str, where: str) -> Foreign:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
     given = Foreign.from_lenses(
         'ROS',
-        {name: _fit_lens(model, size, (k[0], k[4], k[2], k[5], k[1]), tuple(d), name, where)},
+        {name: (lens_of(model, size, (k[0], k[4], k[2], k[5], k[1]), tuple(d), name, where), 0.0)},
     )
     r, p = (
         fields.section({key: {}, **document}, key, where).get('data')
@@ -80,7 +79,7 @@ def _read_message(text: str, where: str) -> Foreign:
         raise LensError(str(cause)) from cause
     except (LookupError, TypeError, ValueError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
-    given = Foreign.from_lenses('ROS', {name: _fit_lens(*model, name, where)})
+    given = Foreign.from_lenses('ROS', {name: (lens_of(*model, name, where), 0.0)})
     return given._replace(rectified=fields.rectified(told.get('r'), told.get('p'), where))
 
 
@@ -92,32 +91,15 @@ def lens_of(
     d: tuple[float, ...],
     name: str,
     where: str,
-) -> tuple[Lens, float]:
-    """Return the lens of a distortion model, and how far off it is at worst, px.
+) -> Lens:
+    """Return the lens of a distortion model, exactly.
 
     size: width, height; intrinsics: fx, fy, cx, cy and skew, which may be left out; d: as
     sensor_msgs/CameraInfo has it.
-    Raises LensError, naming `where`, for a model that no lens here comes near to.
+    Raises LensError, naming `where`, for a model or numbers of no lens.
     """
-    lens, worst = _fit_lens(model, size, intrinsics, d, name, where)
-    if not worst <= _TOLERANCE:
-        raise LensError(
-            f'{where}: the nearest lens is {worst:.2g} px off this {model}; calibrate '
-            'again, as equidistant'
-        )
-    return lens, worst
-
-
-def _fit_lens(
-    model: str,
-    size: tuple[int, int],
-    intrinsics: tuple[float, ...],
-    d: tuple[float, ...],
-    name: str,
-    where: str,
-) -> tuple[Lens, float]:
-    """Return the nearest lens, however far off: a file is read with a warning."""
-    stated = models.stated_model(model)
+    # A camera without distortion need not name a model of it.
+    stated = models.stated_model(model) if model or d else 'plumb_bob'
     if stated is None:
         raise LensError(
             f'{where}: distortion_model is {model!r}; known are '
@@ -126,7 +108,7 @@ def _fit_lens(
     distortion = models.stated_distortion(stated, d, where)
     try:
         with np.errstate(all='ignore'):
-            return models.nearest_lens(name, size, intrinsics, distortion, where)
+            return models.nearest_lens(name, size, intrinsics, distortion, where)[0]
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as cause:
         raise LensError(f'{where}: its numbers are no valid lens ({cause})') from cause
 

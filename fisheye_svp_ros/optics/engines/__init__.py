@@ -3,7 +3,7 @@
 NumPy is the reference.  Numba computes the same faster, but must be loaded and, once on a machine,
 compile, which only long work pays back: what begins such work says so (`settle`), and what must
 not wait has it compiled meanwhile (`settle_in_background`).  A lens behind a port is traced by
-`port_projection`; an image field moves what any of them returns.  Anything else runs on NumPy, and
+`port_projection`; a displacement moves what any of them returns.  Anything else runs on NumPy, and
 gives the same to the last digit whatever was compiled before.
 FISHEYE_SVP_ENGINE or `use` have the last word; nothing outside this package asks which one runs.
 """
@@ -87,7 +87,7 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     """Return image points (M, 2), px, of points (M, 3), m, in the camera frame, and validity."""
     engine = _running() if lens.port is None else port_projection
     uv, valid = engine.project(lens, points, limited)
-    return uv if lens.image_field is None else lens.image_field.apply(uv), valid
+    return lens.displace(uv) if lens.displaces else uv, valid
 
 
 def linearize_views(
@@ -100,8 +100,8 @@ def linearize_views(
     """
     engine = _running() if lens.port is None else port_projection
     uv, valid, d_pose = engine.linearize_views(lens, rotation, position, points, limited)
-    if lens.image_field is not None:
-        d_pose, uv = lens.image_field.carry(uv, d_pose), lens.image_field.apply(uv)
+    if lens.displaces:
+        d_pose, uv = lens.carry(uv, d_pose), lens.displace(uv)
     return uv, valid, d_pose
 
 
