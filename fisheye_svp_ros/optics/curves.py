@@ -193,9 +193,7 @@ def kannala_brandt_equivalent(lens: Lens) -> Lens:
     five odd powers of theta over the field of view.  Corrections have no place in it.
     """
     curve = lens.image_height
-    bare = replace(
-        lens.svp(), tangential=None, image_field=None, corrections={}, target={}
-    )
+    bare = replace(lens.svp(), tangential=None, image_field=None, corrections={}, target={})
     exact = curve.with_powers(())
     if exact is not None:
         return replace(bare, image_height=exact)

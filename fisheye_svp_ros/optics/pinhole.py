@@ -17,6 +17,7 @@ from fisheye_svp_ros.optics.curve_base import ImageHeight
 
 _NEWTON_STEPS = 60
 _ANGLE_TOLERANCE = 1e-12  # rad; a last Newton step this small leaves an error of its square
+_NEAR = 1e-6  # of a height: close by, where Newton's step is to be believed
 _PLACE_TOLERANCE = 1e-14  # of a place in the image for unit focal length
 _AXIS = 1e-12  # of the same: nearer to the axis, directions are of no account
 _MAX_OFF = 1e-9  # of the same: what is farther off has not been inverted
@@ -58,19 +59,19 @@ class RadialPinhole(ImageHeight):
         """Return theta by Newton's method, which falls back to halving: h grows without bound."""
         height = np.asarray(height, dtype=float)
         low, high = np.zeros_like(height), np.full_like(height, self.limit)
-        theta = np.minimum(np.arctan(height), self.limit)
+        theta, moved = np.minimum(np.arctan(height), self.limit), high
         for _ in range(_NEWTON_STEPS):
             with np.errstate(all='ignore'):
                 value, slope = self.value_and_slope(theta)
-                low, high = (
-                    np.where(value <= height, theta, low),
-                    np.where(value > height, theta, high),
-                )
                 change = (height - value) / slope
-            step, last = theta + change, np.abs(change) < _ANGLE_TOLERANCE
-            inside = last | ((step >= low) & (step <= high))
-            before, theta = theta, np.where(inside, step, (low + high) / 2)
-            if not np.any((np.abs(theta - before) > _ANGLE_TOLERANCE) & ~last):
+            small = value <= height
+            low, high = np.where(small, theta, low), np.where(small, high, theta)
+            near = np.abs(height - value) <= _NEAR * height
+            step, settled = theta + change, near & (np.abs(change) < _ANGLE_TOLERANCE)
+            newton = (step >= low) & (step <= high) & (np.abs(change) < moved / 2)
+            step = np.where(newton | settled, step, (low + high) / 2)
+            theta, moved = step, np.abs(step - theta)
+            if not np.any((moved > _ANGLE_TOLERANCE) & ~settled):
                 break
         return np.where(np.isnan(height), np.nan, theta)
 

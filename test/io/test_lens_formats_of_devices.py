@@ -244,7 +244,6 @@ def test_woodscape_begins_at_the_corner(tmp_path: Path) -> None:
             PHOTON | {'lensmodel': 'LENSMODEL_STEREOGRAPHIC'},
             'of PhotonVision LENSMODEL_OPENCV',
         ),
-        (PHOTON | {'distCoeffs': {'data': [0.1] * 14}}, '14 coefficients, with a thin prism'),
         (GYROFLOW | {'distortion_model': 'ptlens'}, "distortion_model is 'ptlens'; of Gyroflow"),
         (GYROFLOW | {'input_horizontal_stretch': 1.33}, 'input_horizontal_stretch is 1.33'),
         (GYROFLOW | {'digital_lens': 'gopro_superview'}, "digital_lens is 'gopro_superview'"),

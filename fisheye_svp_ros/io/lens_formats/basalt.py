@@ -23,7 +23,7 @@ _MODELS: dict[str, tuple[tuple[str, ...], Callable[..., models.Distortion]]] = {
     'ucm': (('alpha',), lambda alpha: models.Distortion(models.unified_heights(alpha, 1.0))),
     'fov': (('w',), lambda omega: models.Distortion(models.field_of_view_model(omega))),
     'pinhole': ((), lambda: models.Distortion(models.PERSPECTIVE)),
-    'pinhole-radtan8': (models.OPENCV, lambda *d: models.opencv_distortion(d)),
+    'pinhole-radtan8': (models.OPENCV[:8], lambda *d: models.opencv_distortion(d)),
 }
 _NAMES = ('px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw')
 

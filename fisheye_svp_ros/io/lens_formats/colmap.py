@@ -1,4 +1,4 @@
-"""COLMAP's cameras.txt: fisheye models as they stand, the others by a fit.
+"""COLMAP's cameras.txt: fisheye and pinhole models as they stand, others by a fit.
 
 Its image begins at 0, so that the center of the first pixel is at 0.5.
 """

@@ -275,9 +275,8 @@ def _opencv_lens(
     lens = replace(bare, image_height=curve)
     if distortion.sideways:
         along_u, along_v = (_pad(part, _PRISM_TERMS) for part in distortion.prism)
-        tangential = TangentialDistortion(
-            *distortion.tangential, *along_u, *along_v, *distortion.tilt
-        )
+        values = (*distortion.tangential, *along_u, *along_v, *distortion.tilt)
+        tangential = TangentialDistortion(*values)
         lens = replace(lens, tangential=tangential)
     if wrong := lens.check():
         raise LensError(f'{where}: {wrong}')
