@@ -8,13 +8,19 @@ from typing import NamedTuple
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
-from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.quality import TRANSFORMS
 from fisheye_svp_ros.nodes.transforms import FrameListener, TransformPublisher
-from fisheye_svp_ros.pose import Pose, carried_pose
+from fisheye_svp_ros.pose import carried_pose
+from fisheye_svp_ros.solve.pose_gate import (
+    GatedPose,
+    GateLimits,
+    OdometryGate,
+    Verdict,
+    weakness,
+)
 from fisheye_svp_ros.study.settings import RobotSettings
 
 _MAX_WAITING = 30  # poses that wait for odometry of their time
@@ -24,7 +30,7 @@ _LONGEST_WAIT = 2.0  # s that a pose does
 class _Waiting(NamedTuple):
     """The pose of a base in its world, the stamp, ns, and since when it waits, s."""
 
-    base: Pose
+    pose: GatedPose
     stamp: int
     world: str
     since: float
@@ -33,8 +39,9 @@ class _Waiting(NamedTuple):
 class BasePose:
     """Publishes `~/base_pose` and, with an odometry frame, map -> odom on /tf as amcl does.
 
-    The camera in the base is looked up on /tf_static.  Raises ParameterError for frames that
-    cannot belong together, and where tf2_msgs is not installed.
+    Poses that a robot should not act on are kept back, see `solve.pose_gate`.  The camera in the
+    base is looked up on /tf_static.  Raises ParameterError for frames that cannot belong together,
+    and where tf2_msgs is not installed.
     """
 
     def __init__(self, node: BaseNode, settings: RobotSettings) -> None:
@@ -49,6 +56,15 @@ class BasePose:
         self._node, self._base, self._odom = node, base, odom
         self._frames = FrameListener(node, self._publish_odometry)
         self._waiting: deque[_Waiting] = deque(maxlen=_MAX_WAITING)
+        self._limits = GateLimits(
+            settings.max_std_m,
+            settings.max_std_rad,
+            settings.allow_ambiguous,
+            settings.max_innovation,
+            settings.odom_error,
+        )
+        self._gate = OdometryGate(self._limits)
+        self._kept_back = 0
         if not base:
             return
         topics = [topic for topic in TRANSFORMS if odom or topic == '/tf_static']
@@ -56,27 +72,43 @@ class BasePose:
         self._publisher = node.announce(PoseWithCovarianceStamped, '~/base_pose')
         self._transforms = TransformPublisher(node, bool(odom))
 
-    def publish(
-        self, camera_pose: Pose, covariance: Array, stamp: int, world: str, camera: str
-    ) -> None:
-        """Publish the base that carries a camera; covariance (6, 6) of the camera, m and rad."""
+    def publish(self, camera: GatedPose, stamp: int, world: str, frame: str) -> str:
+        """Publish the base that carries a camera; return why not, or what is doubtful in it.
+
+        camera: its pose in place of that of the base; frame: its frame id.
+        """
         if not self._base:
-            return
-        mount = self._frames.find(camera, self._base, stamp)
+            return ''
+        mount = self._frames.find(frame, self._base, stamp)
         if mount is None:
             self._node.warn(
                 f'no base_pose: /tf_static has no chain from {self._base!r} (base_frame) to '
-                f'{camera!r}; publish it, e. g. with robot_state_publisher'
+                f'{frame!r}; publish it, e. g. with robot_state_publisher'
             )
-            return
-        base, covariance = carried_pose(camera_pose, covariance, mount)
+            return ''
+        base, covariance = carried_pose(camera.base, camera.covariance, mount)
+        pose = camera._replace(base=base, covariance=covariance)
+        if reason := weakness(pose, self._limits):
+            self._kept_back += 1
+            return f'no base_pose: {reason}'
+        odometry = self._frames.find(self._odom, self._base, stamp) if self._odom else None
+        verdict = Verdict() if odometry is None else self._gate.judge(pose, odometry)
+        if verdict.refused:
+            self._kept_back += 1
+            return f'no base_pose: {verdict.refused}'
         self._publisher.publish(
             messages.pose_with_covariance_message(base, covariance, stamp, world)
         )
-        if self._odom:
+        if odometry is not None:
+            self._transforms.publish(base.compose(odometry.inverse()), stamp, world, self._odom)
+        elif self._odom:
             self._drop_expired()
-            self._waiting.append(_Waiting(base, stamp, world, time.monotonic()))
-            self._publish_odometry()
+            self._waiting.append(_Waiting(pose, stamp, world, time.monotonic()))
+        return verdict.unconfirmed
+
+    def report(self) -> dict[str, object]:
+        """Return what /diagnostics holds of it."""
+        return {'sets: kept back from base_pose and /tf': self._kept_back} if self._base else {}
 
     def _drop_expired(self) -> None:
         """Drop the pose that has waited too long, or is one too many, and tell of it."""
@@ -94,9 +126,16 @@ class BasePose:
         """Publish where the odometry stands in the world, for each pose that has odometry."""
         for _ in range(len(self._waiting)):
             one = self._waiting.popleft()
-            base, stamp, world, _ = one
+            pose, stamp, world, _ = one
             there = self._frames.find(self._odom, self._base, stamp)
             if there is None:
                 self._waiting.append(one)
-            else:
-                self._transforms.publish(base.compose(there.inverse()), stamp, world, self._odom)
+                continue
+            verdict = self._gate.judge(pose, there)
+            if verdict.refused:
+                self._kept_back += 1
+                self._node.warn(f'no transform to {self._odom!r}: {verdict.refused}')
+                continue
+            if verdict.unconfirmed:
+                self._node.warn(f'transform to {self._odom!r}: {verdict.unconfirmed}')
+            self._transforms.publish(pose.base.compose(there.inverse()), stamp, world, self._odom)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.localization import Localization
+from fisheye_svp_ros.solve.pose_gate import GatedPose
 from fisheye_svp_ros.study.settings import LocalizerSettings
 from fisheye_svp_ros.study.solutions import (
     LOCALIZATION_METRICS,
@@ -112,7 +113,19 @@ class Localizer(SolverNode):
         self._pose.publish(
             messages.pose_with_covariance_message(pose, covariance[0], stamp, world)
         )
-        self._base.publish(pose, covariance[0], stamp, world, camera)
+        tags = frozenset() if points.tag is None else frozenset(points.tag.tolist())
+        doubt = self._base.publish(
+            GatedPose(
+                pose,
+                covariance[0],
+                bool(solved.metrics['ambiguous'][0]),
+                float(solved.sigmas[0]),
+                tags,
+            ),
+            stamp,
+            world,
+            camera,
+        )
         if self._residuals.get_subscription_count():
             cloud = residual_points(model, views, solution)
             self._residuals.publish(messages.cloud_message(cloud, stamp, camera))
@@ -121,10 +134,16 @@ class Localizer(SolverNode):
             error = pose.difference(true)
             self._position_error.publish(messages.vector_message(error[:3], stamp, world))
             self._rotation_error.publish(messages.vector_message(error[3:], stamp, world))
-        self.publish_result(stamp, solved.metrics, solved.reasons[0])
+        problem = '; '.join(filter(None, (solved.reasons[0], doubt)))
+        self.publish_result(stamp, solved.metrics, problem)
         if self._markers.get_subscription_count():
             shape = camera_shape(pose, 'estimated', alpha=0.6)
             self._markers.publish(messages.markers_message([shape], stamp, world))
+
+    def report(self) -> tuple[Mapping[str, object], str]:
+        """Return what became of every set, and which poses were kept back."""
+        values, text = super().report()
+        return {**values, **self._base.report()}, text
 
     def _lens_errors(self, stamp: int, items: Items) -> LensErrors:
         lens = self.lens(stamp, items)

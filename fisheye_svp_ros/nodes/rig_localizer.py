@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -19,12 +20,14 @@ from fisheye_svp_ros.nodes.transforms import TransformPublisher
 from fisheye_svp_ros.nodes.validation import Items
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.wording.poses import rig_reason
+from fisheye_svp_ros.solve.pose_gate import GatedPose
 from fisheye_svp_ros.solve.rig_localization import localize_rig
 from fisheye_svp_ros.study.settings import RigLocalizerSettings
 from fisheye_svp_ros.study.solutions import (
     LOCALIZATION_METRICS,
     check_gate,
     localization_metrics,
+    residual_sigmas,
 )
 
 
@@ -80,7 +83,14 @@ class RigLocalizer(SolverNode):
         pose, world = solution.pose.take(0), landmarks.frame
         frame, covariance = items[f'{cameras[0]}image_points'].frame, solution.covariance[0]
         self._pose.publish(messages.pose_with_covariance_message(pose, covariance, stamp, world))
-        self._base.publish(pose, covariance, stamp, world, frame)
+        sigmas = residual_sigmas(residual / self.settings.sigma_px)
+        doubt = self._base.publish(GatedPose(pose, covariance, misfit=sigmas), stamp, world, frame)
         self._transforms.publish(pose, stamp, world, frame)
         problem = rig_reason(len(solution.outliers.rows), solution.contradicted)
+        problem = '; '.join(filter(None, (problem, doubt)))
         self.publish_result(stamp, metrics, problem)
+
+    def report(self) -> tuple[Mapping[str, object], str]:
+        """Return what became of every set, and which poses were kept back."""
+        values, text = super().report()
+        return {**values, **self._base.report()}, text

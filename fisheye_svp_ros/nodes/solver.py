@@ -54,6 +54,8 @@ _NS = 10**9
 _MAX_UNANSWERED = 10  # sets that wait for a topic on which nothing has ever come
 _MIN_AXIS_COSINE = 0.7  # cosine of the angle between two viewing axes
 _ENDS = ('taken', 'solved', 'not solved', 'dropped', 'incomplete')  # of sets
+MAX_LATENCY = 0.5  # s from the stamp of a set to its result, above which it is told
+_CLOCKS_AGREE = 600.0  # s by which a stamp may be older than now, as of the same clock
 _COUNTS = (*_ENDS, 'solved with a warning')
 _SHIFT_SCALE = next(row for row in rows(Scenario) if row.name == 'shift_scale')
 
@@ -65,6 +67,13 @@ class Pace:
         self.counts: Counter[str] = Counter()
         self.latency = 0.0  # s, of the latest set
         self._restarted, self._reported = time.monotonic(), self.counts.copy()
+
+    def answer(self, age: float, waited: float) -> None:
+        """Take in how late a set is answered: s since its stamp, and since it was received.
+
+        A recording that is played back has stamps of another time, which tell nothing.
+        """
+        self.latency = age if waited <= age < _CLOCKS_AGREE else waited
 
     def report(self, waiting: int) -> tuple[dict[str, object], str]:
         """Return the counts since the start, and what is wrong since the last report.
@@ -84,7 +93,8 @@ class Pace:
             'sets: latency_s': round(self.latency, 4),
         }
         if counts['dropped'] == before['dropped']:
-            return told, ''
+            late = self.latency > MAX_LATENCY and counts['solved'] > before['solved']
+            return told, wording.late(self.latency) if late else ''
         return told, (
             f'too slow: {came:.0f} sets per second are received and {done:.0f} are solved, '
             f'{self.latency:.2f} s late; {waiting} wait, {counts["dropped"]} are dropped'
@@ -359,7 +369,7 @@ class SolverNode(ManagedNode):
             self._compare_stamps(one)
         for one in self._join.pop_expired(now, patience):
             self._drop_set(one)
-        while len(self._backlog) > self.settings.backlog:
+        while len(self._backlog) > self.settings.most_waiting:
             self._backlog.popleft()
             self._pace.counts['dropped'] += 1
         if not self.has_listeners():
@@ -367,7 +377,8 @@ class SolverNode(ManagedNode):
         if self._backlog:
             one = self._backlog.popleft()
             self._attempt(one)
-            self._pace.latency = time.monotonic() - one.since
+            age = 1e-9 * (self.get_clock().now().nanoseconds - one.stamp)
+            self._pace.answer(age, time.monotonic() - one.since)
         else:
             self._look_at_next()
         if self._backlog or self._unread:

@@ -98,10 +98,10 @@ class SolverSettings(Settings):
         'left out otherwise',
     )
     backlog: int = parameter(
-        100,
+        0,
         'Largest number of sets that wait to be solved; beyond it the oldest are dropped and '
-        'counted',
-        span=(1, 10_000),
+        'counted. 0: 1 with base_frame, as the newest pose counts for a robot; otherwise 100',
+        span=(0, 10_000),
     )
     lifecycle: bool = parameter(
         False,
@@ -113,6 +113,11 @@ class SolverSettings(Settings):
     def solves_svp(self) -> bool:
         """Whether to solve without the viewpoint shift of the lens."""
         return self.svp == 'true' or (self.svp == 'auto' and not self.lens)
+
+    @property
+    def most_waiting(self) -> int:
+        """How many sets may wait to be solved."""
+        return self.backlog or 100
 
     @property
     def sync_tolerance(self) -> float:
@@ -177,6 +182,45 @@ class RobotSettings(GateSettings):
         fixed=True,
         frame=True,
     )
+    max_std_m: float = parameter(
+        0.2,
+        'With base_frame: largest standard deviation of the position of the base, in any '
+        'direction; a pose above it has a result with the reason, but no ~/base_pose and no '
+        'transform. 0: no limit',
+        'm',
+        (0.0, 1e6),
+        fixed=True,
+    )
+    max_std_rad: float = parameter(
+        0.1,
+        'The same of its rotation. 0: no limit',
+        'rad',
+        (0.0, 1e3),
+        fixed=True,
+    )
+    allow_ambiguous: bool = parameter(
+        False,
+        'With base_frame: also publish poses beside which a second one fits (`ambiguous`)',
+        fixed=True,
+    )
+    max_innovation: float = parameter(
+        5.0,
+        'With odom_frame: largest distance of a pose from where odometry carries most of those '
+        'before it, in standard deviations of both; above it there is no transform. 0: no limit',
+        span=(0.0, 1e6),
+        fixed=True,
+    )
+    odom_error: float = parameter(
+        0.05,
+        'Error of the odometry as a share of the way and of the angle, for max_innovation',
+        span=(0.0, 10.0),
+        fixed=True,
+    )
+
+    @property
+    def most_waiting(self) -> int:
+        """How many sets may wait to be solved."""
+        return self.backlog or (1 if self.base_frame else 100)
 
 
 @dataclass(frozen=True)

@@ -162,11 +162,16 @@ def _residual_sigmas(cost: Array, freedom: Array) -> Array:
     return np.asarray(np.sqrt(cost / np.maximum(freedom, 1)))
 
 
-def check_gate(residual: Array, gate: float) -> None:
-    """Raise GeometryError where whitened residuals (1, N, 2) of a pose are above a gate."""
+def residual_sigmas(residual: Array) -> float:
+    """Return the root mean square, by degrees of freedom, of whitened residuals (1, N, 2)."""
     known = np.isfinite(residual)
     cost = np.where(known, residual, 0.0) ** 2
-    sigmas = float(_residual_sigmas(cost.sum(), known.sum() - 6))
+    return float(_residual_sigmas(cost.sum(), known.sum() - 6))
+
+
+def check_gate(residual: Array, gate: float) -> None:
+    """Raise GeometryError where whitened residuals (1, N, 2) of a pose are above a gate."""
+    sigmas = residual_sigmas(residual)
     if gate and sigmas > gate:
         raise GeometryError(gate_reason(gate, sigmas))
 

@@ -16,6 +16,14 @@ def points_without_value(topic: str, count: int, of: int) -> str:
     return f'{topic}: {count} of {of} points left out: no finite value, or beyond the limit'
 
 
+def late(seconds: float) -> str:
+    """Tell of results that come late; seconds: from the stamp of a set to its result."""
+    return (
+        f'{seconds:.2f} s late: from the stamp of the latest set to its result; relieve the '
+        'machine, or set backlog:=1'
+    )
+
+
 def doubtful_tags(count: int, of: int) -> str:
     """Tell of tags that the detector is not sure of."""
     return (
