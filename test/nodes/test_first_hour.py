@@ -470,6 +470,26 @@ def too_slow(hour: Hour, pattern: str) -> None:
     hour.says(pattern, lambda: node._pace.counts.update(dropped=1))
 
 
+@tries('Results are late, none is lost: the machine is too slow')
+def late(hour: Hour, pattern: str) -> None:
+    node = hour.begin(*SOLVING).start(Localizer)
+
+    def lag() -> None:
+        node._pace.counts.update(solved=1)
+        node._pace.answer(age=2.0, waited=0.1)
+
+    hour.says(pattern, lag)
+
+
+@tries('No base_pose: the pose is not known well enough')
+def weak_pose(hour: Hour, pattern: str) -> None:
+    kind = need_tf2()
+    _, points = framed_sets(hour, *SOLVING, 'base_frame:=base_link', 'max_std_m:=0.0001')
+    mount = messages.transform_message(identity(), 0, 'base_link', 'camera')
+    hour.graph.tell(kind, '/tf_static', LATCHED).publish(kind(transforms=[mount]))
+    hour.says(pattern, lambda: points.publish(image_points()))
+
+
 @tries('No base_pose: /tf_static lacks the camera')
 def no_mount(hour: Hour, pattern: str) -> None:
     need_tf2()
