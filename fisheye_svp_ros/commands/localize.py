@@ -23,6 +23,7 @@ from fisheye_svp_ros.commands.notes import (
     note_extrapolated,
     note_gross_errors,
     note_left_out,
+    note_mirrored,
     note_wrong_landmarks,
     say,
 )
@@ -106,6 +107,7 @@ def run(args: argparse.Namespace) -> None:
             else:
                 measured = localize_measured(model, table)
         note_extrapolated(name or 'image points', lens, measured.views.uv[measured.views.used])
+        note_mirrored(name or 'image points', lens, table)
         title = ' '.join(filter(None, (args.observations, name)))
         _print(table, measured, uncertainty, title)
         note_wrong_landmarks(measured.landmarks)
@@ -126,7 +128,9 @@ def _localize_rig(
     with progress('localizing'):
         solution = localize_rig(table, lenses, cameras, places)
     for camera, (name, lens) in enumerate(lenses.items()):
-        note_extrapolated(name, lens, table.uv[table.camera == camera])
+        mine = table.take(table.camera == camera)
+        note_extrapolated(name, lens, mine.uv)
+        note_mirrored(name, lens, mine)
     note_left_out(table, solution.left_out)
     note_gross_errors(solution.table, solution.outliers)
     if solution.contradicted:

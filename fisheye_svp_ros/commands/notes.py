@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.io.lens_formats import READERS_TO_90_DEG, share_beyond_90_deg
 from fisheye_svp_ros.reporting.terminal import print_note
-from fisheye_svp_ros.reporting.wording.inputs import points_extrapolated
+from fisheye_svp_ros.reporting.wording.inputs import points_extrapolated, points_mirrored
 from fisheye_svp_ros.reporting.wording.poses import wrong_landmark_notes
 from fisheye_svp_ros.scene.observations import frame_name, list_frames
 from fisheye_svp_ros.scene.table_checks import MAX_TARGET_SIZE, target_size
 from fisheye_svp_ros.solve.lens_checks import extrapolated_points
+from fisheye_svp_ros.solve.mirrored_points import find_mirror
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.arrays import Array
@@ -48,6 +49,12 @@ def note_extrapolated(what: str, lens: Lens, uv: Array) -> None:
     """Say it where image points uv (N, 2), px, lie beyond what is known of a lens."""
     if beyond := extrapolated_points(lens, uv):
         say(points_extrapolated(what, beyond))
+
+
+def note_mirrored(what: str, lens: Lens, table: Observations) -> None:
+    """Say it where the table of one camera is a mirror image of what it saw."""
+    if mirror := find_mirror(table, lens):
+        say(points_mirrored(what, mirror))
 
 
 def count_text(count: int, noun: str) -> str:

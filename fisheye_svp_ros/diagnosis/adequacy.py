@@ -26,6 +26,7 @@ from fisheye_svp_ros.scene.observations import frame_names
 from fisheye_svp_ros.scene.table_checks import MAX_TARGET_SIZE, target_size
 from fisheye_svp_ros.solve.frame_groups import MIN_GROUP, find_frame_groups
 from fisheye_svp_ros.solve.lens_checks import image_coverage, is_no_fit
+from fisheye_svp_ros.solve.mirrored_points import find_mirror
 from fisheye_svp_ros.solve.ray_errors import RANGES, RayError
 
 _FOCAL, _CENTER = 'frame_focal', 'frame_centre'
@@ -76,7 +77,7 @@ def judge_data(
     """Return what is wrong with the data of an evaluation; candidates: not confirmed."""
     linear = evaluation.simulation
     reached = float(np.nanmax(linear.scene.theta[linear.data.views.used]))
-    flaws = [*_impossible_lengths(evaluation, candidates)]
+    flaws = [*_mirrors(evaluation), *_impossible_lengths(evaluation, candidates)]
     flaws += _misfits(evaluation, causes, components)
     if evaluation.free and evaluation.medium is None:
         flaws += _coverage(evaluation)
@@ -95,6 +96,15 @@ def judge_data(
     return Adequacy(
         tuple(replace(flaw, names=one) for flaw, one in zip(flaws, names, strict=True)), reached
     )
+
+
+def _mirrors(evaluation: Evaluation) -> Iterator[Flaw]:
+    """Yield cameras whose points are mirror images of what they saw."""
+    table, state = evaluation.problem.observations, evaluation.simulation.state
+    for camera, name in enumerate(table.cameras):
+        lens = state.lenses[camera if len(state.lenses) > 1 else 0]
+        if mirror := find_mirror(table.take(table.camera == camera), lens):
+            yield Flaw(FlawKind.MIRRORED, 0.0, 0.0, camera=name, mirror=mirror)
 
 
 def _impossible_lengths(evaluation: Evaluation, candidates: Sequence[Finding]) -> Iterator[Flaw]:

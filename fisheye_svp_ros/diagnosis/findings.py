@@ -13,6 +13,7 @@ from math import e, exp, log
 from typing import Any, NamedTuple, Protocol
 
 from fisheye_svp_ros.effects.base import ModelTerm
+from fisheye_svp_ros.solve.mirrored_points import Mirror
 
 CONFIRMED_PROBABILITY = 0.95
 LIKELY_PROBABILITY = 0.5
@@ -199,6 +200,7 @@ def is_implausible(cause: ModelTerm) -> bool:
 class FlawKind(Enum):
     """What is wrong with the data; of the first ones nothing is told of lens or target."""
 
+    MIRRORED = 0
     TARGET_TOO_LARGE = 1
     SHIFT_TOO_LARGE = 2
     CAMERAS_MIXED = 3
@@ -231,7 +233,7 @@ class Flaw:
     a coordinate of an image point; of an angle, rad, those that points and the lens reach; of a
     center, px off in u and v.
     groups: frames by number, those of each camera or state, or those that differ most; names: the
-    photographs of these, as far as they are known.
+    photographs of these, as far as they are known; mirror: which one, of mirrored points.
     """
 
     kind: FlawKind
@@ -240,3 +242,4 @@ class Flaw:
     groups: tuple[tuple[int, ...], ...] = ()
     names: tuple[tuple[str, ...], ...] = ()
     camera: str = ''
+    mirror: Mirror | None = None

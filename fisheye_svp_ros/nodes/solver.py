@@ -45,11 +45,13 @@ from fisheye_svp_ros.reporting.wording import inputs as wording
 from fisheye_svp_ros.scene.observations import STEREO, Views
 from fisheye_svp_ros.simulate.scenario import Scenario, true_lens
 from fisheye_svp_ros.solve.lens_checks import extrapolated_points
+from fisheye_svp_ros.solve.mirrored_points import Mirror, mirror_by_lens
 from fisheye_svp_ros.study.settings import SolverSettings
 from fisheye_svp_ros.study.solutions import Pair
 
 _UNREAD = 5 * LIMIT  # messages to look at while there is nothing to solve
 _LONGEST_INTAKE = 0.05  # s of taking in before a set is solved, come what may
+_MIRROR_SETS = 5  # sets of a lens that say whether image points are mirrored
 _NS = 10**9
 _MAX_UNANSWERED = 10  # sets that wait for a topic on which nothing has ever come
 _MIN_AXIS_COSINE = 0.7  # cosine of the angle between two viewing axes
@@ -140,6 +142,7 @@ class SolverNode(ManagedNode):
         self._lenses: dict[str, Lens] = {}  # those of the parameter lens
         self._infos = CameraInfos(self.get_logger().info)
         self._models: dict[str, tuple[Lens, ForwardModel]] = {}  # the latest, by camera
+        self._mirrors: dict[str, tuple[Lens, int, Mirror | None]] = {}  # and sets of it, so far
         self._guarded_work = self.guard_callback(self._work)
         self._rest = self.create_guard_condition(self._guarded_work)
         self.collect(
@@ -224,7 +227,22 @@ class SolverNode(ManagedNode):
         if known is None or known[0] is not lens:
             known = self._models[camera] = lens, ForwardModel(lens)
         self._left_out += self.warn_of_extrapolation(lens, items, camera)
+        self._left_out += self._warn_of_mirror(stamp, lens, items, camera)
         return known[1]
+
+    def _warn_of_mirror(self, stamp: int, lens: Lens, items: Items, camera: str) -> list[str]:
+        """Warn of mirrored image points, by the first sets of a lens; return what was said."""
+        topic = f'{camera}image_points'
+        of, sets, mirror = self._mirrors.get(camera, (lens, 0, None))
+        if of is not lens:
+            sets, mirror = 0, None
+        if sets < _MIRROR_SETS:
+            mirror = mirror_by_lens(self.views(stamp, items[topic]), lens)
+        self._mirrors[camera] = lens, sets + 1, mirror
+        texts = [wording.points_mirrored(topic, mirror)] if mirror else []
+        for text in texts:
+            self.warn(text)
+        return texts
 
     def warn_of_extrapolation(self, lens: Lens, items: Items, camera: str = '') -> list[str]:
         """Warn of image points where the curve of a lens is a guess; return what was said."""

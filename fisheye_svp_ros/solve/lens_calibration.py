@@ -299,9 +299,10 @@ def _check_inside(table: Observations, image_size: tuple[int, int]) -> None:
         return
     image = f'an image of {image_size[0]}x{image_size[1]}'
     if len(rows) > MAX_WILD_SHARE * len(table):
+        exchanged = bool((table.uv <= image_size[::-1]).all())
         raise ObservationError(
             f'{table.source}: {len(rows)} of {len(table)} image points lie far outside {image}; '
-            'check the image size'
+            f'check the image size{", and that u and v are not exchanged" * exchanged}'
         )
     first = int(rows[0])
     u, v = table.uv[first]

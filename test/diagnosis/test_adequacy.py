@@ -40,6 +40,7 @@ def screen(found):
 
 
 FLAWED = {
+    'v upwards': FlawKind.MIRRORED,
     'zoom alternates': FlawKind.FOCAL_VARIES,
     'zoom in groups': FlawKind.FOCAL_VARIES,
     'stabilizer': FlawKind.CENTER_VARIES,

@@ -83,6 +83,8 @@ def flawed(name, seed=0, frames=16, camera=None, noise=0.05, **views):
     if name == 'tiny board':
         views = {'angle': 0.5, 'near': 0.6, 'far': 0.9} | views
     table = observe(rng, cameras, draw_views(rng, points, frames, **views), points, noise)
+    if name == 'v upwards':
+        table = replace(table, uv=table.uv * [1, -1] + [0, camera.size[1] - 1])
     return table, cameras[0].size
 
 

@@ -23,6 +23,7 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import Complaints
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
+from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 
@@ -102,6 +103,19 @@ def test_an_unknown_landmark_costs_one_point(graph: Callable[..., Graph]) -> Non
     assert f'1 of {COUNT} points left out: unknown landmarks 4711' in status.message
     report = told.report(lambda text: 'unknown landmarks 4711' in text)
     assert read_key_values(report)['image_points: points of unknown landmarks'] == '1'
+
+
+def test_mirrored_points_are_told(graph: Callable[..., Graph], tmp_path: Path) -> None:
+    lens = replace(load_lens(lens_path('fish214')).svp(), cy=700.0)
+    save_lens(lens, tmp_path / 'lens.yaml')
+    grid = np.stack(np.meshgrid(np.arange(5), np.arange(4)), axis=-1).reshape(-1, 2)
+    board = np.column_stack([0.1 * grid - 0.1, np.full(20, 0.4)])
+    uv = project(lens, board).uv
+    told = Told(graph(f'lens:={tmp_path}/lens.yaml', 'patience:=0.2'))
+    told.world(Landmarks(np.arange(20), board))
+    assert 'behind' not in told.tell(1, uv, np.arange(20)).message
+    status = told.tell(2, uv * [1, -1] + [0, lens.height - 1], np.arange(20))
+    assert 'shows the board from behind: v is counted upwards' in status.message
 
 
 def test_a_strict_node_refuses_the_set(graph: Callable[..., Graph]) -> None:

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.diagnosis import Flaw, FlawKind
+from fisheye_svp_ros.reporting.wording.inputs import MIRROR_REMEDY, MIRROR_WORDS
 
 _COUNTS = {2: 'two', 3: 'three', 4: 'four'}
 _MAX_FRAMES = 4  # by name, and of those that differ most
 _MAX_RUNS = 8  # of frame numbers
 _UNIT_REMEDY = 'write x, y, z in m (divide mm by 1000), and diagnose again'
 _REMEDIES = {
+    FlawKind.MIRRORED: f'{MIRROR_REMEDY}, and diagnose again',
     FlawKind.TARGET_TOO_LARGE: _UNIT_REMEDY,
     FlawKind.SHIFT_TOO_LARGE: _UNIT_REMEDY,
     FlawKind.CAMERAS_MIXED: 'calibrate each group of frames by itself, a table for each',
@@ -42,6 +44,8 @@ def flaw_statement(flaw: Flaw) -> str:
     """Return what is wrong as a clause."""
     of = f' of {flaw.camera}' if flaw.camera else ''
     groups = [frame_list(*pair) for pair in zip(flaw.groups, _names(flaw), strict=True)]
+    if flaw.mirror:
+        return f'every frame{of} shows the board from behind: {MIRROR_WORDS[flaw.mirror]}'
     if flaw.kind == FlawKind.TARGET_TOO_LARGE:
         return f'the target is {flaw.size:.0f} m across: x, y, z must be in m, not in mm'
     if flaw.kind == FlawKind.SHIFT_TOO_LARGE:

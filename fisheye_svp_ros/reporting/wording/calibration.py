@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fisheye_svp_ros.reporting.wording.inputs import points_mirrored
 from fisheye_svp_ros.scene.observations import list_frames
 from fisheye_svp_ros.solve.hand_eye import MAX_ODDS, HandEye
 from fisheye_svp_ros.solve.lens_checks import image_coverage, is_no_fit
+from fisheye_svp_ros.solve.mirrored_points import find_mirror
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.reporting.calibrated_camera import CalibratedCamera
@@ -52,7 +54,9 @@ def calibration_warnings(camera: CalibratedCamera) -> tuple[str, ...]:
         'the shape of the target is confounded with it; run `fisheye-svp diagnose`'
         for name, limits in camera.trust.doubtful_shift.items()
     ]
+    mirror = find_mirror(camera.table, camera.lens)
     return (
+        *([points_mirrored('points', mirror)] if mirror else ()),
         *shifts,
         *_fit_warnings(camera),
         *_image_warnings(camera),

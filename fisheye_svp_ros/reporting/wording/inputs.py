@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fisheye_svp_ros.solve.lens_checks import ExtrapolatedPoints
+from fisheye_svp_ros.solve.mirrored_points import Mirror
 
 _MAX_NAMES = 5
 
@@ -142,6 +143,22 @@ def compilation_text(state: str) -> str:
     if state == 'compiled':
         return 'solving with Numba from now on'
     return f'solving with NumPy: Numba has not compiled ({state})'
+
+
+MIRROR_WORDS = {
+    Mirror.V_UPWARDS: 'v is counted upwards',
+    Mirror.UV_EXCHANGED: 'u and v are exchanged',
+    Mirror.IMAGE: 'v is counted upwards, or u and v are exchanged',
+    Mirror.Y_REVERSED: 'y of the board is reversed',
+}
+MIRROR_REMEDY = 'write u to the right, v down, x, y, z right-handed with z into the board'
+
+
+def points_mirrored(what: str, mirror: Mirror) -> str:
+    """Tell of points that are a mirror image of what was seen."""
+    return (
+        f'{what}: every frame shows the board from behind: {MIRROR_WORDS[mirror]}; {MIRROR_REMEDY}'
+    )
 
 
 def points_extrapolated(what: str, beyond: ExtrapolatedPoints) -> str:
