@@ -41,6 +41,7 @@ _HOMES = {
     'budget': 'library.functions',
     'undistort_maps': 'library.functions',
     'rectify_maps': 'library.functions',
+    'undistort_views': 'library.lenses',
     'plot_lens': 'library.plots',
     'plot_residuals': 'library.plots',
     'plot_budget': 'library.plots',

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,10 +25,23 @@ from fisheye_svp_ros.io.image_files import save_maps, write_png
 from fisheye_svp_ros.io.lens_formats.ros import camera_info_text
 from fisheye_svp_ros.io.rig_files import load_pair, pair_of_camera_infos, pair_of_lenses
 from fisheye_svp_ros.io.share import typed_lens_path
+from fisheye_svp_ros.io.view_files import (
+    ViewCamera,
+    colmap_cameras_text,
+    colmap_rig_text,
+    nerfstudio_text,
+)
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.cameras import PROJECTIONS, STEREO_PROJECTIONS, camera_for
 from fisheye_svp_ros.rectify.maps import RANGE, Rectification, RectifiedPair, rectify_pair
+from fisheye_svp_ros.rectify.views import (
+    View,
+    cube_views,
+    face_size,
+    perspective_view,
+    rectify_views,
+)
 from fisheye_svp_ros.reporting.terminal import draw_or_note, progress, range_text
 from fisheye_svp_ros.reporting.undistort_report import (
     Remaining,
@@ -44,6 +58,8 @@ from fisheye_svp_ros.reporting.wording.inputs import points_extrapolated
 # What camera_info calls the rectified cameras that it can describe, and its coefficients
 _CAMERA_INFO = {'pinhole': ('plumb_bob', 5), 'fisheye': ('equidistant', 4)}
 _RESULT = 'undistort.json'
+CUBEMAP, _PERSPECTIVE = 'cubemap', 'perspective'
+_IMAGES = 'images'  # folder of the photographs of views, which COLMAP reads whole
 _MAX_LISTED = 12  # photographs that are skipped
 _PICTURES = ('mask.png', 'shift.png')  # of each camera, beside its photographs
 
@@ -83,23 +99,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_split_argument(parser, '1')
     parser.add_argument(
         '--as',
-        choices=PROJECTIONS,
-        default=PROJECTIONS[0],
-        dest='projection',
-        help='projection of the rectified camera; fisheye: equidistant; default: pinhole',
+        action='append',
+        type=_projection,
+        metavar='PROJECTION',
+        dest='projections',
+        help='projection of the rectified camera: pinhole (default), cylindrical, '
+        'equirectangular, fisheye (equidistant); perspective:YAW,PITCH,FOV: a turned pinhole, in '
+        'degrees to the right and upwards, may be given several times; cubemap: six such views. '
+        'For views, cameras of COLMAP and nerfstudio are written, too',
     )
     parser.add_argument(
         '--fov',
         type=float,
         metavar='DEG',
-        help='its field of view over the width; default: 90 for a pinhole '
-        'and for a cylindrical pair, otherwise that of the lens',
+        help='its field of view over the width; default: 90 for a pinhole, a '
+        'face of a cube and a cylindrical pair, otherwise that of the lens',
     )
     parser.add_argument(
         '--size',
         type=image_size,
         metavar='WxH',
-        help='size of the rectified images, px; default: that of the photographs',
+        help='size of the rectified images, px; default: that of the photographs, of faces of a '
+        'cube as fine as these at their middle',
     )
     parser.add_argument(
         '--range',
@@ -113,9 +134,69 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _projection(text: str) -> str:
+    """Return a projection; raise ArgumentTypeError for one that is unknown."""
+    if text in (*PROJECTIONS, CUBEMAP):
+        return text
+    try:
+        _view(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f'{text!r} is unknown; known are {", ".join((*PROJECTIONS, CUBEMAP))} and '
+            'perspective:YAW,PITCH,FOV in degrees, for example perspective:45,0,90'
+        ) from None
+    return text
+
+
+def _view(text: str) -> View:
+    kind, _, angles = text.partition(':')
+    yaw, pitch, field = (float(np.radians(float(word))) for word in angles.split(','))
+    if kind != _PERSPECTIVE or not np.isfinite([yaw, pitch, field]).all():
+        raise ValueError(text)
+    return perspective_view(yaw, pitch, field)
+
+
+def _views(args: argparse.Namespace) -> list[View]:
+    """Return the views that are asked for, none where one projection is.
+
+    Raises ParameterError for projections that do not go together.
+    """
+    asked = args.projections or [PROJECTIONS[0]]
+    if len(asked) > 1 and not all(one.startswith(_PERSPECTIVE) for one in asked):
+        raise ParameterError(
+            f'--as {" --as ".join(asked)}: one projection, or several perspectives, can be written'
+        )
+    if asked == [CUBEMAP]:
+        return cube_views() if args.fov is None else cube_views(float(np.radians(args.fov)))
+    if not asked[0].startswith(_PERSPECTIVE):
+        return []
+    if args.fov is not None:
+        raise ParameterError(
+            f'--fov {args.fov:g}: the field of view is the last number of --as {asked[0]}'
+        )
+    return [_view(one) for one in asked]
+
+
+class _Sides(NamedTuple):
+    """Rectifications by the name of their folder; by_camera: these names; pair: of a rig.
+
+    views: whether they are views, whose images are in a folder of their own.
+    """
+
+    sides: dict[str, Rectification]
+    by_camera: dict[str, list[str]]
+    pair: RectifiedPair | None = None
+    views: bool = False
+
+    def image_folder(self, name: str) -> Path:
+        """Return the folder of the photographs of a side, in that of the output."""
+        return Path(_IMAGES if self.views else '', name)
+
+
 def run(args: argparse.Namespace) -> None:
     """Map the photographs, write maps and cameras, say what is left at other ranges."""
-    sides, pair, paths = _rectifications(args)
+    every, paths = _rectifications(args)
+    sides, pair = every.sides, every.pair
     # Pictures of an earlier run are replaced, those of a camera are not.
     fresh = not (args.output / _RESULT).exists()
     with (
@@ -123,17 +204,17 @@ def run(args: argparse.Namespace) -> None:
         write_together(),
         progress('undistorting', count_photographs(paths, 1, args.split or 1)) as done,
     ):
-        counts = _write_photographs(sides, pair, paths, args.output, args.split or 1, done)
+        written = _write_photographs(every, paths, args.output, args.split or 1, done)
         left = {name: shift_left(side) for name, side in sides.items() if not side.lens.is_svp}
         rows = rows_left(pair) if pair and left else None
         document: dict[str, Any] = {
-            'as': args.projection,
+            'as': args.projections if every.views else (args.projections or PROJECTIONS)[0],
             'range_m': args.range_m,
             'cameras': {
                 name or side.lens.name: _write_camera(
                     side, name, left.get(name), args.output / name
                 )
-                | {'photographs': counts[name]}
+                | {'photographs': len(written[name])}
                 for name, side in sides.items()
             },
         }
@@ -142,6 +223,9 @@ def run(args: argparse.Namespace) -> None:
                 'baseline_m': pair.baseline,
                 'rows': remaining_document(rows) if rows else None,
             }
+        if every.views:
+            for camera, names in every.by_camera.items():
+                _write_views(camera, {name: sides[name] for name in names}, written, args.output)
         write_json(args.output / _RESULT, document)
     with keep_existing(fresh):
         _draw(sides, pair, left, rows, args.output)
@@ -156,15 +240,15 @@ def run(args: argparse.Namespace) -> None:
             rows,
         )
         print(f'  {tolerated_text(rows)}')
-    print(f'{args.output}: {sum(counts.values())} photographs, maps for cv2.remap')
+    count, kind = sum(map(len, written.values())), 'images' if every.views else 'photographs'
+    print(f'{args.output}: {count} {kind}, maps for cv2.remap')
 
 
-def _rectifications(
-    args: argparse.Namespace,
-) -> tuple[dict[str, Rectification], RectifiedPair | None, list[str]]:
+def _rectifications(args: argparse.Namespace) -> tuple[_Sides, list[str]]:
     """Return the rectifications by camera, of a rig also as a pair, and the photographs."""
     if not (args.lens or args.inputs):
         raise ParameterError('no lens is named; give LENS, or --lens left=LENS --lens right=LENS')
+    views = _views(args)
     paths = list(args.inputs) if args.lens else args.inputs[1:]
     lenses = load_lenses(args.lens or args.inputs[:1])
     for line in doubtful_folders(paths):
@@ -172,21 +256,80 @@ def _rectifications(
     photographs = find_photographs(paths, split=args.split or 1)
     photographed = tuple(dict.fromkeys(one.camera for one in photographs))
     by_camera = _by_camera(photographed, lenses)
+    if views:
+        return _view_sides(args, views, by_camera), paths
     rig = _rig(args, by_camera, lenses.files)
     field = None if args.fov is None else float(np.radians(args.fov))
-    wanted = args.projection, args.size, field
+    wanted = (args.projections or PROJECTIONS)[0], args.size, field
+    own = {name: [name] for name in by_camera}
     if rig is None:
-        if len(lenses.in_file or lenses) > 1 and args.projection in STEREO_PROJECTIONS:
+        if len(lenses.in_file or lenses) > 1 and wanted[0] in STEREO_PROJECTIONS:
             _note_unrectified(list(by_camera))
         sides = {
             name: Rectification(lens, camera_for([lens], *wanted), args.range_m)
             for name, lens in by_camera.items()
         }
-        return sides, None, paths
+        return _Sides(sides, own), paths
     left, right = by_camera.values()
     camera = camera_for([left, right], *wanted, along_baseline=True)
     pair = rectify_pair(left, right, rig, camera, args.range_m)
-    return dict(zip(by_camera, (pair.left, pair.right), strict=True)), pair, paths
+    return _Sides(dict(zip(by_camera, (pair.left, pair.right), strict=True)), own, pair), paths
+
+
+def _view_sides(
+    args: argparse.Namespace, views: Sequence[View], lenses: Mapping[str, Lens]
+) -> _Sides:
+    """Return the rectifications of views, a folder for each, in one of its camera."""
+    if args.rig:
+        raise ParameterError(
+            f'--rig {args.rig}: views are of each camera for itself; leave --rig out'
+        )
+    cube = args.projections == [CUBEMAP]
+    if cube and args.size and args.size[0] != args.size[1]:
+        raise ParameterError(f'--size {args.size[0]}x{args.size[1]}: faces of a cube are square')
+    sides: dict[str, Rectification] = {}
+    by_camera: dict[str, list[str]] = {}
+    for camera, lens in lenses.items():
+        size = face_size(lens) if cube and args.size is None else args.size
+        found = rectify_views(lens, views, size, args.range_m)
+        if dark := [view.name for view in views if view.name not in found]:
+            say(f'{lens.name}: no pixel of {", ".join(dark)} is in its field of view')
+        named = {str(Path(camera, name)): side for name, side in found.items()}
+        by_camera[camera] = list(named)
+        sides |= named
+    return _Sides(sides, by_camera, views=True)
+
+
+def _write_views(
+    camera: str,
+    sides: Mapping[str, Rectification],
+    written: Mapping[str, Sequence[str]],
+    folder: Path,
+) -> None:
+    """Write the views of a camera for COLMAP, and with their photographs for nerfstudio."""
+    views = [
+        ViewCamera(
+            Path(name).name,
+            (side.camera.width, side.camera.height),
+            side.camera.f,
+            side.camera.cx,
+            side.camera.cy,
+            side.rotation,
+        )
+        for name, side in sides.items()
+    ]
+    write_text(folder / camera / 'cameras.txt', colmap_cameras_text(views))
+    write_text(folder / camera / 'rig_config.json', colmap_rig_text(views))
+    frames = [
+        (
+            view,
+            os.path.relpath(Path(_IMAGES, name, photograph), camera or '.'),
+            f'{view.name}/mask.png',
+        )
+        for view, name in zip(views, sides, strict=True)
+        for photograph in written[name]
+    ]
+    write_text(folder / camera / 'transforms.json', nerfstudio_text(frames))
 
 
 def _by_camera(photographed: Sequence[str], lenses: Lenses) -> dict[str, Lens]:
@@ -228,21 +371,18 @@ def _note_unrectified(cameras: Sequence[str]) -> None:
 
 
 def _write_photographs(
-    sides: dict[str, Rectification],
-    pair: RectifiedPair | None,
-    paths: Sequence[str],
-    folder: Path,
-    split: int,
-    done: Any,
-) -> dict[str, int]:
-    """Write the rectified photographs, and a picture of the first pair; return how many."""
-    counts = dict.fromkeys(sides, 0)
-    written = {folder / name / file for name in sides for file in _PICTURES}
+    every: _Sides, paths: Sequence[str], folder: Path, split: int, done: Any
+) -> dict[str, list[str]]:
+    """Write the rectified photographs, and a picture of the first pair; return their names."""
+    written: dict[str, list[str]] = {name: [] for name in every.sides}
+    taken = {folder / name / file for name in every.sides for file in _PICTURES}
     first: dict[str, tuple[str, Any]] = {}
     skipped: list[str] = []
     for photograph in find_photographs(paths, split=split):
+        names = every.by_camera[photograph.camera]
         try:
-            image = sides[photograph.camera].remap(photograph.pixels(color=True))
+            pixels = photograph.pixels(color=True)
+            images = {name: every.sides[name].remap(pixels) for name in names}
         except (ObservationError, ParameterError) as error:
             skipped.append(str(error).removeprefix(f'{photograph.name}: '))
             if len(skipped) <= _MAX_LISTED:
@@ -250,31 +390,36 @@ def _write_photographs(
             done()
             continue
         key = Path(photograph.key).name
-        path = folder / photograph.camera / f'{key}.png'
-        if path in written:
-            if path.name in _PICTURES:
-                raise ParameterError(
-                    f'{photograph.name}: {path.name} is a result of this command '
-                    'too; rename the photograph'
-                )
-            raise ParameterError(
-                f'{photograph.name}: another photograph is also called {key}; '
-                'give one folder at a time'
-            )
-        written.add(path)
-        write_png(path, image)
-        counts[photograph.camera] += 1
-        first.setdefault(photograph.camera, (key, image))
+        for name, image in images.items():
+            path = folder / every.image_folder(name) / f'{key}.png'
+            _check_name(path, taken, photograph.name, key)
+            taken.add(path)
+            write_png(path, image)
+            written[name].append(path.name)
+            first.setdefault(name, (key, image))
         done()
     if len(skipped) > _MAX_LISTED:
         say(f'and {len(skipped) - _MAX_LISTED} more such photographs')
-    if skipped and not any(counts.values()):
+    if skipped and not any(written.values()):
         raise ObservationError(f'{", ".join(paths)}: no photograph can be used: {skipped[0]}')
-    if pair and len(first) == 2:
-        left, right = (first[name] for name in sides)
+    if every.pair and len(first) == 2:
+        left, right = (first[name] for name in every.sides)
         if left[0] == right[0]:
             draw_pair(folder / 'pair.png', left[1], right[1])
-    return counts
+    return written
+
+
+def _check_name(path: Path, taken: Collection[Path], photograph: str, key: str) -> None:
+    """Raise ParameterError where a photograph would be written over another file of this run."""
+    if path not in taken:
+        return
+    if path.name in _PICTURES:
+        raise ParameterError(
+            f'{photograph}: {path.name} is a result of this command too; rename the photograph'
+        )
+    raise ParameterError(
+        f'{photograph}: another photograph is also called {key}; give one folder at a time'
+    )
 
 
 def _write_camera(

@@ -1,15 +1,30 @@
-"""The library's part about lenses: for another image."""
+"""The library's part about lenses for other images: resized, and views of them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from fisheye_svp_ros.effects import resizing
 from fisheye_svp_ros.effects.resizing import ImageChange
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.library.checks import check_number, check_size, check_whole_numbers
+from fisheye_svp_ros.library.checks import (
+    check_number,
+    check_numbers,
+    check_size,
+    check_whole_numbers,
+)
 from fisheye_svp_ros.library.functions import AnyLens, load_lens
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.rectify.maps import RANGE, Rectification
+from fisheye_svp_ros.rectify.views import (
+    cube_views,
+    face_size,
+    perspective_view,
+    rectify_views,
+)
 
 
 def resize_lens(
@@ -41,6 +56,31 @@ def resize_lens(
         None if size is None else check_size(size, 'size'),
     )
     return change_image(known, change)[0]
+
+
+def undistort_views(
+    lens: AnyLens,
+    views: Sequence[tuple[float, float, float]] | None = None,
+    *,
+    size: tuple[int, int] | None = None,
+    range_m: float = RANGE,
+) -> dict[str, Rectification]:
+    """Return what maps photographs to several pinhole views of the lens, by name.
+
+    views: yaw (to the right), pitch (upwards) and field of view over the width, rad; None: the
+    faces of a cube that the lens sees (front, right, back, left, up, down).  size: width, height,
+    px, of each.  Each is as of `undistort_maps`; its `rotation` (3, 3) is from camera to view.
+    Raises ParameterError for views that the lens does not see, or that are no plane image.
+    """
+    known = load_lens(lens)
+    wanted = None if size is None else check_size(size, 'size')
+    if views is None:
+        return rectify_views(known, cube_views(), wanted or face_size(known), range_m)
+    rows = check_numbers(views, 'views', '(V, 3)')
+    if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all():
+        raise ParameterError(f'views has the shape {rows.shape}; (V, 3) finite rad are needed')
+    turned = [perspective_view(yaw, pitch, field) for yaw, pitch, field in rows.tolist()]
+    return rectify_views(known, turned, wanted, range_m)
 
 
 def change_image(lens: Lens, change: ImageChange) -> tuple[Lens, tuple[str, ...]]:
