@@ -14,36 +14,37 @@ import scipy
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.decision import Decision, PhotographsAnswer
-from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
+from fisheye_svp_ros.diagnosis.decision import MIN_FRAMES, Decision, PhotographsAnswer
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.findings import MAX_SHIFT, Finding, Flaw, FlawKind, Reason
-from fisheye_svp_ros.diagnosis.random_effects import NAMES, SAG
+from fisheye_svp_ros.diagnosis.frame_changes import FrameChanges, find_frame_changes
 from fisheye_svp_ros.diagnosis.variance_budget import Component
-from fisheye_svp_ros.effects.recording_effects import FocalDriftEffect, SessionStepEffect
 from fisheye_svp_ros.scene.boards import is_flat
 from fisheye_svp_ros.scene.observations import frame_names
 from fisheye_svp_ros.scene.table_checks import MAX_TARGET_SIZE, target_size
 from fisheye_svp_ros.solve.frame_groups import MIN_GROUP, find_frame_groups
 from fisheye_svp_ros.solve.lens_checks import image_coverage, is_no_fit
 from fisheye_svp_ros.solve.mirrored_points import find_mirror
-from fisheye_svp_ros.solve.ray_errors import RANGES, RayError
+from fisheye_svp_ros.solve.ray_errors import MAX_RAY_ERROR, RANGES, RayError
 
-_FOCAL, _CENTER = 'frame_focal', 'frame_centre'
-_MAX_FRAMES_RATIO = 3.0  # times noise and scatter: what frames may have of their own, of any form
-_MAX_RAY_RATIO = 6.0  # times the noise of a point: how far off a ray may be within the data
-_MIN_SIGMAS = 2.0
 _MAX_SPREAD = 0.05  # of the variance between frames: more within groups, and they are none
 _MAX_GROUPS = 3
+_MAX_NOISE = 1.0  # px: detectors of corners leave .02 to .3, those of blurred tags .5
+_MIN_SINE = 0.1  # of the angle between a line of sight and a board, to tell its sides apart
 _NEAR_RANGE = RANGES.index(1.0)
 
 
 @dataclass(frozen=True)
 class Adequacy:
-    """What is wrong with the data, the worst first; reached: the angle of the points, rad."""
+    """What is wrong with the data, the worst first.
+
+    reached: the angle of the points, rad; frames_error: rms angle, rad, by which rays of a single
+    frame differ from those of the lens.
+    """
 
     flaws: tuple[Flaw, ...]
     reached: float
+    frames_error: float = 0.0
 
     @property
     def is_misfit(self) -> bool:
@@ -71,18 +72,27 @@ def judge_data(
     evaluation: Evaluation,
     causes: Sequence[Cause],
     components: Sequence[Component],
-    ray_errors: Mapping[str, Mapping[str, Sequence[RayError]]],
+    rays: Mapping[str, Sequence[RayError]],
     candidates: Sequence[Finding],
 ) -> Adequacy:
-    """Return what is wrong with the data of an evaluation; candidates: not confirmed."""
+    """Return what is wrong with the data of an evaluation.
+
+    rays: expected errors of the lens that is to be used, by camera; candidates: not confirmed.
+    """
     linear = evaluation.simulation
     reached = float(np.nanmax(linear.scene.theta[linear.data.views.used]))
+    changes = find_frame_changes(evaluation, causes, components)
     flaws = [*_mirrors(evaluation), *_impossible_lengths(evaluation, candidates)]
-    flaws += _misfits(evaluation, causes, components)
+    flaws += _misfits(evaluation, changes, components)
+    flaws += _differing_sides(evaluation)
+    if evaluation.noise_px > _MAX_NOISE:
+        flaws.append(Flaw(FlawKind.NOISE_TOO_LARGE, evaluation.noise_px, _MAX_NOISE))
     if evaluation.free and evaluation.medium is None:
+        if evaluation.frames < MIN_FRAMES:
+            flaws.append(Flaw(FlawKind.FEW_FRAMES, evaluation.frames, MIN_FRAMES))
         flaws += _coverage(evaluation)
         if not any(flaw.kind.is_misfit for flaw in flaws):
-            flaws += _unknown_rays(evaluation, ray_errors)
+            flaws += _unknown_rays(rays, changes.ray_error)
     flaws.sort(key=lambda flaw: flaw.kind.value)
     table = evaluation.problem.observations
     known = {frame for frame, _, _ in table.photographs}
@@ -94,7 +104,9 @@ def judge_data(
         for flaw in flaws
     ]
     return Adequacy(
-        tuple(replace(flaw, names=one) for flaw, one in zip(flaws, names, strict=True)), reached
+        tuple(replace(flaw, names=one) for flaw, one in zip(flaws, names, strict=True)),
+        reached,
+        changes.ray_error,
     )
 
 
@@ -122,31 +134,45 @@ def _impossible_lengths(evaluation: Evaluation, candidates: Sequence[Finding]) -
             yield Flaw(FlawKind.SHIFT_TOO_LARGE, shift, MAX_SHIFT)
 
 
-def _misfits(
-    evaluation: Evaluation, causes: Sequence[Cause], components: Sequence[Component]
-) -> Iterator[Flaw]:
-    """Yield what no lens explains: more than noise is left, and it differs between frames."""
-    scatter = evaluation.scatter_px
-    frames = {
-        part.name: part.sd_px / scatter
-        for part in components
-        if part.stage == 'frame'
-        and part.name in NAMES
-        and part.name != SAG
-        and part.p_value * len(NAMES) < SIGNIFICANCE
-    }
-    total = float(np.hypot.reduce(list(frames.values()) or [0.0]))
-    left = evaluation.figures.named.rms_px
-    other = {name: of for name, of in frames.items() if name not in (_FOCAL, _CENTER)}
-    shapeless = float(np.hypot.reduce(list(other.values()) or [0.0]))
-    if shapeless > _MAX_FRAMES_RATIO:
-        groups = _camera_groups(evaluation, scatter)
-        kind = FlawKind.CAMERAS_MIXED if groups else FlawKind.FRAMES_DIFFER
-        yield Flaw(kind, left, scatter, groups or _worst_frames(evaluation))
+def _differing_sides(evaluation: Evaluation) -> Iterator[Flaw]:
+    """Yield that frames see a flat board from its two sides, which a printed one has not.
+
+    Corners that are numbered in mirrored order fit as well as others, from behind.
+    """
+    table, linear = evaluation.problem.observations, evaluation.simulation
+    if not is_flat(table.xyz):
         return
-    changes = _intrinsics_by_frame(evaluation, causes, frames)
-    if changes is not None:
-        yield _changing_intrinsics(evaluation, *changes, total)
+    middle = table.xyz.mean(axis=0)
+    normal = np.linalg.svd(table.xyz - middle, full_matrices=False)[2][-1]
+    away = linear.state.pose.position - middle
+    sine = away @ normal / np.linalg.norm(away, axis=1)
+    front, back = sine > _MIN_SINE, sine < -_MIN_SINE
+    if front.any() and back.any():
+        fewer = min(front, back, key=np.count_nonzero)
+        frames = tuple(linear.data.frame_numbers[fewer].tolist())
+        yield Flaw(FlawKind.SIDES_DIFFER, len(frames), len(sine), (frames,))
+
+
+def _misfits(
+    evaluation: Evaluation, changes: FrameChanges, components: Sequence[Component]
+) -> Iterator[Flaw]:
+    """Yield what no one lens is meant by: frames of several cameras, or of one that changes.
+
+    A board that bends from frame to frame is no reason: what it costs the lens is in its errors.
+    """
+    focal = next(iter(evaluation.problem.inputs.lenses.values())).fx
+    frames = float(np.hypot.reduce([p.sd_px for p in components if p.stage == 'frame'] or [0.0]))
+    left, scatter = evaluation.figures.named.rms_px, evaluation.scatter_px
+    differ = max(changes.warp_error, changes.shapeless_error) > MAX_RAY_ERROR
+    if differ or frames > MAX_RAY_ERROR * focal:
+        groups = _camera_groups(evaluation, scatter)
+        if groups:
+            yield Flaw(FlawKind.CAMERAS_MIXED, left, scatter, groups)
+            return
+    if max(changes.focal_error, changes.center_error) > MAX_RAY_ERROR:
+        yield _changing_intrinsics(evaluation, changes)
+    elif differ:
+        yield Flaw(FlawKind.FRAMES_DIFFER, left, scatter, _worst_frames(evaluation))
     elif is_no_fit(left, scatter):
         yield Flaw(FlawKind.NO_FIT, left, scatter)
 
@@ -170,88 +196,27 @@ def _worst_frames(evaluation: Evaluation) -> tuple[tuple[int, ...], ...]:
     return (tuple(evaluation.null.linear.data.frame_numbers[worst].tolist()),)
 
 
-def _intrinsics_by_frame(
-    evaluation: Evaluation, causes: Sequence[Cause], frames: Mapping[str, float]
-) -> tuple[Array, Array] | None:
-    """Return relative focal lengths (F,) and centers (F, 2), px; None where they are alike.
-
-    By random effects that are larger than noise, and by named changes that are larger than those
-    of a camera at rest (`Parameter.large`).
-    """
-    focal, center = _named_changes(evaluation, causes)
-    if any(frames.get(name, 0.0) > 1.0 for name in (_FOCAL, _CENTER)):
-        own = _own_coefficients(evaluation)
-        focal = focal + own[_FOCAL].sum(axis=1) / _radius(evaluation)
-        center = center + own[_CENTER].reshape(len(center), -1, 2).sum(axis=1)
-    return (focal, center) if focal.any() or center.any() else None
-
-
-def _own_coefficients(evaluation: Evaluation) -> dict[str, Array]:
-    """Return what frames are predicted to have of their own (F, B), px, by component."""
-    fitted = evaluation.fitted
-    group = fitted.factored.equations.split(fitted.solution.e, fitted.solution.r)[0]
-    label = fitted.random.columns.group_label  # after the columns of the pose
-    own = group[:, group.shape[1] - len(label) :]
-    return {name: own[:, label == NAMES.index(name)] for name in (_FOCAL, _CENTER)}
-
-
-def _radius(evaluation: Evaluation) -> float:
-    """Return half the larger extent of the points, px: the unit of `random_effects`."""
-    views = evaluation.null.linear.data.views
-    return float(np.ptp(views.uv[views.used], axis=0).max()) / 2
-
-
-def _named_changes(evaluation: Evaluation, causes: Sequence[Cause]) -> tuple[Array, Array]:
-    """Return what large named changes add to focal lengths (F,) and centers (F, 2), px."""
-    linear = evaluation.null.linear
-    count = linear.data.frames
-    focal, center = np.zeros(count), np.zeros((count, 2))
-    named = {cause.effect for cause in causes}
-    first = linear.data.first_views
-    for term in linear.state.terms:
-        effect, values = term.effect, term.values
-        if effect.name not in named:
-            continue
-        if isinstance(effect, SessionStepEffect):
-            steps = values.reshape(-1, 3)
-            if _is_large(effect, values, evaluation):
-                after = effect.step_design(linear.scene)[first]
-                focal, center = focal + after @ steps[:, 0], center + after @ steps[:, 1:]
-        elif isinstance(effect, FocalDriftEffect) and _is_large(effect, values, evaluation):
-            focal = focal + effect.relative_change(linear.scene)[first] @ values
-    return focal, center
-
-
-def _is_large(
-    effect: FocalDriftEffect | SessionStepEffect, values: Array, evaluation: Evaluation
-) -> bool:
-    """Whether a change is larger than any of a camera at rest, beyond its error."""
-    columns = next(term.columns for term in evaluation.null.terms if term.name == effect.name)
-    large = np.array([parameter.large for parameter in effect.parameters])
-    least = np.abs(values) - _MIN_SIGMAS * evaluation.errors[columns]
-    return bool((least > large).any())
-
-
-def _changing_intrinsics(
-    evaluation: Evaluation, focal: Array, center: Array, ratio: float
-) -> Flaw:
+def _changing_intrinsics(evaluation: Evaluation, changes: FrameChanges) -> Flaw:
     """Return which of the intrinsics change more, by how much, and in which frames."""
-    numbers, radius = evaluation.null.linear.data.frame_numbers, _radius(evaluation)
-    shift = float(np.sqrt(center.var(axis=0).sum()))
-    values = np.column_stack([focal * radius, center])
+    numbers = evaluation.null.linear.data.frame_numbers
+    focal, center = changes.focal, changes.center
+    lens = evaluation.null.linear.state.lens
+    values = np.column_stack([focal * min(lens.width, lens.height) / 2, center])
     groups = tuple(tuple(numbers[group].tolist()) for group in _clusters(values))
-    if shift > float(focal.std()) * radius:
+    if changes.center_error > changes.focal_error:
         kind = FlawKind.CAMERAS_MIXED if groups else FlawKind.CENTER_VARIES
         if groups:
             named = evaluation.figures.named.rms_px
             return Flaw(kind, named, evaluation.noise_px, groups)
-        far = np.linalg.norm(center - center.mean(axis=0), axis=1)
-        return Flaw(kind, shift, ratio, (tuple(numbers[np.argsort(-far)].tolist()),))
+        shift = float(np.sqrt(center.var(axis=0).sum()))
+        far = np.linalg.norm(center, axis=1)
+        farthest = tuple(numbers[np.argsort(-far)].tolist())
+        return Flaw(kind, shift, changes.center_error, (farthest,))
     order = np.argsort(focal)
     third = max(len(order) // 3, 1)
     ends = (tuple(sorted(numbers[order[:third]])), tuple(sorted(numbers[order[-third:]])))
     plain = tuple(tuple(int(n) for n in end) for end in ends)
-    return Flaw(FlawKind.FOCAL_VARIES, float(np.ptp(focal)), ratio, groups or plain)
+    return Flaw(FlawKind.FOCAL_VARIES, float(np.ptp(focal)), changes.focal_error, groups or plain)
 
 
 def _clusters(values: Array) -> list[Index]:
@@ -282,13 +247,18 @@ def _coverage(evaluation: Evaluation) -> Iterator[Flaw]:
             yield Flaw(FlawKind.OFF_CENTER, *image.offset, camera=name)
 
 
-def _unknown_rays(
-    evaluation: Evaluation, ray_errors: Mapping[str, Mapping[str, Sequence[RayError]]]
-) -> Iterator[Flaw]:
-    """Yield cameras whose rays are unknown even where there are points."""
-    lenses = evaluation.problem.inputs.lenses
-    for name, sides in ray_errors.items():
-        error = sides['extended'][_NEAR_RANGE].value
-        point = evaluation.scatter_px / lenses[name].fx
-        if error > _MAX_RAY_RATIO * point:
-            yield Flaw(FlawKind.LENS_UNKNOWN, error, point, camera=name)
+def _unknown_rays(rays: Mapping[str, Sequence[RayError]], frames_error: float) -> Iterator[Flaw]:
+    """Yield cameras whose rays may be off by too much even where there are points.
+
+    That they are off by less than MAX_RAY_ERROR is sure to 97.5 %: it is the user's loss, in what
+    a single frame is solved with, that decides, however large the noise is.
+    """
+    for name, errors in rays.items():
+        bound = errors[_NEAR_RANGE].in_quadrature(frames_error).high
+        if bound > MAX_RAY_ERROR:
+            yield Flaw(FlawKind.LENS_UNKNOWN, bound, MAX_RAY_ERROR, camera=name)
+
+
+def are_rays_known(rays: Mapping[str, Sequence[RayError]]) -> bool:
+    """Say whether the rays of all cameras are known to be off by less than MAX_RAY_ERROR."""
+    return bool(rays) and not any(_unknown_rays(rays, 0.0))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.adequacy import Adequacy, judge_data
+from fisheye_svp_ros.diagnosis.adequacy import Adequacy, are_rays_known, judge_data
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
@@ -32,13 +32,14 @@ from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.findings import LIKELY_PROBABILITY, Finding, Status
 from fisheye_svp_ros.diagnosis.lens_evidence import compare_lens_files, find_bounds, find_lens_rays
-from fisheye_svp_ros.diagnosis.random_effects import SAG
-from fisheye_svp_ros.diagnosis.variance_budget import Component
+from fisheye_svp_ros.diagnosis.random_effects import BEND, MILLIMETRE, SAG
+from fisheye_svp_ros.diagnosis.variance_budget import Component, significant_components
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.effects.target_map import board_maps
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations, frame_names
+from fisheye_svp_ros.solve.bundle_adjustment import adjust_poses
 from fisheye_svp_ros.solve.outliers import FRAME, VIEW, Outliers
 from fisheye_svp_ros.solve.ray_errors import RayError
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
@@ -46,7 +47,7 @@ from fisheye_svp_ros.solve.rig_checks import is_unpaired
 RETAKE, UNLIKE, TURNED = 'retake', 'unlike', 'turned'
 _OUTSTANDING_RATIO = 2.0  # times the typical one
 _MAX_LISTED = 8
-_MIN_SAG = 0.05  # mm
+_MIN_SAG = _MIN_BEND = 0.05  # mm
 
 
 class Action(Enum):
@@ -73,7 +74,6 @@ class Action(Enum):
 
 
 _ACTION_KINDS = {
-    Action.RETAKE: RETAKE,
     Action.CHECK_VIEWS: RETAKE,
     Action.CHECK_FRAMES: RETAKE,
     Action.TAKE_MORE_LIKE_THESE: UNLIKE,
@@ -316,8 +316,14 @@ class Conclusion:
     adequacy: Adequacy
 
     def ray_error_mrad(self) -> dict[str, Any]:
-        """Return the expected ray errors, mrad, of the worst camera, and of each of several."""
-        each = {camera: self.ray_error_of(camera) for camera in self.ray_error}
+        """Return the expected ray errors, mrad, of the worst camera, and of each of several.
+
+        in_use: of the lens that is to be used, in a single frame, with what that has of its own.
+        """
+        each = {
+            camera: {**self.ray_error_of(camera), 'in_use': self._errors_in_use(camera)}
+            for camera in self.ray_error
+        }
         if len(each) < 2:
             return next(iter(each.values()), {})
         worst = max(each.values(), key=lambda both: both['given'][0]['value'])
@@ -330,12 +336,24 @@ class Conclusion:
             for side, found in self.ray_error.get(camera, {}).items()
         }
 
+    def _errors_in_use(self, camera: str) -> list[dict[str, float]]:
+        own = self.adequacy.frames_error
+        return [
+            error.in_quadrature(own).in_mrad()
+            for error in self.ray_error[camera][used_side(self.decision['lens'])]
+        ]
+
     def with_ray_error(self, lens: Lens, camera: str) -> Lens:
         """Return the extended lens of a camera with its ray errors in its `uncertainty`."""
         found = self.ray_error_of(camera)
         if not found:
             return lens
         return replace(lens, uncertainty={**(lens.uncertainty or {}), 'ray_error_mrad': found})
+
+
+def used_side(lens: Decision) -> str:
+    """Return which lens a decision about it leaves in use: `given` or `extended`."""
+    return 'extended' if lens.say in ('use_extended', 'recalibrate') else 'given'
 
 
 def conclude(
@@ -377,6 +395,7 @@ def conclude(
         + [evaluation.noise_px]
     )
     target = decide_target(_target_facts(evaluation, causes, components, contradicted))
+    rays = {name: sides[used_side(lens)] for name, sides in ray_errors.items()}
     photographs = decide_photographs(
         PhotographsFacts(
             frames=evaluation.frames,
@@ -388,9 +407,10 @@ def conclude(
             is_target_off=target.say == 'measure_again' and target.confidence is not None,
             plannable=evaluation.problem.plannable,
             unit='view' if is_unpaired(evaluation.null.linear.data) else 'frame',
+            known=are_rays_known(rays),
         )
     )
-    adequacy = judge_data(evaluation, causes, components, ray_errors, candidates)
+    adequacy = judge_data(evaluation, causes, components, rays, candidates)
     decisions = adequacy.revise({'lens': lens, 'target': target, 'photographs': photographs})
     return Conclusion(decisions, file, ray_errors, candidates, adequacy)
 
@@ -471,20 +491,44 @@ def _target_facts(
     local = [part for part in of_target if not part.named_share and part.p_value < SIGNIFICANCE]
     far = np.linalg.norm(evaluation.offsets.offset, axis=1) if local else np.zeros(1)
 
-    def size(parts: Sequence[Component]) -> float:
-        return float(np.sqrt(sum(part.sd_px**2 for part in parts)))
-
     return TargetFacts(
         largest=_largest_error(evaluation, mine),
         gain=gain,
-        named_px=size([part for part in of_target if part.named_share]),
-        local_px=size(local),
+        local_px=float(np.sqrt(sum(part.sd_px**2 for part in local))),
         local_m=float(np.sqrt((far**2).mean())),
         local_p=max((p.p_value for p in local), default=0.0),
-        noise_px=evaluation.noise_px,
+        pose_error=_pose_error(evaluation) if local else 0.0,
         contradicted=contradicted,
         frames=evaluation.frames,
+        **_frame_bend(evaluation, components),
     )
+
+
+def _frame_bend(evaluation: Evaluation, components: Sequence[Component]) -> dict[str, float]:
+    """Return the size, m, of a significant bend by frame, and its share beside noise."""
+    found = [part for part in significant_components(components) if part.name == BEND]
+    rms = float(np.sqrt((evaluation.fitted.frame_bends() ** 2).mean())) if found else 0.0
+    if rms < _MIN_BEND:
+        return {}
+    rest = sum(part.share for part in components if part.stage != 'noise' and not part.named_share)
+    return {'bend_m': MILLIMETRE * rms, 'bend_share': found[0].share / rest}
+
+
+def _pose_error(evaluation: Evaluation) -> float:
+    """Return by how much of its distance each camera is placed wrongly for offsets of landmarks.
+
+    Rms over the frames, rad: of poses on the landmarks as stated, against those on the landmarks
+    as they are predicted to be.
+    """
+    linear = evaluation.null.linear
+    offsets = evaluation.offsets._replace(grids=(), views=None)
+    stated, predicted = (
+        adjust_poses(data, linear.state).pose for data in (linear.data, offsets.apply(linear.data))
+    )
+    moved = np.linalg.norm(predicted.position - stated.position, axis=-1)
+    points = np.nanmean(linear.data.views.points[linear.data.views.used], axis=0)
+    away = np.linalg.norm(stated.position - points, axis=-1)
+    return float(np.sqrt(((moved / away) ** 2).mean()))
 
 
 def _largest_error(evaluation: Evaluation, causes: Sequence[Cause]) -> TargetError | None:

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 from fisheye_svp_ros.diagnosis.findings import LIKELY_PROBABILITY, Flaw
+from fisheye_svp_ros.solve.ray_errors import MAX_RAY_ERROR
 
 LensAnswer = Literal['keep', 'use_extended', 'recalibrate', 'undecided']
 TargetAnswer = Literal['keep', 'correct', 'measure_again', 'undecided']
@@ -17,11 +18,13 @@ PhotographsAnswer = Literal['enough', 'more', 'retake']
 _INTRINSIC = ('focal_length', 'principal_point', 'aspect')
 _OFF_P = 0.04  # of the offset by chance: below, the lens is another one
 _OFF_PX = 0.2  # of the noise: a difference that matters
+_MIN_OFFSET = 0.1  # mrad: a tenth of MAX_RAY_ERROR; less is no user's loss, however sure it is
 RAY_RATIO = 2.0  # of expected ray errors: a lens so much better is worth the change
 _HINT = 2.4  # standard errors: an effect that is not named, and may well be there
 MIN_FRAMES = 8  # frames
 _MAX_REJECTED_SHARE = 0.1  # of the frames
 _TARGET_RATIO = 1.5  # times noise and scatter: a held-out error that needs a reason
+_MIN_SURE = 0.8  # that held-out frames agree with rays that are expected to be better
 
 
 class LensReason(Enum):
@@ -32,11 +35,10 @@ class LensReason(Enum):
     ONE_FRAME = 3
     INTRINSICS_WRONG = 4
     PREDICTS_BETTER = 5
-    LENS_ALONE_PREDICTS_WORSE = 6
-    GAIN_UNCERTAIN = 7
-    EFFECT_POSSIBLE = 8
-    NO_CAUSE_CONFIRMED = 9
-    RAYS_BETTER = 10
+    GAIN_UNCERTAIN = 6
+    EFFECT_POSSIBLE = 7
+    NO_CAUSE_CONFIRMED = 8
+    RAYS_BETTER = 9
 
 
 class TargetReason(Enum):
@@ -47,8 +49,8 @@ class TargetReason(Enum):
     CORRECTION_GAINS_NOTHING = 3
     CAUSE_AND_OFFSETS = 4
     ONE_FRAME = 5
-    OFFSETS_ABOVE_NOISE = 6
-    OFFSETS_BELOW_NOISE = 7
+    OFFSETS_COST = 6
+    OFFSETS_HARMLESS = 7
     BELOW_NOISE = 8
 
 
@@ -139,7 +141,8 @@ class LensOffset(NamedTuple):
         Of a lens without errors only what costs counts.
         """
         least = _OFF_PX if self.stated else 1.0
-        return not self.is_chance and self.px > least * noise_px and self.is_fresh_better
+        costs = self.px > least * noise_px and self.mrad > _MIN_OFFSET
+        return not self.is_chance and costs and self.is_fresh_better
 
 
 def least_likely_offset(offsets: Sequence[LensOffset]) -> LensOffset | None:
@@ -203,7 +206,8 @@ class LensFacts(NamedTuple):
     def has_better_rays(self) -> bool:
         """Whether the expected error of the rays halves, and held-out frames agree."""
         given, extended = self.rays
-        return extended > 0 and given >= RAY_RATIO * extended and self.file.gain > 0
+        agrees = self.file.gain > 0 and self.file.sure >= _MIN_SURE
+        return extended > 0 and given >= RAY_RATIO * extended and agrees
 
     @property
     def wrong_intrinsics(self) -> list[str]:
@@ -217,7 +221,7 @@ class LensFacts(NamedTuple):
             one
             for one in self.bounds
             if (one.z > _HINT or self.is_likely(one.effect))
-            and one.edge_px > self.noise_px
+            and one.edge_mrad > 1e3 * MAX_RAY_ERROR
             and one.effect not in self.refuted
         )
         return sorted(possible, key=lambda bound: -bound.edge_px)
@@ -250,9 +254,6 @@ def decide_lens(facts: LensFacts) -> Decision:
         return decide('use_extended', LensReason.PREDICTS_BETTER, sure)
     if facts.has_better_rays:
         return decide('use_extended', LensReason.RAYS_BETTER, None)
-    if facts.causes and file.high < 0 < facts.named_gain[1]:
-        reason = LensReason.LENS_ALONE_PREDICTS_WORSE
-        return decide('undecided', reason, 1 - sure, bounded=True)
     if facts.lens_causes:
         return decide('undecided', LensReason.GAIN_UNCERTAIN, sure, bounded=True)
     if facts.possible_effects:
@@ -279,22 +280,29 @@ class TargetFacts(NamedTuple):
     """What the target is judged by.
 
     largest: of its confirmed causes, None without; gain: what they take away of the held-out error
-    above noise, the low end of that, its confidence; named_px, local_px, noise_px:
-    standard deviations of a coordinate by causes, by offsets without a name, and of noise;
-    local_m: rms of those offsets; local_p: p-value of the least sure of their components;
-    contradicted: whether the cameras of a rig contradict each other about the target; frames: how
-    many.
+    above noise, the low end of that, its confidence; local_px: standard deviation of a coordinate
+    by offsets without a name, local_m: their rms; local_p: p-value of the least sure of their
+    components; pose_error: by how much of its distance a camera is placed wrongly for these
+    offsets, rms over the frames, rad; contradicted: whether the cameras of a rig contradict each
+    other about the target; frames: how many; bend_m: rms by which a board bends from frame to
+    frame, bend_share: of the variance beside noise, 0 where it does not.
     """
 
     largest: TargetError | None
     gain: tuple[float, float, float]
-    named_px: float
     local_px: float
     local_m: float
     local_p: float
-    noise_px: float
+    pose_error: float
     contradicted: bool
     frames: int
+    bend_m: float = 0.0
+    bend_share: float = 0.0
+
+    @property
+    def is_harmless(self) -> bool:
+        """Whether poses on this target lose little by its offsets without a name."""
+        return self.pose_error <= MAX_RAY_ERROR
 
 
 def decide_target(facts: TargetFacts) -> Decision:
@@ -311,18 +319,17 @@ def decide_target(facts: TargetFacts) -> Decision:
         return decide('measure_again', TargetReason.CAMERAS_CONTRADICT, None)
     if facts.largest is not None:
         gained = Figure('gain', gain, '1')
-        if low > 0 and facts.local_px <= facts.named_px:
+        if not facts.is_harmless:
+            return decide('measure_again', TargetReason.CAUSE_AND_OFFSETS, sure, gained)
+        if low > 0:
             return decide('correct', TargetReason.CORRECTION_GAINS, sure, gained)
-        if not facts.local_px:
-            reason = TargetReason.CORRECTION_GAINS_NOTHING
-            return decide('measure_again', reason, None, gained)
-        return decide('measure_again', TargetReason.CAUSE_AND_OFFSETS, sure, gained)
+        return decide('measure_again', TargetReason.CORRECTION_GAINS_NOTHING, None, gained)
     if facts.frames < 2:
         return decide('keep', TargetReason.ONE_FRAME, None)
-    if facts.local_px > facts.noise_px:
-        return decide('measure_again', TargetReason.OFFSETS_ABOVE_NOISE, 1 - facts.local_p)
+    if not facts.is_harmless:
+        return decide('measure_again', TargetReason.OFFSETS_COST, 1 - facts.local_p)
     if facts.local_px > 0:
-        return decide('keep', TargetReason.OFFSETS_BELOW_NOISE, 1 - facts.local_p)
+        return decide('keep', TargetReason.OFFSETS_HARMLESS, 1 - facts.local_p)
     return decide('keep', TargetReason.BELOW_NOISE, 0.95)
 
 
@@ -332,7 +339,8 @@ class PhotographsFacts(NamedTuple):
     frames: how many there are; bad: names of those that are wrong as a whole; unlike: that the
     others do not predict; heldout_px: by all causes; scatter_px: what noise leaves of it; lens:
     the answer about the lens; is_target_off: whether errors of the target remain in what is held
-    out; plannable: whether `--next` can tell which photographs to take; unit: what is counted.
+    out; plannable: whether `--next` can tell which photographs to take; unit: what is counted;
+    known: whether the rays of the lens that is to be used are known to MAX_RAY_ERROR.
     """
 
     frames: int
@@ -344,6 +352,7 @@ class PhotographsFacts(NamedTuple):
     is_target_off: bool = False
     plannable: bool = True
     unit: str = 'frame'
+    known: bool = False
 
     @property
     def ratio(self) -> float:
@@ -363,7 +372,7 @@ def decide_photographs(facts: PhotographsFacts) -> Decision:
     def decide(say: PhotographsAnswer, reason: PhotographsReason) -> Decision:
         return Decision(say, reason, facts, figure, None)
 
-    if facts.bad and len(facts.bad) >= many * facts.frames:
+    if facts.bad and len(facts.bad) >= many * facts.frames and not facts.known:
         return decide('retake', PhotographsReason.SOME_ARE_WRONG)
     if facts.frames < MIN_FRAMES:
         return decide('more', PhotographsReason.TOO_FEW_FRAMES)

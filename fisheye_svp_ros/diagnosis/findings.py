@@ -208,9 +208,12 @@ class FlawKind(Enum):
     CENTER_VARIES = 5
     FRAMES_DIFFER = 6
     NO_FIT = 7
-    LENS_UNKNOWN = 8
-    ANGLE_SHORT = 9
-    OFF_CENTER = 10
+    FEW_FRAMES = 8
+    SIDES_DIFFER = 9
+    NOISE_TOO_LARGE = 10
+    LENS_UNKNOWN = 11
+    ANGLE_SHORT = 12
+    OFF_CENTER = 13
 
     @property
     def is_unit(self) -> bool:
@@ -229,9 +232,11 @@ class Flaw:
 
     size, beside: of a length, m, and the largest one that is possible; of mixed cameras and other
     misfits, px rms that is left and noise of a coordinate; of a focal length, its relative range,
-    of a center, its rms, px, and how many times noise that is; of rays the error, rad, and that of
-    a coordinate of an image point; of an angle, rad, those that points and the lens reach; of a
-    center, px off in u and v.
+    of a center, its rms, px, and the rms angle, rad, that rays of a frame are off for it; of few
+    frames, how many there are and are needed; of a flat board that is seen from both sides, how
+    many frames see the side that fewer see, and all; of noise, px of a coordinate, and the most
+    that is plausible; of rays at 1 m, rad, the bound (97.5 %) and what is good enough; of an
+    angle, rad, those that points and the lens reach; of a center, px off in u and v.
     groups: frames by number, those of each camera or state, or those that differ most; names: the
     photographs of these, as far as they are known; mirror: which one, of mirrored points.
     """

@@ -24,15 +24,17 @@ from fisheye_svp_ros.diagnosis.null_model import (
     prior_products,
 )
 from fisheye_svp_ros.diagnosis.random_effects import (
+    BEND,
     MILLIMETRE,
     NAMES,
     SAG,
     ImageGrid,
     RandomEffects,
+    board_bends,
     make_random_effects,
 )
 from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
-from fisheye_svp_ros.effects.target_map import at_landmarks
+from fisheye_svp_ros.effects.target_map import KnownTarget, at_landmarks
 from fisheye_svp_ros.mixed_model import (
     Equations,
     FactoredEquations,
@@ -243,6 +245,18 @@ class FittedModel:
         shared = self.factored.equations.split(self.solution.e, self.solution.r)[2]
         sag = self.random.columns.shared_label == NAMES.index(SAG)
         return np.asarray(shared[sag].reshape(-1, 3, 3))
+
+    def frame_coefficients(self, *names: str) -> Array:
+        """Return what frames are predicted to have of their own (F, B), by some components."""
+        group = self.factored.equations.split(self.solution.e, self.solution.r)[0]
+        label = self.random.columns.group_label  # after the columns of the pose
+        own = group[:, group.shape[1] - len(label) :]
+        return np.asarray(own[:, np.isin(label, [NAMES.index(name) for name in names])])
+
+    def frame_bends(self) -> Array:
+        """Return by how much landmarks leave their boards in each frame (F, L), mm."""
+        target = KnownTarget.from_views(self.linear.data.views)
+        return board_bends(target, self.frame_coefficients(BEND))
 
     def target_modes(self, sigma: float) -> tuple[Array, Array]:
         """Return how far the landmarks may be off: modes (L, 3, K) and alone (L, 3), m.

@@ -67,7 +67,8 @@ def compare_lens_files(evaluation: Evaluation) -> FileFigure:
 
     The target and the offsets of its landmarks are those that the other frames predict with the
     extended lens, for both lenses; that favors the extended one.  An image field that is written
-    is of the extended lens alone.
+    is of the extended lens alone.  A lens that was calibrated from these data has learned from the
+    frame, too: both are fitted without it.
     """
     if evaluation.medium is not None:  # the lens as given is one in air
         gain = evaluation.gains['named']
@@ -90,9 +91,13 @@ def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
     residual = np.zeros((*linear.residual.shape, 2))
     _, rows, fields = null.leave_one_out(at)
     has_field = evaluation.written_field is not None and bool(evaluation.written_field.fields)
+    lenses = evaluation.problem.inputs.lenses.values()
+    both_change = all(_is_of_these_data(evaluation, lens) for lens in lenses)
     for frame, information in enumerate(null.information_without_frames(at)):
         change, added, combination = shifts.refit(null, information)
-        new = np.append(now + change - given, np.zeros(len(shifts.columns)))
+        # Without the frame, a lens that was fitted to it changes as the extended one does.
+        between = now - given if both_change else now + change - given
+        new = np.append(between, np.zeros(len(shifts.columns)))
         off = np.where(of_lens, new * null.scale[at[:-1]] + added, 0.0)
         off[: len(refit_rig)] -= refit_rig @ off
         residual[frame] = (rows[frame] @ combination)[:, None]

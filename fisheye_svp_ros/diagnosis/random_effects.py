@@ -22,7 +22,7 @@ from fisheye_svp_ros.scene.boards import Board, find_boards
 from fisheye_svp_ros.solve.rig_state import Linearization
 
 MILLIMETRE = 1e-3  # unit of offsets on the target
-SAG = 'frame_sag'
+BEND, SAG = 'frame_bend', 'frame_sag'
 STAGE_OF = {
     'image_broad': 'lens',
     'image_coarse': 'lens',
@@ -39,7 +39,7 @@ STAGE_OF = {
     'frame_linear': 'frame',
     'frame_quadratic': 'frame',
     'frame_bumps': 'frame',
-    'frame_bend': 'frame',
+    BEND: 'frame',
     SAG: 'frame',
 }
 NAMES = tuple(STAGE_OF)
@@ -281,7 +281,7 @@ def _frame_columns(points: _Points, compact: bool) -> tuple[Array, Index]:
         bumps = bumps.reshape(*mine.shape, -1) * weight[..., None]
         bumps = _compact_columns(bumps) if compact else bumps
         blocks.append(('frame_bumps', _on_both_axes(bumps)))
-    blocks.append(('frame_bend', _bend_columns(points)))
+    blocks.append((BEND, _bend_columns(points)))
     columns = np.concatenate([block for _, block in blocks], axis=-1)
     label = np.repeat(
         [NAMES.index(name) for name, _ in blocks], [block.shape[-1] for _, block in blocks]
@@ -307,6 +307,23 @@ def _bend_columns(points: _Points) -> Array:
     mine = board[..., None] == np.arange(len(known.boards))
     columns = bend[..., None, :] * mine[..., None, :, None]
     return np.asarray(columns.reshape(*columns.shape[:3], -1))
+
+
+def board_bends(target: KnownTarget, coefficients: Array) -> Array:
+    """Return by how much landmarks leave their boards in each frame (F, L), mm.
+
+    coefficients (F, 3 boards): of the columns of `frame_bend`.  A plane is in the poses, and taken
+    out.
+    """
+    known = _Landmarks.of_target(target)
+    x, y = known.at.T
+    powers = np.stack([x * x, x * y, y * y], axis=-1)
+    heights = np.zeros((len(coefficients), len(x)))
+    for board in range(len(known.boards)):
+        mine = known.board_of == board
+        shape = _remove_polynomial(powers[mine], known.at[mine], 1)
+        heights[:, mine] = coefficients[:, 3 * board : 3 * board + 3] @ shape.T
+    return heights
 
 
 def _sag_columns(

@@ -161,7 +161,7 @@ def component_significance(null: NullModel) -> dict[str, float]:
     }
 
 
-def significant_components(components: list[Component]) -> list[Component]:
+def significant_components(components: Sequence[Component]) -> list[Component]:
     """Return the random components that are there beyond chance."""
     held = [c for c in components if c.name in (*NAMES, REPEATED_COMPONENT)]
     return [c for c in held if c.p_value * len(NAMES) < SIGNIFICANCE]

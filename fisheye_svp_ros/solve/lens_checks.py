@@ -11,6 +11,7 @@ from fisheye_svp_ros.optics.lens import Lens
 
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
 _MAX_CENTER_OFFSET = 0.1  # of the image, by which a principal point is seldom off its center
+_MIN_SMALLER_SHARE, _SHARE_TOLERANCE = 0.05, 0.01  # of the image
 _MIN_COVERED_RADIUS = 0.7  # of the way to the nearest edge; less is poor coverage
 _ANGLE_SLACK = np.radians(2.0)  # past the outermost point of a calibration: as good as there
 
@@ -20,21 +21,34 @@ class ImageCoverage(NamedTuple):
 
     offset: of the principal point from the center of the image, px; size: of the image, px;
     radius, edge: of the outermost image point and of the nearest edge of the image from the
-    principal point, px.
+    principal point, px; farthest: the largest u and v of image points, px.
     """
 
     offset: tuple[float, float]
     size: tuple[int, int]
     radius: float
     edge: float
+    farthest: tuple[float, float]
 
     @property
     def is_off_center(self) -> bool:
         """Whether the principal point is where few cameras have theirs."""
-        return any(
-            abs(off) > _MAX_CENTER_OFFSET * size
-            for off, size in zip(self.offset, self.size, strict=True)
-        )
+        shares = [off / size for off, size in zip(self.offset, self.size, strict=True)]
+        return max(map(abs, shares)) > _MAX_CENTER_OFFSET or self.smaller_size is not None
+
+    @property
+    def smaller_size(self) -> tuple[int, int] | None:
+        """The size of an image, smaller by one factor, whose center the principal point is.
+
+        None where points lie beyond it, or the center is off by another share of each side:
+        an image that is stated too large leaves both.
+        """
+        shares = [-off / size for off, size in zip(self.offset, self.size, strict=True)]
+        share = sum(shares) / 2
+        smaller = tuple(round(size * (1 - 2 * share)) for size in self.size)
+        fits = all(far < size for far, size in zip(self.farthest, smaller, strict=True))
+        alike = abs(shares[0] - shares[1]) < _SHARE_TOLERANCE
+        return (smaller[0], smaller[1]) if share > _MIN_SMALLER_SHARE and alike and fits else None
 
     @property
     def is_extrapolated(self) -> bool:
@@ -46,7 +60,10 @@ def image_coverage(lens: Lens, uv: Array) -> ImageCoverage:
     """Return where image points uv (N, 2), px, lie in the image of a lens."""
     off = lens.cx - (lens.width - 1) / 2, lens.cy - (lens.height - 1) / 2
     out = float(np.linalg.norm(uv - (lens.cx, lens.cy), axis=-1).max())
-    return ImageCoverage(off, (lens.width, lens.height), out, _nearest_edge(lens))
+    far = uv.max(axis=0).tolist()
+    return ImageCoverage(
+        off, (lens.width, lens.height), out, _nearest_edge(lens), (far[0], far[1])
+    )
 
 
 def _nearest_edge(lens: Lens) -> float:

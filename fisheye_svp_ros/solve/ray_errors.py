@@ -6,7 +6,7 @@ A change of the camera frame that is common to all ranges is a convention, and t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import inf
+from math import hypot, inf
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import Lens
 
 RANGES = (0.3, 1.0, 5.0)  # m
+MAX_RAY_ERROR = 1e-3  # rad at 1 m: 1 mm, with which robots dock and grasp; more is worth a word
 _STEP = 1e-3  # of a standard error
 SAMPLES = 1000
 _POINTS = 300  # image points that stand for all
@@ -32,6 +33,11 @@ class RayError(NamedTuple):
     value: float
     low: float
     high: float
+
+    def in_quadrature(self, more: float) -> RayError:
+        """Return the error with an independent one, rad, beside it."""
+        sizes = (self.value, self.low, self.high)
+        return RayError(self.range_m, *(hypot(size, more) for size in sizes))
 
     def in_mrad(self) -> dict[str, float]:
         """Return the numbers by name, angles in mrad."""

@@ -230,8 +230,8 @@ def test_views_of_cameras_without_a_rig_are_counted_as_views():
     )
     said = 'in 8 views of 4 frames (each view with its own pose)'
     assert said in first_screen(found, 'table').facts
-    why = diagnosis_document(found)['decision']['photographs']['why']
-    assert why.startswith('8 views')
+    facts = found.decision['photographs'].facts
+    assert (facts.frames, facts.unit) == (8, 'view')
 
 
 def test_a_center_that_the_rig_absorbs_is_no_gain_of_the_extended_lens():

@@ -111,13 +111,13 @@ def _lens(document: Document) -> Iterator[str]:
     if say == 'keep':
         if any(CATALOGUE[one['effect']].budget_stage() == 'lens' for one in causes):
             yield 'the lens is kept beside a cause in it'
-        costs = {one['effect']: one['edge_px'] for one in lens['bound']}
+        costs = {one['effect']: one['edge_mrad'] for one in lens['bound']}
         for entry in (*document['candidates'], *document['lens'].get('averaged_shift', [])):
             effect = entry.get('effect', 'viewpoint_shift')
             likely = entry.get('weight', entry.get('probability')) > 0.5
             of_lens = CATALOGUE[effect].budget_stage() == 'lens'
-            if likely and of_lens and costs[effect] > document['noise_px']:
-                yield f'the lens is kept beside a likely {effect} that costs more than noise'
+            if likely and of_lens and costs[effect] > 1.0:
+                yield f'the lens is kept beside a likely {effect} that costs over 1 mrad'
     if say == 'recalibrate' and lens['figure']['name'] == 'ray_error' and rays:
         most = max(one['value'] for one in rays['given'] if one['range_m'] == 1.0)
         if lens['figure']['value'] > most:

@@ -9,11 +9,10 @@ from fisheye_svp_ros.diagnosis.evaluation import Figures
 TARGET = TargetFacts(
     largest=TargetError('target_shape', 0.81e-3, board=0),
     gain=(0.82, 0.76, 1.0),
-    named_px=0.137,
     local_px=0.05,
     local_m=4e-5,
     local_p=1e-6,
-    noise_px=0.043,
+    pose_error=0.4e-3,
     contradicted=False,
     frames=12,
 )

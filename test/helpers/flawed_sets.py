@@ -45,17 +45,24 @@ def board(columns=9, rows=6, square=0.03):
     return np.column_stack([square * x.ravel(), square * y.ravel(), np.zeros(x.size)])
 
 
-def draw_views(rng, points, frames, angle=0.9, near=0.2, far=0.45, tilt=0.5):
-    """Return landmarks (F, N, 3) in the camera frame, middles up to an angle off the axis."""
+def draw_views(rng, points, frames, angle=0.9, near=0.2, far=0.45, tilt=0.5, bend=0.0):
+    """Return landmarks (F, N, 3) in the camera frame, middles up to an angle off the axis.
+
+    bend: rms, m, of a bend of the board about one axis, another one in each frame.
+    """
     views = []
     middle = points.mean(axis=0)
+    bends = np.random.default_rng(frames).normal(size=frames)
+    shape = ((points[:, 0] - middle[0]) / np.ptp(points[:, 0])) ** 2
+    shape = (shape - shape.mean()) / shape.std()
     for i in range(frames):
         off = angle * np.sqrt((i % frames + 0.5) / frames)
         around = 2.4 * i + rng.uniform(0, 0.5)
         to_axis = rotation_from_vector(off * np.array([-np.sin(around), np.cos(around), 0.0]))
         turn = rotation_from_vector(rng.uniform(-tilt, tilt, 3) * [1, 1, 2])
         place = to_axis @ [0.0, 0.0, rng.uniform(near, far)]
-        views.append((points - middle) @ (to_axis @ turn).T + place)
+        bent = points - middle + np.outer(shape, [0, 0, bend * bends[i]])
+        views.append(bent @ (to_axis @ turn).T + place)
     return np.array(views)
 
 

@@ -489,7 +489,7 @@ def test_no_plan_is_promised_that_the_target_does_not_allow(found: Diagnosis) ->
 
 def test_photographs_are_named_only_beside_what_to_do_with_them(found: Diagnosis) -> None:
     """Once "Enough: frame 3. 16 frames, ..." did not say what was to be done with frame 3."""
-    bad = replace(found, advice=[Advice(Action.RETAKE, frames=[3])])
+    bad = replace(found, advice=[Advice(Action.CHECK_FRAMES, frames=[3])])
     for say, names in (('enough', []), ('more', []), ('retake', ['frame 3'])):
         action = first_screen(_deciding(bad, 'photographs', say=say), 'table').actions[2]
         assert [photo.name for photo in action.photographs] == names

@@ -77,6 +77,11 @@ def accuracy(d: Diagnosis) -> str:
         f'at {rays.range_m:g} m (95 %: {used["low"]:.2g} to {used["high"]:.2g}), {rays.ratio:.1f} '
         f'times the noise of a point{other}{_whichever(d)}'
     )
+    if d.adequacy.frames_error:
+        words += (
+            f'; those of a single frame by {1e3 * d.adequacy.frames_error:.2g} mrad more, since '
+            'the camera changes from frame to frame'
+        )
     if d.decision['lens'].say == 'undecided' and not d.adequacy.flaws:
         words += '; meanwhile use it only where that is good enough'
     claimed = min(lens.max_incidence for lens in d.lenses.values())

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis import Flaw, FlawKind
+from fisheye_svp_ros.diagnosis import MIN_FRAMES, Flaw, FlawKind
 from fisheye_svp_ros.reporting.wording.inputs import MIRROR_REMEDY, MIRROR_WORDS
 
 _COUNTS = {2: 'two', 3: 'three', 4: 'four'}
@@ -25,7 +25,10 @@ _REMEDIES = {
     FlawKind.CENTER_VARIES: 'switch off stabilization and cropping, and take all again',
     FlawKind.FRAMES_DIFFER: 'check that all frames are of one camera, one size and one board',
     FlawKind.NO_FIT: 'check order and units of the points, image size and model',
-    FlawKind.LENS_UNKNOWN: 'take nearer and tilted views of a larger board',
+    FlawKind.FEW_FRAMES: f'take {MIN_FRAMES} or more, tilted, and out to the edges of the image',
+    FlawKind.SIDES_DIFFER: 'number the corners alike in all frames, none of them mirrored',
+    FlawKind.NOISE_TOO_LARGE: 'check sharpness, detector and the order of the corners',
+    FlawKind.LENS_UNKNOWN: 'take more near and tilted views, out to the edges of the image',
     FlawKind.ANGLE_SHORT: 'take photographs with the board near the edges of the image',
     FlawKind.OFF_CENTER: 'check the image size, and that images are not cropped',
 }
@@ -34,7 +37,10 @@ _OF_LENS_MISFIT = {
     True: 'until then, trust no lens, pose or size from these data',
 }
 _OF_LENS = {
-    FlawKind.LENS_UNKNOWN: 'its parameters are hardly determined',
+    FlawKind.FEW_FRAMES: 'so few frames do not tell its errors from those of the board',
+    FlawKind.SIDES_DIFFER: 'its rays may be right, but the poses of some frames are mirrored',
+    FlawKind.NOISE_TOO_LARGE: 'such points may be wrong in ways that no noise is',
+    FlawKind.LENS_UNKNOWN: 'more photographs would make it better',
     FlawKind.ANGLE_SHORT: 'beyond its points, its curve is extrapolated',
     FlawKind.OFF_CENTER: 'no sound image has its center there',
 }
@@ -76,10 +82,23 @@ def flaw_statement(flaw: Flaw) -> str:
         )
     if flaw.kind == FlawKind.NO_FIT:
         return f'no camera fits: {flaw.size:.2g} px are left ({_noise(flaw)})'
+    if flaw.kind == FlawKind.FEW_FRAMES:
+        count = f'{flaw.size:.0f} frames are' if flaw.size > 1 else 'one frame is'
+        return f'{count} too few to judge the lens'
+    if flaw.kind == FlawKind.SIDES_DIFFER:
+        return (
+            f'{flaw.size:.0f} of {flaw.beside:.0f} frames see the board from behind, so their '
+            f'corners are numbered in mirrored order: {groups[0]}'
+        )
+    if flaw.kind == FlawKind.NOISE_TOO_LARGE:
+        return (
+            f'the noise of the image points is {flaw.size:.1f} px, far more than a detector '
+            'leaves (0.02 to 0.3 px)'
+        )
     if flaw.kind == FlawKind.LENS_UNKNOWN:
         return (
-            f'these views leave the lens{of} open, even where points are: a ray may be off by '
-            f'{flaw.size / 2**0.5 / flaw.beside:.1f} times the noise of a point'
+            f'these views leave rays{of} uncertain by up to {1e3 * flaw.size:.2g} mrad '
+            f'({1e3 * flaw.size:.2g} mm at 1 m)'
         )
     if flaw.kind == FlawKind.ANGLE_SHORT:
         return (

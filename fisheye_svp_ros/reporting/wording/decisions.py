@@ -44,7 +44,7 @@ _ACTIONS = {
     Action.VARY_VIEWS: 'take photographs from more different poses: errors of landmarks repeat in '
     'similar ones{soon} and do not average out. Check that the paper is flat, nothing reflects, '
     'and nothing is printed near the corners',
-    Action.RETAKE: 'take these photographs again: they scatter more than the others',
+    Action.RETAKE: 'look at these photographs: they scatter more than the others (light, blur)',
     Action.CHECK_VIEWS: f'check these photographs: {VIEW}',
     Action.CHECK_FRAMES: f'check these photographs: {FRAME}',
     Action.CHECK_HELD_OUT_VIEWS: f'check these held-out photographs: {VIEW}',
@@ -97,9 +97,6 @@ def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
         LensReason.RAYS_BETTER: 'the expected error of its rays is '
         f'{facts.rays[1]:.2g} mrad, of the lens as given {facts.rays[0]:.2g} mrad'
         f'{_unconfirmed_clause(facts)}',
-        LensReason.LENS_ALONE_PREDICTS_WORSE: f'held-out error {pixels(file.extended_px)} px with '
-        f'the extended lens alone, {pixels(file.given_px)} px with the lens as given; only '
-        'all causes together reduce it',
         LensReason.GAIN_UNCERTAIN: f'it is not certain that {", ".join(facts.lens_causes)} in the '
         f'lens reduces the held-out error ({pixels(file.given_px)} → '
         f'{pixels(file.extended_px)} px): its probability is {100 * file.sure:.0f} %',
@@ -175,18 +172,30 @@ def _target_reasons(facts: TargetFacts) -> dict[TargetReason, str]:
             f'{facts.local_px:.2g} px'
         )
     largest = target_error(facts.largest) if facts.largest else ''
-    return {
+    reasons = {
         TargetReason.CAMERAS_CONTRADICT: 'the cameras contradict each other about its shape',
         TargetReason.CORRECTION_GAINS: f'{largest}; held-out frames confirm it',
         TargetReason.CORRECTION_GAINS_NOTHING: f'{largest}; the correction does not lower the '
         'held-out error significantly',
-        TargetReason.CAUSE_AND_OFFSETS: f'{largest}; in addition, {local}',
+        TargetReason.CAUSE_AND_OFFSETS: f'{largest}; in addition, {local} and '
+        f'{1e3 * facts.pose_error:.2g} mrad in poses on it',
         TargetReason.ONE_FRAME: f'its errors are unknown: {_ONE_FRAME}',
-        TargetReason.OFFSETS_ABOVE_NOISE: f'{local}, more than the noise of '
-        f'{facts.noise_px:.2g} px',
-        TargetReason.OFFSETS_BELOW_NOISE: f'{local}, less than the noise',
+        TargetReason.OFFSETS_COST: f'{local} and {1e3 * facts.pose_error:.2g} mrad in poses on it',
+        TargetReason.OFFSETS_HARMLESS: f'{local} and only {1e3 * facts.pose_error:.2g} mrad in '
+        'poses on it',
         TargetReason.BELOW_NOISE: 'its errors are below the noise',
     }
+    return {reason: text + _bend_clause(facts) for reason, text in reasons.items()}
+
+
+def _bend_clause(facts: TargetFacts) -> str:
+    """Return by how much the board bends from frame to frame, and the remedy; '' for nothing."""
+    if not facts.bend_m:
+        return ''
+    return (
+        f'; it bends from frame to frame by {1e3 * facts.bend_m:.2g} mm rms, '
+        f'{100 * facts.bend_share:.0f} % of what is left beside noise: mount it on a stiff plate'
+    )
 
 
 def target_error(error: TargetError) -> str:
@@ -208,9 +217,7 @@ def _photographs_reasons(facts: PhotographsFacts) -> dict[PhotographsReason, str
     """Return the clause of each reason."""
     count, unit = facts.frames, facts.unit
     bad, unlike = len(facts.bad), len(facts.unlike)
-    wrong = 'scatter more than the others or are outliers'
-    if bad == 1:
-        wrong = 'scatters more than the others or is an outlier'
+    wrong = 'are outliers' if bad > 1 else 'is an outlier'
     few = f'one {unit} is' if count == 1 else f'{count} {unit}s are'
     remedy = 'cover the image to its edge, at different distances'
     if facts.plannable:

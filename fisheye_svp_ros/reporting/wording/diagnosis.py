@@ -119,8 +119,8 @@ def _of_flawed_data(d: Diagnosis, words: str, lens: str) -> str:
     decision, kinds = d.decision['lens'], {flaw.kind for flaw in d.adequacy.flaws}
     if decision.say == 'use_extended':
         return f'{words} for now; take more photographs'
-    if decision.say == 'undecided' and FlawKind.LENS_UNKNOWN in kinds:
-        return f'Do not rely on {lens}; take more photographs'
+    if decision.say == 'undecided' and kinds == {FlawKind.LENS_UNKNOWN}:
+        return f'Use {lens} only where that is good enough, or take more photographs'
     # Where points are, nothing speaks against it.
     if kinds == {FlawKind.ANGLE_SHORT} and decision.reason is LensReason.NO_CAUSE_CONFIRMED:
         angle = math.degrees(min(flaw.size for flaw in d.adequacy.flaws))
