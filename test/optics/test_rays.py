@@ -21,7 +21,7 @@ SHIFTS = {
 
 
 def crossings(shift: Gennery) -> np.ndarray:
-    """Return the distances, m, at which rays of the grid meet their neighbors ahead of the axis."""
+    """Return the distances, m, at which rays of the grid meet neighbors ahead of the axis."""
     theta = np.linspace(0.0, LIMIT, 257)[1:]
     near = theta - 1e-6
 
