@@ -165,7 +165,9 @@ def _run(arguments: Sequence[str]) -> None:
     if unknown:
         chosen = commands.choices[named]
         _refuse(chosen, unknown[0], chosen.format_help().split(), 'argument')
-    import_module('fisheye_svp_ros.commands.outputs').check_output(parsed)
+    checks = 'fisheye_svp_ros.commands.applicability', 'fisheye_svp_ros.commands.outputs'
+    import_module(checks[0]).check_options(named, parsed, commands.choices[named])
+    import_module(checks[1]).check_output(parsed)
     if named not in _SIGNAL_HANDLERS:  # nodes have it compiled in the background
         _choose_engine(getattr(parsed, 'engine', None))
     with _tidy(named):

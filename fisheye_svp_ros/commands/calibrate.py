@@ -135,11 +135,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Calibrate, print the parameters, write the lens, or two lenses and the rig."""
-    if args.lens and not (args.medium or args.port):
-        raise ParameterError(
-            f'--lens {args.lens} needs --medium (for example water) or --port: '
-            'what the camera looked through'
-        )
     observations, sizes = read_input(args.observations, args)
     sizes = _known_sizes(args, observations, sizes)
     if not args.board:
@@ -196,6 +191,10 @@ def _known_sizes(args: argparse.Namespace, observations: Observations, sizes: Si
     Raises ParameterError where one is unknown, or another one than `detect` found.
     """
     check_size_given(args.observations, sizes, args.image_size or {}, '--image-size')
+    other = [name for name in args.image_size or {} if name and name not in observations.cameras]
+    if other:
+        held = ', '.join(filter(None, observations.cameras)) or 'one camera without a name'
+        raise ParameterError(f'--image-size {other[0]}=...: the observations hold {held}')
     sizes = args.image_size or sizes or sizes_beside(Path(args.observations))
     if args.lens:
         air = load_with_notes(args.lens)

@@ -217,9 +217,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _check_options(args: argparse.Namespace) -> None:
-    """Raise ParameterError for options that need another one or contradict each other."""
-    if (args.number or args.room) and not args.count:
-        raise ParameterError('--for and --room need --next N')
+    """Raise ParameterError for options that contradict each other."""
     for name in args.included:
         if name in args.left_out:
             raise ParameterError(

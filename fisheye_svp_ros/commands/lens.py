@@ -16,7 +16,6 @@ from fisheye_svp_ros.commands.outputs import output_file
 from fisheye_svp_ros.effects.extension import LANDMARKS
 from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.effects.resizing import ImageChange
-from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file, save_lens
 from fisheye_svp_ros.io.lens_formats import (
@@ -85,10 +84,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Show the lens, write it, say what the form cannot hold."""
-    if args.format and not args.output:
-        raise ParameterError(f'--format {args.format} needs -o FILE')
-    if args.range_m is not None and not args.format:
-        raise ParameterError(f'--range {args.range_m:g} needs --format, for example ros')
     path = typed_lens_path(args.lens)
     foreign = read_lens_file(path)
     changed = (args.crop, args.scale, args.size) != (None, None, None)

@@ -29,7 +29,6 @@ from fisheye_svp_ros.commands.notes import (
 )
 from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.csv_files import write_table
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.readers import check_sizes, write_poses
@@ -81,8 +80,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Localize every frame, print the poses, write the results."""
-    if args.rig and args.model_error:
-        raise ParameterError('--model-error works for one camera at a time; leave --rig out')
     given = load_lenses(args.lens)
     observations, sizes = read_input(args.observations, args)
     lenses = lenses_of(observations.cameras, given)

@@ -146,14 +146,6 @@ def run(args: argparse.Namespace) -> None:
 
 def _of_random_poses(args: argparse.Namespace) -> tuple[int, Ranges]:
     """Return number and ranges of random poses; raise ParameterError where nothing has them."""
-    for option, given in (('--count', args.count), ('--ranges', args.ranges)):
-        if args.poses and given is not None:
-            raise ParameterError(f'{option} is of random poses; leave out {option} or --poses')
-    if args.target == 'room' and args.ranges:
-        raise ParameterError(
-            '--ranges is of one board or a cube; the poses in a room are inside '
-            'it: leave --ranges out'
-        )
     count = _COUNT if args.count is None else args.count
     near, far = args.ranges or _RANGES
     if count < 1 or not 0 < near <= far < np.inf:

@@ -197,6 +197,8 @@ def run(args: argparse.Namespace) -> None:
     """Map the photographs, write maps and cameras, say what is left at other ranges."""
     every, paths = _rectifications(args)
     sides, pair = every.sides, every.pair
+    if args.range_m != RANGE and not pair and all(one.lens.is_svp for one in sides.values()):
+        say(f'--range {args.range_m:g} changes nothing: the lens has a single viewpoint')
     # Pictures of an earlier run are replaced, those of a camera are not.
     fresh = not (args.output / _RESULT).exists()
     with (

@@ -1,0 +1,93 @@
+"""Which options apply to what: one that would have no effect is refused."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from fisheye_svp_ros.errors import ParameterError
+
+
+class Rule(NamedTuple):
+    """Options of commands, when they apply, and what is said of one that does not."""
+
+    commands: tuple[str, ...]
+    options: tuple[str, ...]
+    applies: Callable[[argparse.Namespace], object]
+    reason: str
+
+
+def _has_photographs(args: argparse.Namespace) -> bool:
+    """Whether an input is no table: with a board, it is searched."""
+    inputs = (args.observations, getattr(args, 'held_out', None), getattr(args, 'against', None))
+    return any(Path(path).suffix.lower() != '.csv' for path in inputs if path)
+
+
+_READING = ('calibrate', 'diagnose', 'localize')
+_DESTINATIONS = {'--for': 'number', '--range': 'range_m', '--next': 'count'}  # unlike the option
+RULES = (
+    Rule(
+        _READING,
+        ('--board',),
+        _has_photographs,
+        'has no effect on a CSV file, which holds its landmarks; leave it out',
+    ),
+    Rule(
+        _READING,
+        ('--detector', '--every', '--sync', '--split'),
+        lambda args: args.board and _has_photographs(args),
+        'has an effect on photographs alone, with --board; leave it out',
+    ),
+    Rule(
+        ('calibrate',),
+        ('--lens',),
+        lambda args: args.medium or args.port,
+        'needs --medium (for example water) or --port: what the camera looked through',
+    ),
+    Rule(
+        ('calibrate',),
+        ('--model', '--image-size'),
+        lambda args: not args.lens,
+        'has no effect beside --lens, whose curve and image are used; leave it out',
+    ),
+    Rule(('diagnose',), ('--for', '--room'), lambda args: args.count, 'needs --next N'),
+    Rule(('lens',), ('--format',), lambda args: args.output, 'needs -o FILE'),
+    Rule(('lens',), ('--range',), lambda args: args.format, 'needs --format, for example ros'),
+    Rule(
+        ('localize',),
+        ('--model-error',),
+        lambda args: not args.rig,
+        'works for one camera at a time; leave --rig out',
+    ),
+    Rule(
+        ('render',),
+        ('--count', '--ranges'),
+        lambda args: not args.poses,
+        'is of random poses; leave out it or --poses',
+    ),
+    Rule(
+        ('render',),
+        ('--ranges',),
+        lambda args: args.target != 'room',
+        'is of one board or a cube; the poses in a room are inside it: leave it out',
+    ),
+    Rule(
+        ('undistort',),
+        ('--split',),
+        lambda args: len(args.inputs) > (0 if args.lens else 1),
+        'has an effect on photographs alone, and none is given; leave it out',
+    ),
+)
+
+
+def check_options(command: str, args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """Raise ParameterError for an option that does not apply; parser: of the command."""
+    for rule in RULES:
+        for option in rule.options if command in rule.commands else ():
+            name = _DESTINATIONS.get(option, option.removeprefix('--').replace('-', '_'))
+            if name not in args or getattr(args, name) == parser.get_default(name):
+                continue
+            if not rule.applies(args):
+                raise ParameterError(f'{option} {rule.reason}')
