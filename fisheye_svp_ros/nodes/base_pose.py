@@ -13,7 +13,7 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.quality import TRANSFORMS
 from fisheye_svp_ros.nodes.transforms import FrameListener, TransformPublisher
-from fisheye_svp_ros.pose import carried_pose
+from fisheye_svp_ros.pose import Pose, carried_pose
 from fisheye_svp_ros.solve.pose_gate import (
     GatedPose,
     GateLimits,
@@ -72,6 +72,10 @@ class BasePose:
         self._publisher = node.announce(PoseWithCovarianceStamped, '~/base_pose')
         self._transforms = TransformPublisher(node, bool(odom))
 
+    def mount(self, frame: str, stamp: int) -> Pose | None:
+        """Return the base in the frame of a camera; None where there is none, or it is unknown."""
+        return self._frames.find(frame, self._base, stamp) if self._base else None
+
     def publish(self, camera: GatedPose, stamp: int, world: str, frame: str) -> str:
         """Publish the base that carries a camera; return why not, or what is doubtful in it.
 
@@ -79,7 +83,7 @@ class BasePose:
         """
         if not self._base:
             return ''
-        mount = self._frames.find(frame, self._base, stamp)
+        mount = self.mount(frame, stamp)
         if mount is None:
             self._node.warn(
                 f'no base_pose: /tf_static has no chain from {self._base!r} (base_frame) to '

@@ -13,6 +13,7 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.tag_maps import read_tag_map
 from fisheye_svp_ros.nodes import messages
@@ -27,6 +28,7 @@ from fisheye_svp_ros.nodes.validation import Items, KnownPoints
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
+from fisheye_svp_ros.scene.pose_priors import PlanarPrior
 from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.solve.pose_gate import GatedPose
 from fisheye_svp_ros.study.settings import LocalizerSettings
@@ -92,7 +94,18 @@ class Localizer(SolverNode):
         """Refuse a lens that cannot be loaded, or does not know its errors where they count."""
         if settings.model_error and settings.lens not in ('', CAMERA_INFO):
             _errors_of(lens_of(settings.lens, 1.0, settings))
+        if settings.planar and not settings.base_frame:
+            raise ParameterError('planar without base_frame; name the base that drives on a plane')
         return super().prepare(settings)
+
+    def _prior(self, camera: str, stamp: int) -> PlanarPrior | None:
+        """Return what is known of the camera (1,) of a base that drives on a plane, if it does."""
+        settings = self.settings
+        mount = self._base.mount(camera, stamp) if settings.planar else None
+        if mount is None:
+            return None
+        sigma = np.array([[settings.planar_std_m, settings.planar_std_rad]])
+        return PlanarPrior(mount.take(None), np.array([settings.planar_height]), sigma)
 
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Localize the camera of one set; raise GeometryError where its points fix no pose."""
@@ -102,11 +115,12 @@ class Localizer(SolverNode):
         if errors is not None:
             sigma = errors.inflate_sigma(self.settings.sigma_px)
             views = views._replace(weight=np.full_like(views.weight, 1 / sigma))
+        camera = self.settings.camera_frame or points.frame
+        views = views._replace(prior=self._prior(camera, stamp))
         true: Pose | None = items.get('true_pose')
         solved = self._localize(stamp, model, views, true).require(self.settings.gate)
         solution = solved.solution
         pose, world = solution.pose.take(0), landmarks.frame
-        camera = self.settings.camera_frame or points.frame
         covariance = solution.covariance
         if errors is not None:
             covariance = errors.of_solved_poses(views, solution, None).total

@@ -16,6 +16,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Batch, Index, Mask
 from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.scene.pose_priors import PlanarPrior
 
 SPREADS = ('whole', 'inner', 'outer')
 RADII = (2.0, 0.5, 0.2)
@@ -178,6 +179,7 @@ class _Views(NamedTuple):
     camera: Index
     row: Index
     landmark_covariance: Array | None = None
+    prior: PlanarPrior | None = None
 
 
 class Views(_Views, Batch):
@@ -185,7 +187,8 @@ class Views(_Views, Batch):
 
     points (S, N, 3), m; uv (S, N, 2), px; weight (S, N): 1 / sigma, 0 for padding; landmark,
     board (S, N); t (S, N), s; frame, camera (S,); row (S, N): row of the table, -1 for padding;
-    landmark_covariance (S, N, 3, N, 3), m^2: of the points, None where they are exact.
+    landmark_covariance (S, N, 3, N, 3), m^2: of the points, None where they are exact; prior (S,):
+    of the poses, None where nothing is known of them.
     """
 
     __slots__ = ()

@@ -13,6 +13,7 @@ from fisheye_svp_ros.optics.engines.results import PLANARITY
 from fisheye_svp_ros.optics.engines.results import Localization as Localization
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
+from fisheye_svp_ros.scene.pose_priors import PlanarPrior
 from fisheye_svp_ros.solve.initial_pose import candidate_poses, initial_poses
 from fisheye_svp_ros.solve.landmark_errors import generalized_equations
 from fisheye_svp_ros.solve.least_squares import (
@@ -40,7 +41,8 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
     small looks, tilted to one side, like tilted to the other, and the misfit has a minimum on
     either side (Schweighofer and Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014): both are tried.
     So are all minima of views with fewer than FEW_POINTS points that are not flat.
-    Landmarks that have a covariance are weighed by it (`solve.landmark_errors`).
+    Landmarks that have a covariance are weighed by it (`solve.landmark_errors`); a prior of the
+    views counts as further observations do.
     What a lens has that follows from motion (a rolling shutter) needs times: velocities are those
     between the poses of neighboring views.
     Raises GeometryError, naming the frame, for fewer than MIN_POINTS usable points.
@@ -111,17 +113,15 @@ def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localiza
             _improve(
                 model, views, found, few, candidate_poses(some.points, direction, some.weight)
             )
-    if views.landmark_covariance is not None:
+    if views.landmark_covariance is not None or views.prior is not None:
         rows = np.flatnonzero(found.converged)
         for first in range(0, len(rows), _VIEWS_AT_ONCE):
-            _weigh_landmarks(model, views, found, rows[first : first + _VIEWS_AT_ONCE])
+            _weigh(model, views, found, rows[first : first + _VIEWS_AT_ONCE])
     return found
 
 
-def _weigh_landmarks(
-    model: ForwardModel, views: Views, localization: Localization, rows: Index
-) -> None:
-    """Write to views (R,), solved by exact landmarks, what comes of their covariance."""
+def _weigh(model: ForwardModel, views: Views, localization: Localization, rows: Index) -> None:
+    """Write to views (R,), solved by exact landmarks alone, what their covariance and prior do."""
     before, seen = localization.take(rows), views.take(rows)
     weighed, two = _weigh_from(model, seen, before.pose), np.flatnonzero(np.isfinite(before.gap))
     if two.size:
@@ -131,11 +131,19 @@ def _weigh_landmarks(
         weighed.put(two[better], second.take(better))
         weighed.other.put(two, first.pose.where(better, second.pose))
         weighed.gap[two] = np.abs(second.cost - first.cost)
+    if seen.prior is not None:  # residuals are tested without it
+        weighed.cost[:] = np.maximum(weighed.cost - seen.prior.equations(weighed.pose)[0], 0.0)
     localization.put(rows, weighed._replace(iterations=before.iterations))
 
 
 def _weigh_from(model: ForwardModel, views: Views, pose: Pose) -> Localization:
-    """Return the minima (S,) near poses (S,), landmarks being weighed by their covariance."""
+    """Return the minima (S,) near poses (S,), landmarks being weighed by their covariance.
+
+    A prior may move a pose far that the image leaves open.
+    """
+    if views.prior is not None:
+        problem = _Localization(model, views._replace(landmark_covariance=None), views.prior)
+        pose = Pose(*levenberg_marquardt(problem, tuple(pose)).state)
     cost, (hessian, gradient) = pose_equations(model, pose, views)
     for _ in range(_WEIGHINGS):
         trial = pose.retract(solve_damped(hessian, gradient, np.zeros(len(cost))))
@@ -301,9 +309,11 @@ class _Localization:
 
     step = staticmethod(dense_step)
 
-    def __init__(self, model: ForwardModel, views: Views) -> None:
+    def __init__(
+        self, model: ForwardModel, views: Views, prior: PlanarPrior | None = None
+    ) -> None:
         self._model = model
-        self._views = views._replace(landmark_covariance=None)  # see `_weigh_landmarks`
+        self._views = views._replace(landmark_covariance=None, prior=prior)  # see `_weigh`
 
     def linearize(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         views = self._views
@@ -319,11 +329,15 @@ def pose_equations(model: ForwardModel, pose: Pose, views: Views) -> tuple[Array
     """Return costs (S,) and (H (S, 6, 6), g (S, 6)) of poses (S,), each the only unknown."""
     exact = views.landmark_covariance is None
     if exact and model.is_lens_only and model.lens.is_bare:
-        cost, *normal = engines.pose_equations(model.lens, *pose, views.solver_inputs)
-        return cost, tuple(normal)
-    linear = model.linearize(pose, views)
-    equations = normal_equations if exact else generalized_equations
-    return equations(linear.uv, model.d_pose(linear, views), views)
+        cost, hessian, gradient = engines.pose_equations(model.lens, *pose, views.solver_inputs)
+    else:
+        linear = model.linearize(pose, views)
+        equations = normal_equations if exact else generalized_equations
+        cost, (hessian, gradient) = equations(linear.uv, model.d_pose(linear, views), views)
+    if views.prior is not None:
+        more = views.prior.equations(pose)
+        cost, hessian, gradient = cost + more[0], hessian + more[1], gradient + more[2]
+    return cost, (hessian, gradient)
 
 
 def normal_equations(uv: Array, jacobian: Array, views: Views) -> tuple[Array, Arrays]:

@@ -18,6 +18,7 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
+from fisheye_svp_ros.scene.pose_priors import PRIOR_ROWS
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.landmark_errors import with_own_errors
 from fisheye_svp_ros.solve.least_squares import misfit_fails
@@ -149,7 +150,7 @@ def _examine(
     suspect = ~localization.converged | _suspect(own, localization, freedom, allowed)
     if tags:
         suspect |= ~tags_agree(model, views, localization, allowed)
-    result, reasons = localization, _far_reasons(views, localization)
+    result, reasons = localization, _place_reasons(views, localization)
     gross = np.zeros(views.used.shape, dtype=bool)
     if not suspect.any():
         return Examination(result, gross, tuple(reasons), None, np.ones(len(freedom)))
@@ -370,11 +371,21 @@ def _landmark_names(landmark: Index, size: Array, kind: str = 'landmark') -> str
     return f'{kind}{"s" if len(landmark) > 1 else ""} {names}{more}'
 
 
-def _far_reasons(views: Views, localization: Localization) -> list[str]:
+def _place_reasons(views: Views, localization: Localization) -> list[str]:
     away = np.linalg.norm(views.points - localization.pose.position[:, None], axis=-1)
     farthest = np.where(views.weight > 0, away, 0.0).max(axis=1)
     why = f'landmarks lie up to {farthest.max():.0f} m away; check that they are in meters'
-    return [why if far > _MAX_RANGE else '' for far in farthest]
+    reasons = [why if far > _MAX_RANGE else '' for far in farthest]
+    if views.prior is None:
+        return reasons
+    cost = views.prior.equations(localization.pose)[0]
+    why = 'height or tilt of the base is {:.3g} sigma off its plane: check planar_height and mount'
+    return [
+        _join_reasons(why.format(np.sqrt(one)) if fails else '', reason)
+        for one, fails, reason in zip(
+            cost, misfit_fails(cost, np.asarray(PRIOR_ROWS)), reasons, strict=True
+        )
+    ]
 
 
 def _join_reasons(*reasons: str) -> str:

@@ -267,6 +267,26 @@ class LocalizerSettings(RobotSettings):
         'Include the errors of the lens in the covariance of the pose, besides `sigma_px`; '
         'the lens file must state them, as those of `calibrate` and `diagnose` do',
     )
+    planar: bool = parameter(
+        False,
+        'With base_frame: the base drives on a plane, so that its height '
+        '(planar_height) and its tilt (none) are known before an image; one tag then seldom '
+        'leaves a second pose',
+        fixed=True,
+    )
+    planar_height: float = parameter(
+        0.0,
+        'Height of base_frame over the plane z = 0 of the landmarks',
+        'm',
+        (-1e4, 1e4),
+        fixed=True,
+    )
+    planar_std_m: float = parameter(
+        0.02, 'Standard deviation of that height', 'm', (1e-6, 1e3), fixed=True
+    )
+    planar_std_rad: float = parameter(
+        0.02, 'Standard deviation of roll and pitch of the base', 'rad', (1e-6, 3.0), fixed=True
+    )
 
 
 @dataclass(frozen=True)
