@@ -573,13 +573,30 @@ def test_other_units_in_a_lens_file_are_told(
     assert re.search(told, capsys.readouterr().err) if told else not capsys.readouterr().err
 
 
+# Focal lengths that the files state, px; of a field-of-view model 2 tan(w / 2) / w times as much,
+# of a polynomial its first coefficient, less its affine part.
+FOCAL = {
+    'camera_info_five': 285.0,
+    'colmap_cameras': 600.12,
+    'euroc_sensor': 458.654,
+    'kalibr_fov': 300.1 * 2 * np.tan(0.46) / 0.92,
+    'metashape': 1712.4,
+    'nerf': 600.1,
+    'ocam': 186.075,
+    'orb3': 190.978477,
+}
+
+
 def test_files_that_others_wrote() -> None:
     folder = DATA.parent / 'faults' / 'lens_files'
     if not folder.exists():
         pytest.skip('the files are not here')
-    for path in folder.iterdir():
+    paths = sorted(folder.iterdir())
+    assert {path.stem for path in paths} >= set(FOCAL)
+    for path in paths:
         lens, foreign = load_lens(path), read_lens_file(path)
         assert lens.max_incidence > 0.5
+        assert lens.fx == pytest.approx(FOCAL.get(path.stem, lens.fx), rel=5e-3)
         assert max(foreign.worst_px.values(), default=0.0) < (
             5 if path.stem == 'center_outside' else 0.3
         )

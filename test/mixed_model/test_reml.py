@@ -265,6 +265,17 @@ def likelihood_ratio(y, z):
     return deviance(-40.0) - best
 
 
+@pytest.mark.parametrize('factor', [0.2, 5.0])
+def test_weights_settle_from_wherever_they_begin(model, factor):
+    """As the ratios do: the last step changes them by a twentieth at most, in the mean."""
+    whole = make_equations(model.random, model.group_fixed, model.border)
+    begun = fixed_point(whole, initial_variances(whole), 3)
+    begun = replace(begun, weight=factor * begun.weight)
+    now, eq = estimate_variances(whole, begun)
+    again, _ = estimate_variances(eq, now, steps=1)
+    assert np.abs(np.log(again.weight / now.weight)).mean() < 0.05
+
+
 @pytest.mark.parametrize('seed', [0, 1, 2, 3, 4])
 def test_a_p_value_is_half_the_tail_of_the_likelihood_ratio(seed):
     """On the boundary (Self and Liang 1987), against the whole likelihood maximized."""

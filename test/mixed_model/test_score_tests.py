@@ -260,5 +260,6 @@ def test_degrees_of_freedom_are_those_of_the_delta_method(model):
 def test_degrees_of_freedom_stay_where_tables_end(model):
     f, combination = model.factored(), np.array([1.0, 0.0, 0.0])
     assert satterthwaite_freedom(f, combination, 1e6 * np.eye(7)) == 2.0
-    assert satterthwaite_freedom(f, combination, 1e-12 * np.eye(7)) == 1e6
+    for certain in (1e-12 * np.eye(7), np.zeros((7, 7))):
+        assert satterthwaite_freedom(f, combination, certain) == 1e6
     assert np.isfinite(satterthwaite_freedom(f, np.zeros(3), np.eye(7)))

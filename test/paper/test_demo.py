@@ -139,7 +139,10 @@ def test_the_table_and_the_pictures_are_there(demo: Any) -> None:
 def test_the_nodes_have_nothing_to_complain_of(demo: Any) -> None:
     """But of one another's slow start, and of a camera that ended before other nodes."""
     folder, _ = demo
-    for log in (folder / 'logs').glob('*.log'):
+    names = ['recorder', *(name for task in TASKS for name in (f'camera_{task.name}', task.node))]
+    logs = [folder / 'logs' / f'{name}.log' for name in names]
+    assert set(logs) <= set((folder / 'logs').glob('*.log'))
+    for log in logs:
         text = '\n'.join(
             line
             for line in log.read_text().splitlines()

@@ -34,6 +34,8 @@ PUBLISHED = {
         0.2: [(-5.8982, 6.4501), (0.2195, 1.0735), (-7.7370, 5.7515)],
     },
 }
+# A shift of the viewpoint is the same at every radius, and so is z: one published value is not.
+CORRECTED = {('fish180', 2.0, 'whole'): -0.1614}
 ALL = [(lens, radius, spread) for lens in LENSES for radius in RADII for spread in SPREADS]
 
 
@@ -75,9 +77,10 @@ def test_svp_errors_have_the_papers_signs_and_sizes(name, radius, spread):
     )
     z_mm, residual_px = PUBLISHED[name][radius][SPREADS.index(spread)]
     assert solved.converged.all()
-    assert solved.pose.position[0, 2] * 1e3 == pytest.approx(z_mm, rel=0.45)
+    expected = CORRECTED.get((name, radius, spread), z_mm)
+    assert solved.pose.position[0, 2] * 1e3 == pytest.approx(expected, rel=0.05)
     mean_residual = np.linalg.norm(solved.residual[0], axis=-1).mean()
-    assert mean_residual == pytest.approx(residual_px, rel=0.1)
+    assert mean_residual == pytest.approx(residual_px, rel=0.08)
     assert np.abs(solved.pose.position[0, :2]).max() < 0.3e-3
     assert axis_angle_between(solved.pose, paper_pose(1))[0] < np.radians(0.15)
 
