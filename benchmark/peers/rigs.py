@@ -23,14 +23,13 @@ import numpy as np
 from scipy import stats
 
 from benchmark import study
-from benchmark.studies.boards import facing, grid
+from benchmark.studies.boards import facing, grid, surround_rig
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Observations, make_observations
-from fisheye_svp_ros.scene.rigs import surround_rig
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.rig_calibration import RigCalibration, calibrate_rig

@@ -33,6 +33,14 @@ def unit(rng: Rng, size: int) -> Array:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
+def surround_rig(count: int, radius: float) -> Pose:
+    """Return cameras (count,) that look outward from a circle about y, m, in the first of them."""
+    azimuth = 2 * np.pi * np.arange(count) / count
+    turns = azimuth[:, None] * np.array([0.0, 1.0, 0.0])
+    places = np.stack([np.sin(azimuth), np.zeros(count), np.cos(azimuth) - 1], axis=-1)
+    return Pose(rotation_from_vector(turns), radius * places)
+
+
 def directions(theta: Array | float, azimuth: Array | float) -> Array:
     """Return unit vectors (..., 3) at angles from z and about it, rad."""
     sin = np.sin(theta)

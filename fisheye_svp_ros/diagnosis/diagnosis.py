@@ -1,4 +1,4 @@
-"""The answer of a diagnosis: causes, what remains, lenses, decision (design, section 7)."""
+"""The answer of a diagnosis: causes, what remains, lenses, decision."""
 
 from __future__ import annotations
 

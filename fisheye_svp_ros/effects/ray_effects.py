@@ -193,7 +193,7 @@ class FlatPortEffect(Effect):
     """A window of unknown thickness and given refractive index, square to the axis, in air.
 
     Where the medium behind it is another one, the port is a part of the lens (`optics.ports`), and
-    a diagnosis names it under the same name (`diagnosis.medium`).
+    a diagnosis names it under the same name (`diagnosis.checks.medium`).
     """
 
     refractive_index: float = 1.5

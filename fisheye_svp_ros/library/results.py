@@ -129,7 +129,7 @@ def _to_json(value: Any) -> Any:
 
 
 def _from_json(value: Any, hint: Any) -> Any:
-    """Return what `_plain` made plain, as the annotation of its field has it."""
+    """Return what `_to_json` made plain, as the annotation of its field has it."""
     kinds = [kind for kind in get_args(hint) if kind is not type(None)]
     if hint in (Array, Index):
         return np.array(value, dtype=float if hint == Array else np.int64)

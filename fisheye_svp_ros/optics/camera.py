@@ -163,16 +163,19 @@ def project(lens: Lens, points: Array, limited: bool = True) -> Image:
     return Image(uv.reshape(*points.shape[:-1], 2), valid.reshape(points.shape[:-1]))
 
 
-def project_with_jacobian(lens: Lens, points: Array) -> LinearImage:
-    """Project points (..., 3), m, and differentiate by the point and by both lens curves."""
+def project_with_jacobian(lens: Lens, points: Array, limited: bool = True) -> LinearImage:
+    """Project points (..., 3), m, and differentiate by the point and by both lens curves.
+
+    limited: see `incidence`.
+    """
     shape = points.shape[:-1]
     still = np.eye(3)[None], np.zeros((1, 3))
-    uv, valid, d_pose = engines.linearize_views(lens, *still, points.reshape(1, -1, 3), True)
+    uv, valid, d_pose = engines.linearize_views(lens, *still, points.reshape(1, -1, 3), limited)
     d_point = -d_pose[..., :3]  # the camera moves the other way
     return LinearImage(
         lens,
         points,
-        True,
+        limited,
         uv.reshape(*shape, 2),
         valid.reshape(shape),
         d_point.reshape(*shape, 2, 3),

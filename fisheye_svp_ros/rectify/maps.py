@@ -306,13 +306,7 @@ def _fit_parameters(start: Lens, names: tuple[str, ...], points: Array, uv: Arra
     """Return the lens with some parameters fitted to image points (N, 2) of points (N, 3)."""
     lens = start
     for _ in range(_MOST_STEPS):
-        image = camera.LinearImage(
-            lens,
-            points,
-            False,
-            *camera.project(lens, points, False),
-            np.empty((len(points), 2, 3)),
-        )
+        image = camera.project_with_jacobian(lens, points, limited=False)
         columns = camera.lens_columns(lens, image, names).reshape(-1, len(names))
         size = np.linalg.norm(columns, axis=0)
         residual = (uv - image.uv).ravel()

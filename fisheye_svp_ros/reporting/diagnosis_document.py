@@ -106,7 +106,7 @@ class DecisionEntry(TypedDict):
 
 
 def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
-    """Return what diagnosis.json holds (design, section 7)."""
+    """Return what diagnosis.json holds (docs/reference/diagnosis_json.md)."""
     base, named, lens, extended = (
         {name: value for name, value in asdict(fit).items() if value is not None}
         for fit in d.figures[:4]

@@ -30,22 +30,6 @@ def rig_from_angle(inward: float, baseline: float) -> Pose:
     return Pose(turn, np.array([-baseline, 0.0, 0.0]))
 
 
-def surround_rig(count: int, radius: float) -> Pose:
-    """Return cameras (count,) that look outward from a circle about y, m, in the first of them.
-
-    Raises ParameterError for fewer than two, or an impossible radius.
-    """
-    if count < 2 or not (np.isfinite(radius) and radius > 0):
-        raise ParameterError(
-            f'{count} cameras on a circle of {radius} m; at least 2, and a '
-            'radius above 0, are needed'
-        )
-    azimuth = 2 * np.pi * np.arange(count) / count
-    turns = azimuth[:, None] * np.array([0.0, 1.0, 0.0])
-    places = np.stack([np.sin(azimuth), np.zeros(count), np.cos(azimuth) - 1], axis=-1)
-    return Pose(rotation_from_vector(turns), radius * places)
-
-
 def paper_pose(*shape: int) -> Pose:
     """Return the paper's true pose: at the origin, gazing along -z of the world."""
     return Pose(np.tile(PAPER_FROM_OPTICAL, (*shape, 1, 1)), np.zeros((*shape, 3)))

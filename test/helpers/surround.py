@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from benchmark.studies.boards import surround_rig
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Observations, make_observations
-from fisheye_svp_ros.scene.rigs import surround_rig
 
 LENS = Lens(
     'around',

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmark.studies.boards import surround_rig
 from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.detection_effects import (
     NoiseVsAngleEffect,
@@ -22,7 +23,7 @@ from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.camera import back_project, project
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.observations import Landmarks, group_views
-from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig, surround_rig
+from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
 from fisheye_svp_ros.simulate import scenario
 from fisheye_svp_ros.simulate.scenario import (
     Scenario,

@@ -1,4 +1,4 @@
-"""The effects of section 7 of the design, each formulated by what causes it."""
+"""The effects of the catalog, each formulated by what causes it."""
 
 from __future__ import annotations
 
