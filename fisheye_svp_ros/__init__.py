@@ -31,6 +31,7 @@ _HOMES = {
     'back_project': 'library.functions',
     'localize': 'library.functions',
     'calibrate': 'library.functions',
+    'calibrate_cameras': 'library.functions',
     'calibrate_stereo': 'library.functions',
     'calibrate_rig': 'library.boards',
     'localize_rig': 'library.boards',

@@ -12,6 +12,7 @@ from fisheye_svp_ros.library.boards import write_lens as write_lens
 from fisheye_svp_ros.library.functions import back_project as back_project
 from fisheye_svp_ros.library.functions import budget as budget
 from fisheye_svp_ros.library.functions import calibrate as calibrate
+from fisheye_svp_ros.library.functions import calibrate_cameras as calibrate_cameras
 from fisheye_svp_ros.library.functions import calibrate_stereo as calibrate_stereo
 from fisheye_svp_ros.library.functions import diagnose as diagnose
 from fisheye_svp_ros.library.functions import load_lens as load_lens

@@ -99,8 +99,8 @@ def pair(hidden: Hidden, seed: int) -> Pair:
     """Draw a pair; the same seed gives the same views and background, whatever is hidden."""
     rng = np.random.default_rng([17, seed])
     printed = Print(hidden.columns, hidden.rows, 0.27 / hidden.columns)
-    true = _bent(printed, hidden, rng)
-    boards = (true, _bent(printed, hidden, rng) if hidden.apart else true)
+    true = bent_print(printed, hidden, rng)
+    boards = (true, bent_print(printed, hidden, rng) if hidden.apart else true)
     seen = hidden_lenses(hidden)
     rig = Pose(rotation_from_vector(np.array([0.01, 0.08, -0.02])), np.array([0.12, 0.004, -0.01]))
     left = _views(lenses(), printed, rig, hidden.frames, rng)
@@ -120,7 +120,7 @@ def pair(hidden: Hidden, seed: int) -> Pair:
     else:
         table = joined(
             [
-                _seen(lens, printed, board, pose, hidden, rng, camera)
+                photograph_print(lens, printed, board, pose, hidden, rng, camera)
                 for camera, (lens, board, pose) in enumerate(zip(seen, boards, poses, strict=True))
             ]
         )
@@ -149,7 +149,7 @@ def pair(hidden: Hidden, seed: int) -> Pair:
     )
 
 
-def _bent(printed: Print, hidden: Hidden, rng: Rng) -> Print:
+def bent_print(printed: Print, hidden: Hidden, rng: Rng) -> Print:
     """Return a board with a bend, a smooth stretch along it, single offsets of its corners."""
     flat, size = printed.corners, printed.size
     weights = rng.normal(size=6) * [1.0, 1.0, 1.0, 0.3, 0.3, 0.2]
@@ -215,7 +215,7 @@ def _views(given: Sequence[Lens], printed: Print, rig: Pose, frames: int, rng: R
     return Pose(*(np.concatenate(both) for both in zip(own, back, strict=True)))
 
 
-def _seen(
+def photograph_print(
     lens: Lens, printed: Print, board: Print, pose: Pose, hidden: Hidden, rng: Rng, camera: int
 ) -> Observations:
     true = board.true_corners()

@@ -10,9 +10,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fisheye_svp_ros.io.lens_formats import READERS_TO_90_DEG, share_beyond_90_deg
 from fisheye_svp_ros.reporting.terminal import print_note
-from fisheye_svp_ros.reporting.wording.inputs import points_extrapolated, points_mirrored
+from fisheye_svp_ros.reporting.wording.inputs import (
+    points_extrapolated,
+    points_mirrored,
+    reader_limit,
+)
 from fisheye_svp_ros.reporting.wording.poses import wrong_landmark_notes
 from fisheye_svp_ros.scene.observations import frame_name, list_frames
 from fisheye_svp_ros.scene.table_checks import MAX_TARGET_SIZE, target_size
@@ -37,12 +40,8 @@ def say(note: str) -> None:
 
 def note_reader_limit(lens: Lens, form: str) -> None:
     """Say it where the readers of a format end at 90 degrees, and the image of a lens does not."""
-    share = share_beyond_90_deg(lens) if form in READERS_TO_90_DEG else 0.0
-    if share:
-        say(
-            f'{100 * share:.2g} % of the image of {lens.name} lies beyond 90 deg, where '
-            f'{READERS_TO_90_DEG[form]} ends; basalt, nerfstudio and mrcal reach further'
-        )
+    if limit := reader_limit(lens, form):
+        say(limit)
 
 
 def note_extrapolated(what: str, lens: Lens, uv: Array) -> None:

@@ -53,7 +53,9 @@ from fisheye_svp_ros.reporting.undistort_report import (
     shift_left,
     tolerated_text,
 )
-from fisheye_svp_ros.reporting.wording.inputs import points_extrapolated
+from fisheye_svp_ros.reporting.wording.inputs import exchanged_cameras, points_extrapolated
+from fisheye_svp_ros.scene.observations import STEREO
+from fisheye_svp_ros.solve.rig_checks import is_exchanged
 
 # What camera_info calls the rectified cameras that it can describe, and its coefficients
 _CAMERA_INFO = {'pinhole': ('plumb_bob', 5), 'fisheye': ('equidistant', 4)}
@@ -272,6 +274,8 @@ def _rectifications(args: argparse.Namespace) -> tuple[_Sides, list[str]]:
             for name, lens in by_camera.items()
         }
         return _Sides(sides, own), paths
+    if tuple(by_camera) == STEREO and is_exchanged(rig):
+        say(exchanged_cameras(*STEREO))
     left, right = by_camera.values()
     camera = camera_for([left, right], *wanted, along_baseline=True)
     pair = rectify_pair(left, right, rig, camera, args.range_m)

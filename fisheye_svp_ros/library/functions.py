@@ -16,7 +16,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects import forward
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io import lens_files
 from fisheye_svp_ros.io.columns import plain_columns
 from fisheye_svp_ros.io.csv_files import FramePoses
@@ -25,6 +25,8 @@ from fisheye_svp_ros.io.parameters import SWEEP, rows, with_values
 from fisheye_svp_ros.io.readers import check_size_given, check_sizes, read_observations, read_poses
 from fisheye_svp_ros.io.rig_files import load_pair
 from fisheye_svp_ros.io.share import typed_lens_path
+from fisheye_svp_ros.library import calibration
+from fisheye_svp_ros.library.calibration import CalibratedCameras, LensOptions
 from fisheye_svp_ros.library.checks import (
     check_list,
     check_number,
@@ -54,7 +56,7 @@ from fisheye_svp_ros.scene.observations import STEREO, Observations, stereo_view
 from fisheye_svp_ros.scene.rigs import BASELINE, rig
 from fisheye_svp_ros.scene.table_checks import check_sigma
 from fisheye_svp_ros.simulate import scenario as scenarios
-from fisheye_svp_ros.solve import lens_calibration, stereo_calibration
+from fisheye_svp_ros.solve import stereo_calibration
 from fisheye_svp_ros.solve.measured_poses import localize_measured, rms_px, sigma_known
 from fisheye_svp_ros.solve.reliability import noise_sigma
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate
@@ -176,38 +178,72 @@ def calibrate(
     `hand_eye` then, where the camera sits in it.
     progress: called with each stage and the share that is done.
     Raises LensError for an unknown model or parameter, ParameterError for an image size that is
-    none, ObservationError or GeometryError where the data do not fix a lens.
+    none, ObservationError or GeometryError where the data do not fix a lens, ObservationError for
+    rows of several cameras (`calibrate_cameras`).
     """
-    from fisheye_svp_ros.solve.robust_calibration import calibrate_without_outliers
-    from fisheye_svp_ros.study.trust import assess_lens, generalize, with_covariance
-
-    size = check_size(image_size, 'image_size')
     table = table_of(observations)
-    if not isinstance(observations, Observations):
-        check_size_given(str(observations), {}, {'': size}, 'image_size')
-    progress('fitting the lens', 0.0)
-    found, kept, _ = calibrate_without_outliers(
-        table,
-        lambda rows: lens_calibration.calibrate(rows, model, size, free, name),
-        lens_calibration.rough_lenses(model, size),
-    )
-    if poses is not None:
-        found, _ = lens_calibration.calibrate_hand_eye(found, kept, _by_frame(poses))
-    progress('estimating standard errors', 0.3)
-    trusted = assess_lens(kept, found.adjusted.lens, found.adjusted.names)
-    if not plain:
-        found = generalize(found, trusted)
-        if poses is not None:
-            found, _ = lens_calibration.calibrate_hand_eye(found, kept, _by_frame(poses), ())
-    adjusted = found.adjusted
+    if len(np.unique(table.camera)) > 1:
+        raise ObservationError(
+            f'{table.source}: the observations hold the cameras {", ".join(table.cameras)}; use '
+            'calibrate_cameras, or the rows of one'
+        )
+    found = _calibrate(observations, table, image_size, name, progress, model, free, poses, plain)
+    camera = next(iter(found.cameras.values()))
+    adjusted = camera.result.adjusted
     return Calibrated(
-        with_covariance(adjusted.lens, trusted),
+        camera.lens,
         tuple(adjusted.names),
-        trusted.covariance,
-        found.sigma,
-        found.left_out,
+        camera.trust.covariance,
+        camera.result.sigma,
+        camera.result.left_out,
         bool(adjusted.converged),
     )
+
+
+@limit_threads
+def calibrate_cameras(
+    observations: AnyObservations,
+    image_size: tuple[int, int] | Mapping[str, tuple[int, int]],
+    model: str = 'kannala_brandt',
+    free: Sequence[str] | None = None,
+    *,
+    poses: AnyPoses | None = None,
+    plain: bool = False,
+    progress: Progress = _silent,
+) -> CalibratedCameras:
+    """Fit the lenses of all cameras of a table and, where frames hold them together, their rig.
+
+    Lenses and rig are of one fit, in which all cameras see the same errors of the target.
+    Arguments and errors are those of `calibrate`; image_size: also by camera.  The result has
+    `cameras` (by name: `lens`), `rig` (None: no frame holds two of them together) and `notes`.
+    """
+    table = table_of(observations)
+    return _calibrate(observations, table, image_size, '', progress, model, free, poses, plain)
+
+
+def _calibrate(
+    observations: AnyObservations,
+    table: Observations,
+    image_size: tuple[int, int] | Mapping[str, tuple[int, int]],
+    name: str,
+    progress: Progress,
+    model: str,
+    free: Sequence[str] | None,
+    poses: AnyPoses | None,
+    plain: bool,
+) -> CalibratedCameras:
+    """Call what the command calls, with checked arguments; name: of each lens, '': its camera."""
+    by_camera = image_size if isinstance(image_size, Mapping) else {'': image_size}
+    sizes = {camera: check_size(size, 'image_size') for camera, size in by_camera.items()}
+    if missing := [camera for camera in table.cameras if not {camera, ''} & set(sizes)]:
+        raise ParameterError(f'image_size has no size of camera {missing[0]!r}')
+    if not isinstance(observations, Observations):
+        check_size_given(str(observations), {}, sizes, 'image_size')
+    options = LensOptions(
+        model, free, poses=None if poses is None else _by_frame(poses), plain=plain
+    )
+    names = {camera: name or camera or 'lens' for camera in table.cameras}
+    return calibration.calibrate_cameras(table, sizes, options, names, progress)
 
 
 @limit_threads

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.optics.lens import Lens, monotone_limit, parameter_values
+from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, vector_from_rotation
 from fisheye_svp_ros.reporting.terminal import UNITS, interval, with_error
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.hand_eye import HandEye
-from fisheye_svp_ros.solve.localization import localize
-from fisheye_svp_ros.solve.measured_poses import rms_px
-from fisheye_svp_ros.solve.outliers import WrongLandmark
+from fisheye_svp_ros.solve.outliers import NO_OUTLIERS, Outliers
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.solve.lens_calibration import Calibration
@@ -29,45 +27,21 @@ ROBOT_HEADER = ('transform', 'x, mm', 'y, mm', 'z, mm', 'rx, deg', 'ry, deg', 'r
 class CalibratedCamera:
     """One camera's lens with its errors, the fit, its trust, its table, and the robot, if any.
 
-    least_squares: the lens of least squares, with the same errors; wrong_landmarks: that are not
-    where the table says, their points rejected.
+    table: without outliers.
     """
 
     lens: Lens
-    least_squares: Lens
     result: Calibration
     trust: LensTrust
     table: Observations
-    model: str
     hand_eye: HandEye | None = None
-    wrong_landmarks: tuple[WrongLandmark, ...] = ()
+    outliers: Outliers = NO_OUTLIERS
 
-    def generalize(self, lens: Lens) -> Lens:
-        """Return a lens of least squares, fitted to more, moved as far as that of the camera was.
-
-        It states no errors: it is to stay as it is.
-        """
-        names = self.result.adjusted.names
-        values = [np.array(parameter_values(of, names)) for of in (lens, self.lens)]
-        moved = values[1] - parameter_values(self.least_squares, names)
-        lens = lens.with_parameters(names, (values[0] + moved).tolist())
-        limit = min(self.lens.max_incidence, monotone_limit(lens))
-        return replace(lens, calibration=None, max_incidence=limit)
-
-    def with_lens(self, lens: Lens) -> CalibratedCamera:
-        """Return the camera with a lens fitted to more, and the poses of its views by it."""
-        adjusted, views = self.result.adjusted, self.result.views
-        solved = localize(ForwardModel(lens), views, adjusted.pose)
-        lens = replace(
-            lens, calibration={**(lens.calibration or {}), 'rms_px': rms_px(solved.residual)}
-        )
-        return replace(
-            self,
-            lens=lens,
-            result=self.result._replace(
-                adjusted=adjusted._replace(lens=lens, pose=solved.pose, residual=solved.residual)
-            ),
-        )
+    @property
+    def model(self) -> str:
+        """The name of the image-height curve."""
+        kind = type(self.lens.image_height)
+        return IMAGE_HEIGHTS.name_of(kind) or kind.__name__
 
     def parameter_rows(self) -> list[tuple[str, str, str, str, str]]:
         """Return name, value, standard error, range over targets ('': settled) and unit.

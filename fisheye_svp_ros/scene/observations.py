@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import PurePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -249,6 +249,15 @@ def select_shared(table: Observations) -> Observations:
     pairs = np.unique(np.stack([table.frame, table.camera], axis=-1), axis=0)
     frames, counts = np.unique(pairs[:, 0], return_counts=True)
     return table.take(np.isin(table.frame, frames[counts >= 2]))
+
+
+def join_tables(tables: Sequence[Observations]) -> Observations:
+    """Return the rows of several tables of the same cameras."""
+    rows: dict[str, Any] = {
+        name: np.concatenate([getattr(table, name) for table in tables])
+        for name in ('frame', 'landmark', 'uv', 'xyz', 'camera', 'board', 't', 'sigma')
+    }
+    return replace(tables[0], **rows)
 
 
 def rig_cameras(cameras: tuple[str, ...]) -> tuple[str, str] | None:

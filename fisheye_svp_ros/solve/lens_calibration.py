@@ -151,10 +151,10 @@ def calibrate_hand_eye(
     return _with_figures(calibration, adjusted, hand_eye=hand_eye.to_dict()), hand_eye
 
 
-def with_values(found: Calibration, values: Sequence[float]) -> Calibration:
+def with_values(found: Calibration, values: Sequence[float], **figures: Any) -> Calibration:
     """Return a calibration with other values of its parameters, its views posed anew.
 
-    Raises LensError where these are no lens.
+    figures: more of the `calibration` block.  Raises LensError where these are no lens.
     """
     adjusted = found.adjusted
     block = adjusted.lens.calibration or {}
@@ -168,7 +168,7 @@ def with_values(found: Calibration, values: Sequence[float]) -> Calibration:
         cost=solved.cost,
         converged=adjusted.converged and bool(np.all(solved.converged)),
     )
-    moved = _with_figures(found, adjusted, least_squares_rms_px=block['rms_px'])
+    moved = _with_figures(found, adjusted, **figures)
     return moved._replace(
         adjusted=moved.adjusted._replace(lens=check_lens(moved.adjusted.lens, lens.name)),
         beyond=int((_angles(adjusted, found.views) > moved.adjusted.lens.max_incidence).sum()),

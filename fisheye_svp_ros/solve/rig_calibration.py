@@ -8,7 +8,7 @@ the other's frame (`solve.hand_eye`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,10 +18,15 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.optics.lens import Lens, monotone_limit, parameter_values
 from fisheye_svp_ros.pose import Pose, identity
-from fisheye_svp_ros.scene.observations import Observations, select_cameras, select_shared
+from fisheye_svp_ros.scene.observations import (
+    Observations,
+    join_tables,
+    select_cameras,
+    select_shared,
+)
 from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust, rig_covariance
 from fisheye_svp_ros.solve.hand_eye import MIN_FRAMES, Transforms, solve_hand_eye, turn_sizes
-from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.initial_rig import initial_state, localize_frames
 from fisheye_svp_ros.solve.least_squares import misfit_fails
 from fisheye_svp_ros.solve.measured_poses import sigma_known
 from fisheye_svp_ros.solve.outliers import FRAME, find_outliers
@@ -43,28 +48,42 @@ _ROUNDS = 3
 class PlacedBoards(NamedTuple):
     """A rig's rows with the boards in one frame, and where its bundle adjustment starts.
 
-    boards: of each camera; empty where all cameras see one.
+    boards: of each camera; empty where all cameras see one; poses (B,): of the boards in the
+    frame of the first one.
     """
 
     rows: Observations
     data: RigViews
     state: RigState
-    boards: tuple[int, ...]
+    boards: tuple[int, ...] = ()
+    poses: Pose | None = None
+
+    def place(self, rows: Observations, last: int) -> Observations:
+        """Return other rows of the cameras with their landmarks in the frame of the first board.
+
+        last: the largest number of a landmark.
+        """
+        return rows if self.poses is None else _in_first_board(rows, self.boards, self.poses, last)
 
 
-def place_boards(rows: Observations, lenses: Sequence[Lens]) -> PlacedBoards:
+def place_boards(
+    rows: Observations, lenses: Sequence[Lens], last: int | None = None
+) -> PlacedBoards:
     """Return the rows with the boards of all cameras in the frame of the first camera's board.
 
-    rows: of frames that several cameras share.  Cameras that no relative pose relates, as seeing
+    rows: of frames that several cameras share; last: the largest number of a landmark, None for
+    that of these rows.  Cameras that no relative pose relates, as seeing
     one target, see boards of their own.
     Raises ObservationError where neither explains most frames.
     """
+    last = int(rows.landmark.max()) if last is None else last
     data, state = _start_rig(rows, lenses)
     if not _contradicts(data, state):
-        return PlacedBoards(rows, data, state, ())
+        return PlacedBoards(rows, data, state)
     boards = _boards_of_cameras(rows, lenses)
     try:
-        placed = _in_first_board(rows, boards, _board_poses(rows, lenses, boards))
+        poses = _board_poses(rows, lenses, boards)
+        placed = _in_first_board(rows, boards, poses, last)
         data, state = _start_rig(placed, lenses)
         if _contradicts(data, state):
             raise GeometryError('no motion of a rig explains these frames')
@@ -75,7 +94,7 @@ def place_boards(rows: Observations, lenses: Sequence[Lens]) -> PlacedBoards:
             'and number points from the same end; if the cameras see boards of their own, '
             f'{cause}'
         ) from cause
-    return PlacedBoards(placed, data, state, boards)
+    return PlacedBoards(placed, data, state, boards, poses)
 
 
 def _start_rig(rows: Observations, lenses: Sequence[Lens]) -> tuple[RigViews, RigState]:
@@ -157,14 +176,16 @@ def _solve_robustly(camera: Pose, flange: Pose) -> Transforms:
     return hand_eye
 
 
-def _in_first_board(rows: Observations, boards: tuple[int, ...], placed: Pose) -> Observations:
+def _in_first_board(
+    rows: Observations, boards: tuple[int, ...], placed: Pose, last: int
+) -> Observations:
     """Return rows with their landmarks in the frame of the first board, numbered by board."""
     board = np.array(boards)[rows.camera]
     return replace(
         rows,
         board=board,
         xyz=placed.take(board).transform(rows.xyz),
-        landmark=rows.landmark + board * (int(rows.landmark.max()) + 1),
+        landmark=rows.landmark + board * (last + 1),
     )
 
 
@@ -220,6 +241,88 @@ def connected_cameras(table: Observations) -> list[tuple[str, ...]]:
     return groups
 
 
+class RigStart(NamedTuple):
+    """A rig of C cameras fitted to the frames that several of them share, the lenses known.
+
+    cameras: in the order in which frames hold them together, as data and state have them; wanted:
+    in that in which they were asked for; torn: frames that no rig explains.
+    """
+
+    cameras: tuple[str, ...]
+    wanted: tuple[str, ...]
+    placed: PlacedBoards
+    data: RigViews
+    state: RigState
+    torn: tuple[int, ...]
+
+    def add_frames_of_one(self, table: Observations) -> tuple[RigViews, RigState]:
+        """Return data and state with the frames that one camera alone shows, too.
+
+        table: that of the start.
+        """
+        whole = select_cameras(table, self.cameras)
+        alone = whole.take(~np.isin(whole.frame, select_shared(whole).frames))
+        alone = self.placed.place(alone, int(whole.landmark.max()))
+        data = group_by_frame(join_tables([self.data.observations, alone]))
+        return data, localize_frames(data, self.state)
+
+    def summarize(
+        self, data: RigViews, state: RigState, covariance: Callable[[float], Array]
+    ) -> RigCalibration:
+        """Return the rig of a state that was fitted to these data, or more.
+
+        covariance: returns that of the cameras but the first (C - 1, 6, 6), in the order of the
+        state, for the noise of the shared frames.
+        """
+        several = (np.bincount(data.frame_of) > 1)[data.frame_of]
+        frames = np.unique(data.frame_of[several])
+        data, state = data.select(several), replace(state, pose=state.pose.take(frames))
+        linear, place = Linearization(data, state, ()), self._places()
+        squared, freedom = linear.sum_of_squares, _freedom(linear)
+        known = sigma_known(data.observations)
+        fails = known and bool(misfit_fails(np.array(squared), np.array(freedom)))
+        sigma = None if known else float(np.sqrt(squared / freedom))
+        squares = (linear.residual_px**2).sum(axis=-1)
+        return RigCalibration(
+            tuple(self.cameras[i] for i in place),
+            state.rig.take(place),
+            covariance(sigma or 1.0)[[i - 1 for i in place[1:]]],
+            data.frame_numbers,
+            state.pose,
+            np.array([np.sqrt(np.nanmean(squares[data.camera_of == i])) for i in place]),
+            float(np.sqrt(np.nanmean(squares))),
+            sigma,
+            np.bincount(data.camera_of, minlength=len(self.cameras))[place],
+            self.torn,
+            misfit_reason(squared / freedom, freedom) if fails else '',
+            tuple(
+                replace(lens, max_incidence=min(lens.max_incidence, monotone_limit(lens)))
+                for lens in (state.lenses[i] for i in place)
+            ),  # as far as their curves still allow
+            tuple(self.placed.boards[i] for i in place if self.placed.boards),
+        )
+
+    def _places(self) -> list[int]:
+        # The first camera stays the first.
+        return [self.cameras.index(name) for name in self.wanted if name in self.cameras]
+
+
+def start_rig(table: Observations, lenses: Mapping[str, Lens], cameras: Sequence[str]) -> RigStart:
+    """Fit the rig and the poses of its frames to what the cameras saw, the lenses known.
+
+    Arguments and errors are those of `calibrate_rig`.
+    """
+    order = connected_cameras(select_cameras(table, cameras))[0]
+    ordered = [lenses[name] for name in order]
+    rows = select_cameras(table, order)
+    placed = place_boards(select_shared(rows), ordered, int(rows.landmark.max()))
+    rows, torn = _without_outliers(placed)
+    data, state = _fit_rig(rows, ordered, placed.boards)
+    if _freedom(Linearization(data, state, ())) < 1:
+        raise GeometryError(f'{rows.source}: too few points for a rig of {len(order)} cameras')
+    return RigStart(order, tuple(cameras), placed, data, state, torn)
+
+
 def calibrate_rig(
     table: Observations, lenses: Mapping[str, Lens], cameras: Sequence[str]
 ) -> RigCalibration:
@@ -232,48 +335,26 @@ def calibrate_rig(
     Raises ObservationError where no rig explains most frames; GeometryError, naming the frame, for
     a view that does not fix a pose, and where the rig is not determined.
     """
-    order = connected_cameras(select_cameras(table, cameras))[0]
-    ordered = [lenses[name] for name in order]
-    placed = place_boards(select_shared(select_cameras(table, order)), ordered)
-    rows, torn = _without_outliers(placed)
-    data, state = _fit_rig(rows, ordered, placed.boards)
-    # Cameras stand in the order in which frames hold them together; the first one stays the first.
-    place = [order.index(name) for name in cameras if name in order]
-    known = sigma_known(rows)
-    free, mean, information = _stated_errors(order, ordered)
-    start = Linearization(data, state, ())
-    freedom = int(start.row_mask.sum()) - 6 * (data.frames + len(state.rig.position) - 1)
-    if freedom < 1:
-        raise GeometryError(f'{rows.source}: too few points for a rig of {len(order)} cameras')
+    start = start_rig(table, lenses, cameras)
+    data, state = start.data, start.state
+    free, mean, information = _stated_errors(
+        start.cameras, [lenses[name] for name in start.cameras]
+    )
     if free:
-        noise = 1.0 if known else np.sqrt(start.sum_of_squares / freedom)
+        linear = Linearization(data, state, ())
+        known = sigma_known(data.observations)
+        noise = 1.0 if known else np.sqrt(linear.sum_of_squares / _freedom(linear))
         values, vectors = np.linalg.eigh(information)
         root = noise * np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
         state = adjust(data, state, free, Prior(mean, root))
     linear = Linearization(data, state, free)
-    squared = linear.sum_of_squares
-    fails = known and bool(misfit_fails(np.array(squared), np.array(freedom)))
-    sigma = None if known else float(np.sqrt(squared / freedom))
-    covariance = rig_covariance(linear, sigma or 1.0, information)
-    squares = (linear.residual_px**2).sum(axis=-1)
-    return RigCalibration(
-        tuple(order[i] for i in place),
-        state.rig.take(place),
-        covariance[[i - 1 for i in place[1:]]],
-        rows.frames,
-        state.pose,
-        np.array([np.sqrt(np.nanmean(squares[data.camera_of == i])) for i in place]),
-        float(np.sqrt(np.nanmean(squares))),
-        sigma,
-        np.bincount(data.camera_of, minlength=len(order))[place],
-        torn,
-        misfit_reason(squared / freedom, freedom) if fails else '',
-        tuple(
-            replace(lens, max_incidence=min(lens.max_incidence, monotone_limit(lens)))
-            for lens in (state.lenses[i] for i in place)
-        ),  # as far as their curves still allow
-        tuple(placed.boards[i] for i in place if placed.boards),
-    )
+    return start.summarize(data, state, lambda sigma: rig_covariance(linear, sigma, information))
+
+
+def _freedom(linear: Linearization) -> int:
+    """Return how many numbers are left beside poses, rig and boards."""
+    unknown = 6 * (linear.data.frames + len(linear.state.rig.position) - 1)
+    return int(linear.row_mask.sum()) - unknown
 
 
 def _without_outliers(placed: PlacedBoards) -> tuple[Observations, tuple[int, ...]]:

@@ -11,6 +11,7 @@ from fisheye_svp_ros.arrays import Mask
 from fisheye_svp_ros.effects.base import Untestable
 from fisheye_svp_ros.effects.pose_effects import RigFlexEffect, StereoTimeOffsetEffect
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state, localize_cameras, localize_frames
 from fisheye_svp_ros.solve.outliers import cross_camera_offsets
@@ -31,6 +32,15 @@ _EXPLAINED_RATIO = 1.1  # times that rms, if an effect of a rig is all that move
 def unpair_cameras(data: RigViews) -> RigViews:
     """Return the data with a pose for every view, whatever rig the cameras are said to be."""
     return replace(data, frame_of=np.arange(len(data.frame_of)))
+
+
+def is_exchanged(rig: Pose) -> bool:
+    """Whether the left camera stands to the right, seen by both; rig: the left in the right one.
+
+    Cameras that stand one above or behind the other, or back to back, have no left and right.
+    """
+    left, right = rig.position, rig.inverse().position
+    return bool(min(left[0], -right[0]) > np.linalg.norm(left) / 2)
 
 
 def is_unpaired(data: RigViews) -> bool:

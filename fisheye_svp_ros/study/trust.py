@@ -26,7 +26,7 @@ from fisheye_svp_ros.mixed_model import FactoredEquations, factor_equations, pse
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import Pose, axis_angle_between, identity
 from fisheye_svp_ros.scene.observations import Observations, views_of
-from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import initial_state, localize_cameras
 from fisheye_svp_ros.solve.lens_calibration import Calibration, with_values
 from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measured, rms_px
@@ -79,33 +79,92 @@ class LensTrust:
         }
 
 
+class SharedTrust(NamedTuple):
+    """What the null model says of cameras that were fitted together.
+
+    lenses (C,): of each; moved (K,), covariance (K, K): of all that is shared, as of `LensTrust`:
+    cameras but the first, boards but the first (6 each, the change in `Pose.retract`), lenses.
+    """
+
+    lenses: tuple[LensTrust, ...]
+    moved: Array
+    covariance: Array
+
+    def rig_covariance(self) -> Array:
+        """Return the covariances (C - 1, 6, 6) of the cameras but the first, m and rad."""
+        ends = [slice(6 * i, 6 * i + 6) for i in range(len(self.lenses) - 1)]
+        return np.array([self.covariance[one, one] for one in ends]).reshape(-1, 6, 6)
+
+
 def assess_lens(observations: Observations, lens: Lens, names: Sequence[str]) -> LensTrust:
     """Return what the null model says of a lens fitted to one camera's views, names being free."""
     data = group_by_frame(observations)
-    null = NullModel.estimate(data, adjust(data, initial_state(data, lens), names), names)
-    # What else the lens has, its corrections, is fitted along and follows them.
-    errors = total_errors(null)[: len(names)]
-    stderr = {name: float(error) for name, error in zip(names, errors, strict=True)}
-    targets = _fit_targets(null, len(names))
-    values, free = parameter_values(lens, names), targets[-1]
-    admissible = {
-        name: _admissible(name, (value, error), (value + step, spread))
-        for name, value, error, step, spread in zip(
-            names, values, errors, free.step, np.sqrt(np.diag(free.covariance)), strict=True
-        )
-    }
+    state = adjust(data, initial_state(data, lens), names)
+    return assess_cameras(data, state, names).lenses[0]
+
+
+def assess_cameras(data: RigViews, state: RigState, names: Sequence[str]) -> SharedTrust:
+    """Return what the null model says of a rig of cameras, or of one, and of their lenses.
+
+    The random parts of target and frames are the same for all cameras.  state: fitted to the data
+    by least squares; names: of what was free of the lenses, as the state calls it.
+    """
+    null = NullModel.estimate(data, state, names)
+    start = 6 * (len(state.rig.position) - 1)
+    count = start + len(names)
+    # What else a lens has, its corrections, is fitted along and follows them.
+    errors = total_errors(null)[:count]
+    targets = _fit_targets(null, count)
     moved, covariance = _average_fits([_fit_without_random_parts(null, targets[0]), *targets])
     # What frames left out say of the errors holds for any target.
     known = np.sqrt(np.diag(targets[0].covariance))
-    larger = np.maximum(np.nan_to_num(standard_errors(null)[: len(names)]), known)
-    larger = larger / np.maximum(known, 1e-300)
-    return LensTrust(
-        stderr, admissible, moved, covariance * np.outer(larger, larger), noise_px(null)
-    )
+    larger = np.nan_to_num(standard_errors(null)[:count])
+    # A broad image field turns a camera on the rig; of one by itself the poses take that up.
+    larger[:start] = np.nan_to_num(errors[:start])
+    larger = np.maximum(larger, known) / np.maximum(known, 1e-300)
+    covariance = covariance * np.outer(larger, larger)
+    free, lenses, end = targets[-1], [], start
+    spread = np.sqrt(np.diag(free.covariance))
+    for lens, own in zip(state.lenses, state.lens_names(names), strict=True):
+        at, end = slice(end, end + len(own)), end + len(own)
+        found = zip(
+            own, parameter_values(lens, own), errors[at], free.step[at], spread[at], strict=True
+        )
+        lenses.append(
+            LensTrust(
+                dict(zip(own, errors[at].tolist(), strict=True)),
+                {
+                    name: _admissible(name, (value, error), (value + step, width))
+                    for name, value, error, step, width in found
+                },
+                moved[at],
+                covariance[at, at],
+                noise_px(null),
+            )
+        )
+    return SharedTrust(tuple(lenses), moved, covariance)
+
+
+def generalize_rig(
+    data: RigViews, state: RigState, names: Sequence[str], trusted: SharedTrust
+) -> RigState:
+    """Return a state at the values of generalized least squares, the poses of its frames by them.
+
+    As it is where these are no lenses, or ones that are not near: the equations are linear.
+    """
+    ported = any(lens.port is not None for lens in state.lenses)
+    if ported or not np.isfinite(trusted.moved).all():
+        return state
+    moved = state.retract(names, np.zeros((data.frames, 6)), trusted.moved)
+    if any(lens.check() for lens in moved.lenses):
+        return state
+    moved = adjust_poses(data, moved)
+    before, after = (Linearization(data, one, ()).rms_px for one in (state, moved))
+    return moved if after < _MAX_RMS_RATIO * before else state
 
 
 def generalize(calibration: Calibration, trusted: LensTrust) -> Calibration:
-    """Return a calibration at the values of generalized least squares.
+    """Return a calibration of one camera at the values of generalized least squares.
 
     As it is where these are no lens, or one that is not near: the equations are linear.
     """
@@ -114,7 +173,9 @@ def generalize(calibration: Calibration, trusted: LensTrust) -> Calibration:
         return calibration
     values = np.array(parameter_values(adjusted.lens, adjusted.names)) + trusted.moved
     try:
-        moved = with_values(calibration, values.tolist())
+        moved = with_values(
+            calibration, values.tolist(), least_squares_rms_px=rms_px(adjusted.residual)
+        )
     except FisheyeSvpError:
         return calibration
     near = moved.adjusted.converged and rms_px(moved.adjusted.residual) < (

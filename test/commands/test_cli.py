@@ -306,7 +306,7 @@ class TestCalibrate:
         @contextmanager
         def stages(description):
             shown.append(description)
-            yield lambda *_: None
+            yield lambda stage, done: shown.append(stage)
 
         monkeypatch.setattr('fisheye_svp_ros.commands.calibrate.stages', stages)
         lens = tmp_path / 'lens.yaml'
@@ -326,8 +326,12 @@ class TestCalibrate:
             == 0
         )
         fx = load_lens(lens).fx
-        assert [line.partition(',')[0] for line in shown] == [f'fx {fx:.6g}']
-        assert shown[0].endswith('standard errors')
+        assert [line.partition(',')[0] for line in shown] == [
+            'calibrating',
+            'fitting the lens',
+            f'fx {fx:.6g}',
+        ]
+        assert shown[-1].endswith('standard errors')
 
     def test_writes_the_lens_and_its_covariance(self, scene, capsys, tmp_path):
         folder, _, table = scene

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fisheye_svp_ros.reporting.wording.inputs import points_mirrored
-from fisheye_svp_ros.scene.observations import list_frames
+from fisheye_svp_ros.reporting.wording.inputs import exchanged_cameras, points_mirrored
+from fisheye_svp_ros.scene.observations import STEREO, list_frames
 from fisheye_svp_ros.solve.hand_eye import MAX_ODDS, HandEye
 from fisheye_svp_ros.solve.lens_checks import image_coverage, is_no_fit
 from fisheye_svp_ros.solve.mirrored_points import find_mirror
+from fisheye_svp_ros.solve.outliers import FRAME
+from fisheye_svp_ros.solve.rig_checks import MAX_RIG_RATIO, MIN_SHARED_FRAMES, is_exchanged
 
 if TYPE_CHECKING:
+    from fisheye_svp_ros.optics.lens import Lens
     from fisheye_svp_ros.reporting.calibrated_camera import CalibratedCamera
+    from fisheye_svp_ros.scene.observations import Observations
+    from fisheye_svp_ros.solve.rig_calibration import RigCalibration
 
 STANDARD_ERRORS = (
     'standard errors allow for local errors of target, frames and image, and for a target as '
@@ -27,8 +32,10 @@ ANY_TARGET_NOTE = (
 )
 _WORTH_SAYING = 1.001  # residuals over those of least squares
 _MODEL_ERROR_RATIO = 2.0  # times the noise, from which residuals show a model error
+_MAX_NOISE = 0.6  # px, of a coordinate: twice what the poorest detectors leave
 _LARGE_SHARE = 0.5  # of the squares of all frames: such a pose is wrong
 _MIN_FRAMES = 6
+_ENOUGH_FRAMES = 8  # as for `diagnose`, which takes long to load
 _MAX_SCALE = 2.0  # of lengths, either way: more is another unit, or the size of another board
 _MIN_MM = 100.0  # such a factor, too large for a mistaken board, is that of mm
 
@@ -76,6 +83,7 @@ def _fit_warnings(camera: CalibratedCamera) -> list[str]:
             'the adjustment has not converged, so the lens is inaccurate; take more '
             'photographs, or check these'
         )
+    texts += _few_frames(len(result.views.frame))
     rms, sigma = (camera.lens.calibration or {})['rms_px'], float(np.median(camera.table.sigma))
     noise = sigma if np.isfinite(sigma) else camera.trust.noise_px
     if is_no_fit(rms, sigma):
@@ -84,11 +92,16 @@ def _fit_warnings(camera: CalibratedCamera) -> list[str]:
             'image points and landmarks do not match (order, units, axes, image size), or two '
             'cameras are mixed; do not use it'
         )
-    elif rms > _MODEL_ERROR_RATIO * 2**0.5 * noise:
+    elif len(result.views.frame) > 1 and rms > _MODEL_ERROR_RATIO * 2**0.5 * noise:
         texts.append(
             f'{rms:.2g} px are {rms / noise / 2**0.5:.1f} times the noise of image '
             'points: lens, target or data have a model error; do not use this lens before '
             '`fisheye-svp diagnose` says which'
+        )
+    if len(result.views.frame) > 1 and camera.trust.noise_px > _MAX_NOISE:
+        texts.append(
+            f'noise is {camera.trust.noise_px:.1f} px in u and v, far more than a detector leaves '
+            '(0.02 to 0.3 px): check sharpness, detector, order of corners'
         )
     if result.beyond:
         texts.append(
@@ -96,6 +109,18 @@ def _fit_warnings(camera: CalibratedCamera) -> list[str]:
             'fitted curve stops growing; try another --model'
         )
     return texts
+
+
+def _few_frames(frames: int) -> list[str]:
+    """Say it where so few frames were taken that their lens cannot be judged."""
+    if frames == 1:
+        return [
+            'one frame is too few: noise and errors of the landmarks cannot be told apart in it; '
+            f'take {_ENOUGH_FRAMES} frames or more'
+        ]
+    if frames < _MIN_FRAMES:
+        return [f'{frames} frames are too few to judge a lens; take {_ENOUGH_FRAMES} or more']
+    return []
 
 
 def _image_warnings(camera: CalibratedCamera) -> list[str]:
@@ -154,3 +179,48 @@ def hand_eye_warnings(hand_eye: HandEye) -> list[str]:
             f'{np.degrees(turn):.2f} deg off the others: correct it, or remove it from the poses'
         )
     return warnings
+
+
+def unrelated_cameras(group: Sequence[str], others: Sequence[str]) -> str:
+    """Return why cameras are not in a rig with others."""
+    return (
+        f'{" and ".join(group)} cannot be related to {", ".join(others)}: no frame shows the '
+        'target in both; photograph it where two cameras see it, or turn the rig while each sees '
+        'a board of its own, and give simultaneous photographs the same frame number'
+    )
+
+
+def rig_warnings(
+    rig: RigCalibration, table: Observations, lenses: Mapping[str, Lens]
+) -> Iterator[str]:
+    """Yield what there is to say against a rig; lenses: of each camera, fitted by itself."""
+    if rig.left_out:
+        yield f'left out: {list_frames(table, rig.left_out)}: {FRAME}'
+    if rig.reason:
+        yield rig.reason
+    if rig.cameras == STEREO and is_exchanged(rig.steps()[0]):
+        yield exchanged_cameras(*STEREO)
+    own = max((lenses[name].calibration or {}).get('rms_px', np.inf) for name in rig.cameras)
+    if rig.total_rms_px > MAX_RIG_RATIO * own:
+        yield (
+            f'rms {rig.total_rms_px:.2f} px with a rigid rig, at most {own:.2f} px for each '
+            'camera alone: the cameras moved, their photographs were not simultaneous, or a '
+            'lens is wrong'
+        )
+    for name, shared in zip(rig.cameras, rig.shared.tolist(), strict=True):
+        if shared < MIN_SHARED_FRAMES:
+            yield _few_shared_frames(name, shared, len(rig.cameras))
+            if len(rig.cameras) == 2:
+                return
+
+
+def _few_shared_frames(name: str, shared: int, cameras: int) -> str:
+    one = shared == 1
+    if cameras > 2:
+        what = f'relate{"s" if one else ""} {name} to the others'
+    else:
+        what = 'is shared' if one else 'are shared'
+    return (
+        f'only {shared} frame{"" if one else "s"} {what}, and it is assumed that all '
+        'cameras saw one target; take more photographs of it with two cameras at once'
+    )

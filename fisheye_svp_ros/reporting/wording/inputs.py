@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fisheye_svp_ros.io.lens_formats import READERS_TO_90_DEG, share_beyond_90_deg
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.lens_checks import ExtrapolatedPoints
 from fisheye_svp_ros.solve.mirrored_points import Mirror
 
@@ -167,4 +169,23 @@ def points_extrapolated(what: str, beyond: ExtrapolatedPoints) -> str:
         f'{what}: {100 * beyond.share:.2g} % lie up to '
         f'{np.degrees(beyond.farthest):.0f} deg from the axis, but image points of the '
         f'calibration reach {np.degrees(beyond.known):.0f} deg: nothing is known beyond'
+    )
+
+
+def reader_limit(lens: Lens, form: str) -> str:
+    """Return where the readers of a format end before the image of a lens does; '' elsewhere."""
+    share = share_beyond_90_deg(lens) if form in READERS_TO_90_DEG else 0.0
+    if not share:
+        return ''
+    return (
+        f'{100 * share:.2g} % of the image of {lens.name} lies beyond 90 deg, where '
+        f'{READERS_TO_90_DEG[form]} ends; basalt, nerfstudio and mrcal reach further'
+    )
+
+
+def exchanged_cameras(left: str, right: str) -> str:
+    """Tell of a rig whose left camera stands right of the right one."""
+    return (
+        f'{right} stands to the left of {left}: the baseline is negative, which stereo_image_proc '
+        'refuses; exchange the names, or turn the images upright'
     )
