@@ -113,9 +113,10 @@ def judge_data(
 def _mirrors(evaluation: Evaluation) -> Iterator[Flaw]:
     """Yield cameras whose points are mirror images of what they saw."""
     table, state = evaluation.problem.observations, evaluation.simulation.state
-    for camera, name in enumerate(table.cameras):
+    for camera in np.unique(table.camera).tolist():  # some of a table's may have seen nothing
         lens = state.lenses[camera if len(state.lenses) > 1 else 0]
         if mirror := find_mirror(table.take(table.camera == camera), lens):
+            name = table.cameras[camera]
             yield Flaw(FlawKind.MIRRORED, 0.0, 0.0, camera=name, mirror=mirror)
 
 

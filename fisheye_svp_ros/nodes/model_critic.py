@@ -318,6 +318,7 @@ def _lines(diagnosis: Diagnosis) -> list[str]:
     return [
         line.rstrip('.') + '.'
         for line in terminal_lines(first_screen(diagnosis, 'image_points'), '')
+        if line
     ]
 
 

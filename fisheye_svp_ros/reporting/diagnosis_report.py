@@ -102,6 +102,8 @@ def write_report(
             inputs=inputs,
             percent=percent,
             significance=NAMED_P,
+            moving=any(cause.effect_class.stage != 'noise' for cause in diagnosis.causes),
+            removed=diagnosis.evaluation.gains['named'],
             screen=first_screen(diagnosis, inputs.observations, known),
             command=command_to_go_on(diagnosis, inputs),
             verdict=verdict_words(diagnosis),

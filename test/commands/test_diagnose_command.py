@@ -43,7 +43,8 @@ from fisheye_svp_ros.reporting import diagnosis_plots, evidence_plots
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
 from fisheye_svp_ros.reporting.wording.causes import cause_rows, intrinsic_rows
 from fisheye_svp_ros.reporting.wording.diagnosis import advice_text, verdict_sentences
-from fisheye_svp_ros.reporting.wording.first_screen import headline
+from fisheye_svp_ros.reporting.wording.first_screen import largest_cause
+from fisheye_svp_ros.reporting.wording.first_screen import wrong as what_is_wrong
 from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
@@ -305,7 +306,7 @@ class TestTerminal:
     def test_nothing_wrong(self, scene, capsys):
         assert run('clean.csv', scene) == 0
         out = ' '.join(capsys.readouterr().out.split())
-        assert out.startswith('No model error shows in these data. Keep the lens. ')
+        assert out.startswith('Keep the lens. Wrong: No model error shows in these data. ')
         assert 'Not excluded: viewpoint_shift up to' in out and 'px' in out
 
     def test_intrinsics_of_another_day_are_told(self, scene, capsys, tmp_path):
@@ -508,25 +509,25 @@ class TestWords:
                 for name, value in zip('xyz', (0.1, 0.2, 0.6), strict=True)
             },
         )
-        words = headline(with_changes(found, causes=[first, board]))
-        assert words.startswith(
-            'The relative poses of the boards are wrong (board1.z = 0.60 ± '
-            '0.10 mm), and the viewpoint of the lens shifts with the '
-            'angle (e0 = '
+        words = largest_cause(with_changes(found, causes=[first, board]))
+        assert re.fullmatch(
+            r'The relative poses of the boards are wrong \(board1.z = 0.60 ± 0.10 mm\), and the '
+            r'viewpoint of the lens moves by [\d.]+ mm from the axis to \d+ deg',
+            words,
         )
 
     def test_points_that_are_set_aside_are_no_riddle(self, found):
         gross = [{'frame': 4, 'landmark': 17, 'px': 12.3456, 'why': 'far off'}] * 2
         left = [Structure('outliers', 0.0, 0.5)]
         clean = with_changes(found, causes=[], advice=[], remaining=left, gross=gross)
-        assert headline(clean).startswith('2 image points are outliers; nothing else is wrong')
+        assert what_is_wrong(clean).startswith(
+            '2 image points are outliers; nothing else is wrong'
+        )
         *_, following = verdict_sentences(clean)
         partly = with_changes(found, remaining=left, gross=gross)
-        assert headline(partly).startswith(
-            'The viewpoint of the lens shifts with the angle (e0 = '
-        )
+        assert what_is_wrong(partly).startswith('The viewpoint of the lens moves by ')
         more = [*left, Structure('range', 1e-9, 0.3)]
-        assert headline(with_changes(clean, remaining=more)).startswith(
+        assert what_is_wrong(with_changes(clean, remaining=more)).startswith(
             'No effect of the catalog explains the residual error'
         )
         *_, following = verdict_sentences(with_changes(clean, remaining=more))

@@ -16,6 +16,7 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.optics.camera import back_project
 from fisheye_svp_ros.reporting.wording.first_screen import (
+    MAX_WORDS,
     first_screen,
     terminal_lines,
     tone,
@@ -81,6 +82,17 @@ def test_sound_data_are_adequate():
     assert tone(found) == 'adequate' and 'describes these data' in verdict_words(found)
 
 
+@pytest.mark.parametrize(
+    'name', [pytest.param(name, marks=once(name)) for name in (*FLAWED, 'sound')]
+)
+def test_what_is_read_first_is_short(name):
+    """A headline of at most 25 words, and four lines of as many; all else is below."""
+    lines = terminal_lines(first_screen(diagnosed(name), 'set.csv'), 'fisheye-svp localize a')
+    first = lines[: lines.index('')]
+    assert len(first) <= 5
+    assert max(len(line.split()) for line in first) <= MAX_WORDS
+
+
 @once('zoom alternates')
 def test_alternating_zoom_is_told_in_percent_and_by_frames():
     flaw = diagnosed('zoom alternates').adequacy.flaws[0]
@@ -104,7 +116,7 @@ def test_angle_of_the_points_is_told():
     flaw = diagnosed('central').adequacy.flaws[0]
     assert np.degrees(flaw.size) == pytest.approx(11, abs=3)
     said = screen(diagnosed('central'))
-    assert 'nothing is known beyond' in said
+    assert re.search(r'Points reach \d+ of the \d+ deg that the lens claims', said)
     assert re.search(r'Undecided about the lens beyond \d+ deg; use it only within, or', said)
 
 

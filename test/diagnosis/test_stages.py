@@ -19,7 +19,7 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.effects.recording_effects import FocalDriftEffect, SessionStepEffect
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.reporting.wording.first_screen import first_screen, headline
+from fisheye_svp_ros.reporting.wording.first_screen import first_screen, wrong
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
@@ -180,7 +180,7 @@ def test_one_frame_confirms_nothing_and_is_not_adequate():
         Reason.NO_OTHER_FRAME,
         Reason.REFUTED_BY_FRAMES,
     }
-    assert headline(found).startswith('Errors show in one frame')
+    assert wrong(found).startswith('Errors show in one frame')
     screen = first_screen(found, 'table')
     assert 'points in 1 frame;' in screen.facts
     listed = screen.candidates

@@ -73,7 +73,7 @@ def test_reversed_photographs_are_named_and_put_in_order() -> None:
     (told,) = (
         line
         for line in terminal_lines(first_screen(found, 'x'), '')
-        if line.startswith('Photographs: ')
+        if line.startswith('Photographs, why: ')
     )
     assert (
         'numbered from another end of the board, and reordered: left03.png, left08.png, '

@@ -20,6 +20,8 @@ LENS = {
     'recalibrate': ['Do not use the lens as given'],
     'undecided': [
         'Undecided about the lens',
+        'Use the lens only where that is good enough',
+        'Use the lenses only where that is good enough',
         'Do not rely on the lens',
         'Do not use a lens that was calibrated from these data',
         'cannot be judged before lengths are in m',

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import degrees
+from math import degrees, hypot
 from typing import NamedTuple
 
 from fisheye_svp_ros.diagnosis import Diagnosis
 from fisheye_svp_ros.reporting.wording.causes import COMPONENTS, pixels
 from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE, RemainingError, remaining_error
+from fisheye_svp_ros.solve.ray_errors import MAX_RAY_ERROR
 
-_COARSE_RATIO = 3.0  # times the noise of a point: rays known no better are no good ones
 _EXTRAPOLATED_RATIO = 1.1  # of the angle that a lens claims to that of the points
 _REMAINING_PARTS = {
     'lens': '{} of that stays in the image ({})',
@@ -23,7 +23,8 @@ _NEARLY_ALL, _MOST = 0.8, 0.5  # of the squares
 class UsedRays(NamedTuple):
     """Expected ray errors, mrad, of the lens that is to be used, and of the lens as given.
 
-    range_m, reached: where, m and rad; point_mrad: noise of a point, of both coordinates.
+    range_m, reached: where, m and rad; point_mrad: noise of a point, of both coordinates;
+    frames_mrad: what the camera changes from frame to frame.
     """
 
     used: Mapping[str, float]
@@ -31,6 +32,7 @@ class UsedRays(NamedTuple):
     range_m: float
     reached: float
     point_mrad: float
+    frames_mrad: float
 
     @property
     def ratio(self) -> float:
@@ -40,9 +42,10 @@ class UsedRays(NamedTuple):
     @property
     def quality(self) -> str:
         """How good the lens is."""
-        how = 'known only' if self.ratio > _COARSE_RATIO else 'good'
+        bound = hypot(self.used['high'], self.frames_mrad)
+        how = 'known only' if bound > 1e3 * MAX_RAY_ERROR else 'good'
         where = f'at {self.range_m:g} m within {degrees(self.reached):.0f} deg'
-        return f'{how} to {self.used["high"]:.2g} mrad {where} (95 %)'
+        return f'{how} to {bound:.2g} mrad {where} (95 %)'
 
 
 def used_rays(d: Diagnosis) -> UsedRays | None:
@@ -58,7 +61,8 @@ def used_rays(d: Diagnosis) -> UsedRays | None:
     lens = next(iter(d.evaluation.problem.inputs.lenses.values()))
     point = 1e3 * max(2**0.5 * d.noise_px, 1e-3) / lens.fx
     used = extended if d.offers_extended else given
-    return UsedRays(used, given, asked, d.adequacy.reached, point)
+    frames = 1e3 * d.adequacy.frames_error
+    return UsedRays(used, given, asked, d.adequacy.reached, point, frames)
 
 
 def accuracy(d: Diagnosis) -> str:

@@ -47,68 +47,50 @@ _OF_LENS = {
 
 
 def flaw_statement(flaw: Flaw) -> str:
-    """Return what is wrong as a clause."""
-    of = f' of {flaw.camera}' if flaw.camera else ''
+    """Return what is wrong as a clause, with the frames that it is about."""
     groups = [frame_list(*pair) for pair in zip(flaw.groups, _names(flaw), strict=True)]
+    frames = {
+        FlawKind.CAMERAS_MIXED: f', one lens leaves {flaw.size:.2g} px ({_noise(flaw)}): '
+        f'{"; ".join(groups)}',
+        FlawKind.FOCAL_VARIES: f': {" against ".join(groups)}',
+        FlawKind.SIDES_DIFFER: f', so their corners are in mirrored order: {"".join(groups)}',
+    }
+    if flaw.kind in (FlawKind.CENTER_VARIES, FlawKind.FRAMES_DIFFER):
+        return f'{flaw_summary(flaw)}, most in {_first_frames(flaw)}'
+    return flaw_summary(flaw) + frames.get(flaw.kind, '')
+
+
+def flaw_summary(flaw: Flaw) -> str:
+    """Return what is wrong as a clause of few words."""
+    of = f' of {flaw.camera}' if flaw.camera else ''
+    count = _COUNTS.get(len(flaw.groups), str(len(flaw.groups)))
+    px, mrad, angle = f'{flaw.size:.2g} px', f'{1e3 * flaw.size:.2g} mrad', degrees(flaw.size)
     if flaw.mirror:
         return f'every frame{of} shows the board from behind: {MIRROR_WORDS[flaw.mirror]}'
-    if flaw.kind == FlawKind.TARGET_TOO_LARGE:
-        return f'the target is {flaw.size:.0f} m across: x, y, z must be in m, not in mm'
-    if flaw.kind == FlawKind.SHIFT_TOO_LARGE:
-        return (
-            f'the viewpoint would shift by {1e3 * flaw.size:.0f} mm, more than in any real lens: '
-            'x, y, z are probably not in m'
-        )
-    if flaw.kind == FlawKind.CAMERAS_MIXED:
-        count = _COUNTS.get(len(groups), str(len(groups)))
-        return (
-            f'{count} groups of frames are of {count} cameras, one lens leaves {flaw.size:.2g} px '
-            f'({_noise(flaw)}): {"; ".join(groups)}'
-        )
-    if flaw.kind == FlawKind.FOCAL_VARIES:
-        return (
-            f'the focal length{of} differs from frame to frame by {100 * flaw.size:.2g} %: '
-            f'{" against ".join(groups)}'
-        )
-    if flaw.kind == FlawKind.CENTER_VARIES:
-        return (
-            f'the image{of} is shifted by {flaw.size:.2g} px rms from frame to frame, most in '
-            f'{_first_frames(flaw)}'
-        )
-    if flaw.kind == FlawKind.FRAMES_DIFFER:
-        return (
-            f'frames contradict each other: {flaw.size:.2g} px are left ({_noise(flaw)}), most in '
-            f'{_first_frames(flaw)}'
-        )
-    if flaw.kind == FlawKind.NO_FIT:
-        return f'no camera fits: {flaw.size:.2g} px are left ({_noise(flaw)})'
-    if flaw.kind == FlawKind.FEW_FRAMES:
-        count = f'{flaw.size:.0f} frames are' if flaw.size > 1 else 'one frame is'
-        return f'{count} too few to judge the lens'
-    if flaw.kind == FlawKind.SIDES_DIFFER:
-        return (
-            f'{flaw.size:.0f} of {flaw.beside:.0f} frames see the board from behind, so their '
-            f'corners are numbered in mirrored order: {groups[0]}'
-        )
-    if flaw.kind == FlawKind.NOISE_TOO_LARGE:
-        return (
-            f'the noise of the image points is {flaw.size:.1f} px, far more than a detector '
-            'leaves (0.02 to 0.3 px)'
-        )
-    if flaw.kind == FlawKind.LENS_UNKNOWN:
-        return (
-            f'these views leave rays{of} uncertain by up to {1e3 * flaw.size:.2g} mrad '
-            f'({1e3 * flaw.size:.2g} mm at 1 m)'
-        )
-    if flaw.kind == FlawKind.ANGLE_SHORT:
-        return (
-            f'points{of} reach {degrees(flaw.size):.0f} deg, the lens claims '
-            f'{degrees(flaw.beside):.0f} deg: nothing is known beyond {degrees(flaw.size):.0f} deg'
-        )
-    return (
-        f'the principal point{of} lies {flaw.size:.0f}, {flaw.beside:.0f} px off the center of '
-        'the image'
-    )
+    texts = {
+        FlawKind.TARGET_TOO_LARGE: f'the target is {flaw.size:.0f} m across: x, y, z must be in '
+        'm, not in mm',
+        FlawKind.SHIFT_TOO_LARGE: f'the viewpoint would shift by {1e3 * flaw.size:.0f} mm, more '
+        'than in any real lens: x, y, z are probably not in m',
+        FlawKind.CAMERAS_MIXED: f'{count} groups of frames are of {count} cameras',
+        FlawKind.FOCAL_VARIES: f'the focal length{of} differs from frame to frame by '
+        f'{100 * flaw.size:.2g} %',
+        FlawKind.CENTER_VARIES: f'the image{of} is shifted by {px} rms from frame to frame',
+        FlawKind.FRAMES_DIFFER: f'frames contradict each other: {px} are left ({_noise(flaw)})',
+        FlawKind.NO_FIT: f'no camera fits: {px} are left ({_noise(flaw)})',
+        FlawKind.FEW_FRAMES: (f'{flaw.size:.0f} frames are' if flaw.size > 1 else 'one frame is')
+        + ' too few to judge the lens',
+        FlawKind.SIDES_DIFFER: f'{flaw.size:.0f} of {flaw.beside:.0f} frames see the board from '
+        'behind',
+        FlawKind.NOISE_TOO_LARGE: f'the noise of the image points is {flaw.size:.1f} px, far more '
+        'than a detector leaves (0.02 to 0.3 px)',
+        FlawKind.LENS_UNKNOWN: f'these views leave rays{of} uncertain by up to {mrad} at 1 m',
+        FlawKind.ANGLE_SHORT: f'points{of} reach {angle:.0f} of the {degrees(flaw.beside):.0f} '
+        'deg that the lens claims',
+        FlawKind.OFF_CENTER: f'the principal point{of} lies {flaw.size:.0f}, {flaw.beside:.0f} px '
+        'off the center of the image',
+    }
+    return texts[flaw.kind]
 
 
 def flaw_remedy(flaw: Flaw) -> str:
@@ -117,9 +99,9 @@ def flaw_remedy(flaw: Flaw) -> str:
 
 
 def flaw_headline(flaw: Flaw) -> str:
-    """Return what is wrong as the start of a sentence."""
-    statement = flaw_statement(flaw)
-    return statement[0].upper() + statement[1:]
+    """Return what is wrong as the start of a sentence, in few words."""
+    summary = flaw_summary(flaw)
+    return summary[0].upper() + summary[1:]
 
 
 def flaw_reason(flaws: Sequence[Flaw], about: str) -> str:

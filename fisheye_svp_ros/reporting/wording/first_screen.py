@@ -1,6 +1,7 @@
-"""The first screen of a report, and the ten lines of the terminal: the same words for both.
+"""The first screen of a report and of the terminal: the same words for both.
 
-The headline is the largest cause, and what to do about the lens.
+A headline says whether the lens may be used, how good it is and where; four lines say what is
+wrong, by its size, and what to do.  Why, and all else, is below.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from fisheye_svp_ros.diagnosis import (
 )
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.blocks import image_uri
-from fisheye_svp_ros.reporting.wording.accuracy import accuracy, single_points, used_rays
+from fisheye_svp_ros.reporting.wording.accuracy import accuracy, used_rays
 from fisheye_svp_ros.reporting.wording.adequacy import flaw_headline, flaw_statement
 from fisheye_svp_ros.reporting.wording.causes import (
     COMPONENTS,
@@ -59,7 +60,6 @@ from fisheye_svp_ros.reporting.wording.diagnosis import (
     known_rows,
     lens_words,
     only_gross,
-    remaining_error,
 )
 from fisheye_svp_ros.reporting.wording.external import travel_sentence
 from fisheye_svp_ros.scene.observations import photograph_names
@@ -70,6 +70,7 @@ _MIN_SIGMAS = 2.0  # a size nearer to 0 stands in no headline
 _MIN_CONFIDENCE = 0.5  # what is less is no reason for what a decision says
 _LENS = 'Lens'
 _THUMBNAIL = 96  # px, the longer side
+MAX_WORDS = 25  # of the headline, and of each line below it
 _VERDICTS = {
     'adequate': 'Adequate: the simulation of the lens describes these data',
     'explained': 'Explained: the model error is identified',
@@ -111,11 +112,13 @@ class AnswerLine(NamedTuple):
 class Screen(NamedTuple):
     """What is read first; warning: '' unless an error rises with the causes in the model.
 
-    accuracy: what to reckon with, '' where nothing is known of it; travel: '' unless there is
-    another set.
+    wrong: what is, with its size, and what correcting it gains; flaws: of the data; accuracy: what
+    to reckon with, '' where nothing is known of it; travel: '' unless there is another set.
     """
 
     headline: str
+    wrong: str
+    flaws: tuple[str, ...]
     facts: str
     warning: str
     actions: tuple[AnswerLine, ...]
@@ -146,6 +149,8 @@ def first_screen(
     )
     return Screen(
         headline(d),
+        wrong(d),
+        tuple(map(flaw_statement, d.adequacy.flaws)),
         _facts(d, source),
         _warning(d),
         tuple(
@@ -188,25 +193,31 @@ def _reason(decision: Decision, d: Diagnosis) -> str:
 
 
 def terminal_lines(screen: Screen, command: str) -> list[str]:
-    """Return the screen as at most eleven lines, one more where there is another set."""
-    lines = [*filter(None, [screen.travel]), screen.headline, screen.facts]
-    lines += [f'Warning: {screen.warning}'] if screen.warning else []
+    """Return the headline, four lines of what is wrong and what to do, and the details below."""
+    first, details = [*filter(None, [screen.travel]), screen.headline], [f'Data: {screen.facts}']
+    first += [f'Wrong: {screen.wrong}.'] if screen.wrong else []
+    details += [f'Flaw: {_capital(flaw)}.' for flaw in screen.flaws]
+    details += [f'Warning: {screen.warning}'] if screen.warning else []
     for action in screen.actions:
         names = ', '.join(photo.name for photo in action.photographs)
         names += f' and {action.more} more' if action.more else ''
-        # Of the lens it is the decision that is sure, of others the reason.
+        do = f'{action.about}: {action.do}{names and f": {names}"}.'
         sure = f' ({action.sure})' if action.sure else ''
-        first, last = (sure, '') if action.about == _LENS else ('', sure)
-        lines.append(
-            f'{action.about}: {action.do}{first}{names and f": {names}"}. {action.why}{last}.'
-        )
-        if action.about == _LENS and screen.accuracy:
-            lines.append(f'Accuracy: {screen.accuracy}.')
-    lines += [f'Causes: {screen.causes}'] if screen.causes else []
-    lines += [f'Against the truth: {screen.truth}'] if screen.truth else []
-    lines += [f'Not confirmed: {screen.candidates}'] if screen.candidates else []
-    lines += [f'Not excluded: {screen.bound}'] if screen.bound else []
-    return [*lines, f'Next: {command}'] if command else lines
+        why = f'{action.why}{sure}.'
+        if action.about == _LENS:
+            details.append(f'{_LENS}: {action.do}. {why}')
+            details += [f'Accuracy: {screen.accuracy}.'] if screen.accuracy else []
+        elif len(f'{do} {why}'.split()) <= MAX_WORDS:
+            first.append(f'{do} {why}')
+        else:
+            first.append(do)
+            details.append(f'{action.about}, why: {why}')
+    details += [f'Causes: {screen.causes}'] if screen.causes else []
+    details += [f'Against the truth: {screen.truth}'] if screen.truth else []
+    details += [f'Not confirmed: {screen.candidates}'] if screen.candidates else []
+    details += [f'Not excluded: {screen.bound}'] if screen.bound else []
+    first += [f'Next: {command}'] if command else []
+    return [*first, '', *details]
 
 
 def _facts(d: Diagnosis, source: str) -> str:
@@ -352,24 +363,49 @@ def photographs_words(d: Diagnosis) -> str:
 
 
 def headline(d: Diagnosis) -> str:
-    """Return the largest cause and the decision about the lens, or what is wrong with the data."""
-    lens = lens_words(d)
-    remaining, rays = remaining_error(d), used_rays(d)
+    """Return whether the lens may be used, how good it is and where, or what is wrong instead."""
+    lens, rays = lens_words(d), used_rays(d)
     if d.adequacy.flaws:
-        it = 'They are' if len(d.lenses) > 1 else 'It is'
-        good = f' {it} {rays.quality}.' if rays else ''
-        return f'{flaw_headline(d.adequacy.flaws[0])}. {lens}.{good}'
-    more = len(d.causes) - len(_headline_causes(d))
-    parts = [f'{largest_cause(d)}{_displaced_landmarks(d)}']
-    parts += [f'{more} more cause{"s" * (more > 1)} below'] if more else []
-    if d.causes and d.open_lens is not None:
-        parts.append(unconfirmed_effects(d.open_lens))
+        return f'{flaw_headline(d.adequacy.flaws[0])}. {lens}.'
     if d.decision['lens'].say != 'recalibrate' and rays:
         undecided = d.decision['lens'].say == 'undecided'
         lens += f'; until then it is {rays.quality}' if undecided else f': {rays.quality}'
-        if remaining is not None:
-            lens += f'; single points are off by {single_points(d, remaining)}'
-    return f'{"; ".join(parts)}. {lens}.'
+    return f'{lens}.'
+
+
+def wrong(d: Diagnosis) -> str:
+    """Return what is wrong, largest first, with its size, as a clause of at most MAX_WORDS.
+
+    '' where the headline says it.
+    """
+    if d.adequacy.is_misfit:
+        statement = flaw_statement(d.adequacy.flaws[0])
+        return _capital(statement) if len(statement.split()) < MAX_WORDS else ''
+    if d.adequacy.flaws and not d.causes:
+        return ''
+    more = len(d.causes) - len(_headline_causes(d))
+    parts = [f'{largest_cause(d)}{_displaced_landmarks(d)}']
+    if d.causes and d.open_lens is not None:
+        parts.append(unconfirmed_effects(d.open_lens))
+    gain = _gain(d)
+    ends = [f'{more} more cause{"s" * (more > 1)} below'] * (more > 0) + [gain] * bool(gain)
+    text = '; '.join([*parts, *ends])
+    if len(text.split()) < MAX_WORDS or not d.causes:
+        return text
+    first = _headline_causes(d)[0]
+    likeliest = max(first.odds, key=lambda name: first.odds[name], default=first.effect)
+    short = _statement(d, first) if likeliest == first.effect else _describe(likeliest)
+    rest = len(d.causes) - 1
+    others = ['alternatives below'] if first.indistinguishable_from else []
+    others += [f'{rest} more cause{"s" * (rest > 1)} below'] * (rest > 0)
+    return '; '.join([_capital(short), *others, *([gain] * bool(gain))])
+
+
+def _gain(d: Diagnosis) -> str:
+    """Return what correcting the causes gains on frames left out: the one pair of figures."""
+    base, named = (quality.heldout_rms_px for quality in (d.figures.base, d.figures.named))
+    moving = any(cause.effect_class.stage != 'noise' for cause in d.causes)
+    return f'left-out frames {pixels(base)} → {pixels(named)} px' if moving else ''
 
 
 def verdict_words(d: Diagnosis) -> str:
@@ -468,7 +504,7 @@ def _displaced_landmarks(d: Diagnosis) -> str:
         or target.confidence is None
     ):
         return ''
-    return f', and landmarks of the target are displaced ({target.figure.value:.2g} px)'
+    return f', and landmarks are displaced ({target.figure.value:.2g} px)'
 
 
 def _sentence(d: Diagnosis, cause: Cause) -> str:
@@ -514,6 +550,8 @@ def _statement(d: Diagnosis, cause: Cause) -> str:
         several = len(np.unique(d.evaluation.problem.observations.board)) > 1
         which = f'Board {worst.board}' if several else 'The board'
         return f'{which} is bent by {1e3 * worst.peak_to_valley:.2g} mm'
+    if cause.effect == 'viewpoint_shift':
+        return f'The viewpoint of the lens moves by {viewpoint_path(d)}'
     words = cause.effect_class.headline or _capital(describe_effect(cause.effect))
     if cause.effect == 'landmark_scale' and 'relative' not in cause.parameters:
         words = 'The target is stretched'
@@ -524,6 +562,24 @@ def _statement(d: Diagnosis, cause: Cause) -> str:
         else most_significant(cause.parameters, _MIN_SIGMAS)
     )
     return f'{words} ({how})' if how else words
+
+
+def viewpoint_path(d: Diagnosis) -> str:
+    """Return how far the viewpoint moves from the axis to where points are; e0 is no length.
+
+    Of several cameras, the farthest.
+    """
+    angle = d.adequacy.reached
+    ends = np.array([0.0, angle])
+    moved = max(
+        (
+            float(np.ptp(lens.viewpoint_shift.value_and_slope(ends, np.tan(ends / 2))[0]))
+            for lens in d.lenses.values()
+            if lens.viewpoint_shift is not None
+        ),
+        default=0.0,
+    )
+    return f'{1e3 * moved:.2g} mm from the axis to {np.degrees(angle):.0f} deg'
 
 
 def _capital(text: str) -> str:
