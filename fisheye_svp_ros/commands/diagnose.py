@@ -40,7 +40,7 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import check_sizes, read_poses
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.scene.observations import Observations, photograph_names
+from fisheye_svp_ros.scene.observations import Observations, photograph_column
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis import Comparison, Diagnosis
@@ -386,19 +386,6 @@ def _write(
 def _write_residuals(path: Path, points: PointResiduals, table: Observations) -> None:
     cameras = np.array(table.cameras)[points.camera]
     named = {'camera': cameras} if len(table.cameras) > 1 else {}
-    names = photograph_names(table)
-    photographs = (
-        {
-            'photograph': np.array(
-                [
-                    names.get(view, '')
-                    for view in zip(points.frame.tolist(), cameras.tolist(), strict=True)
-                ]
-            )
-        }
-        if names
-        else {}
-    )
     write_table(
         path,
         {
@@ -414,6 +401,6 @@ def _write_residuals(path: Path, points: PointResiduals, table: Observations) ->
             'theta': points.theta,
             'range': points.range,
             'outlier': points.outlier.astype(int),
-            **photographs,
+            **photograph_column(table, points.frame, cameras.tolist()),
         },
     )

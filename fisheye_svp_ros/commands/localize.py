@@ -41,6 +41,7 @@ from fisheye_svp_ros.scene.observations import (
     Observations,
     frame_name,
     list_frames,
+    photograph_column,
     photograph_entry,
 )
 from fisheye_svp_ros.solve.localization import sight
@@ -238,13 +239,20 @@ def _parts_text(uncertainty: _Parts) -> str:
     return f'standard errors with those of the lens (rms of positions: {shares})'
 
 
-def _write_poses(folder: Path, frame: Index, pose: Pose, covariance: Array) -> None:
-    """Write poses (F,) and their covariances (F, 6, 6)."""
-    write_poses(folder / 'poses.csv', frame, pose)
+def _write_poses(
+    folder: Path, table: Observations, frame: Index, pose: Pose, covariance: Array
+) -> None:
+    """Write poses (F,) and their covariances (F, 6, 6); table: whose photographs they are of."""
+    photographs = photograph_column(table, frame)
+    write_poses(folder / 'poses.csv', frame, pose, photographs)
     names = [f'{a}_{b}' for a in _AXES for b in _AXES]
     write_table(
         folder / 'covariance.csv',
-        {'frame': frame, **dict(zip(names, covariance.reshape(-1, 36).T, strict=True))},
+        {
+            'frame': frame,
+            **dict(zip(names, covariance.reshape(-1, 36).T, strict=True)),
+            **photographs,
+        },
     )
 
 
@@ -256,7 +264,7 @@ def _write(
     uncertainty: _Parts | None,
 ) -> None:
     views, result = measured.views, measured.result
-    _write_poses(folder, views.frame, result.pose, result.covariance)
+    _write_poses(folder, table, views.frame, result.pose, result.covariance)
     used = views.used
     frame = np.broadcast_to(views.frame[:, None], used.shape)
     theta, distance = sight(model, result.pose, views)
@@ -271,6 +279,7 @@ def _write(
             'dv': result.residual[used][:, 1],
             'theta': theta[used],
             'range': distance[used],
+            **photograph_column(table, frame[used]),
         },
     )
     write_json(
@@ -282,7 +291,12 @@ def _write(
             'left_out': measured.left_out,
             'sigma_px': measured.sigma,
             'poses': [
-                {'frame': int(frame), 'ambiguous': bool(second), 'odds': float(odds)}
+                {
+                    'frame': int(frame),
+                    **photograph_entry(table, int(frame)),
+                    'ambiguous': bool(second),
+                    'odds': float(odds),
+                }
                 for frame, second, odds in zip(
                     views.frame, is_ambiguous(result), pose_odds(result), strict=True
                 )
@@ -309,7 +323,8 @@ def _write(
 
 def _write_rig(folder: Path, cameras: tuple[str, ...], localization: RigLocalization) -> None:
     data, views, residual = localization.data, localization.data.views, localization.residual
-    _write_poses(folder, localization.frame, localization.pose, localization.covariance)
+    table, names = localization.table, localization.table.cameras
+    _write_poses(folder, table, localization.frame, localization.pose, localization.covariance)
     used = views.used
     frame, camera = (
         np.broadcast_to(part[:, None], used.shape)[used] for part in (views.frame, data.camera_of)
@@ -318,12 +333,13 @@ def _write_rig(folder: Path, cameras: tuple[str, ...], localization: RigLocaliza
         folder / 'residuals.csv',
         {
             'frame': frame,
-            'camera': np.array(localization.table.cameras)[camera],
+            'camera': np.array(names)[camera],
             'landmark': views.landmark[used],
             'u': views.uv[used][:, 0],
             'v': views.uv[used][:, 1],
             'du': residual[used][:, 0],
             'dv': residual[used][:, 1],
+            **photograph_column(table, frame, [names[one] for one in camera]),
         },
     )
     write_json(

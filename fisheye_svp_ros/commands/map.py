@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+import numpy as np
+
 from fisheye_svp_ros.commands.detect import positive_count
 from fisheye_svp_ros.commands.lenses import add_lens_argument, lenses_of, load_lenses
 from fisheye_svp_ros.commands.notes import say
@@ -80,4 +82,9 @@ def run(args: argparse.Namespace) -> None:
     if args.output:
         with write_together():
             write_tag_map(tags, args.output, tag_map.stderr, 'fisheye-svp map')
-            write_poses(args.output.with_suffix('.poses.csv'), tag_map.images, tag_map.cameras)
+            write_poses(
+                args.output.with_suffix('.poses.csv'),
+                tag_map.images,
+                tag_map.cameras,
+                {'photograph': np.array(seen.names)[tag_map.images]},
+            )

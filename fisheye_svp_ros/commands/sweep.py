@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import fcntl
+import os
 import shutil
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -88,26 +90,55 @@ def run(args: argparse.Namespace) -> None:
             f'{path}: {len(plan.sweep)} scenarios ({lengths}); add --large to run them all'
         )
     parts = TableParts(args.output / _PARTS, column_types(plan))
+    with _sole_writer(parts.folder):
+        _run(args, path, plan, parts)
+        shutil.rmtree(parts.folder, ignore_errors=True)
+
+
+@contextmanager
+def _sole_writer(folder: Path) -> Iterator[None]:
+    """Hold a folder, which is made, for this process; raise OutputError where another has it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as cause:
+        raise OutputError(f'{folder}: cannot be written ({cause.strerror})') from cause
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # parts are kept for --resume
+                folder.rmdir()
+    except BlockingIOError as cause:
+        raise OutputError(
+            f'{folder.parent}: another sweep is writing there; wait for it, or choose another -o'
+        ) from cause
+    finally:
+        os.close(handle)
+
+
+def _run(args: argparse.Namespace, path: Path, plan: Plan, parts: TableParts) -> None:
     mine = fingerprint(plan)
     summary = args.output / _SUMMARY
-    if (
-        args.resume
-        and summary.exists()
-        and (read_json(summary, OutputError).get('fingerprint') == mine)
-    ):
-        say(f'{args.output} already holds this sweep')
-    else:
-        engine = _claim(parts, mine, args.resume, work(plan))
-        _solve(args, plan, parts, engine)
-        if missing := {numbers.start for numbers in tasks(plan)} - parts.numbers():
-            raise OutputError(
-                f'{parts.folder}: {len(missing)} parts of the sweep are missing; '
-                'compute them again with --resume'
-            )
-        with write_together():
-            _report(path, args.output, plan, mine, _join(args.output / 'sweep', plan, parts))
-        note_formats()
-    shutil.rmtree(parts.folder, ignore_errors=True)
+    if args.resume and summary.exists():
+        if read_json(summary, OutputError).get('fingerprint') == mine:
+            say(f'{args.output} already holds this sweep')
+            return
+        raise OutputError(
+            f'{args.output}: it holds another, finished sweep; choose another -o, or leave '
+            '--resume out to replace it'
+        )
+    engine = _claim(parts, mine, args.resume, work(plan))
+    _solve(args, plan, parts, engine)
+    if missing := {numbers.start for numbers in tasks(plan)} - parts.numbers():
+        raise OutputError(
+            f'{parts.folder}: {len(missing)} parts of the sweep are missing; '
+            'compute them again with --resume'
+        )
+    with write_together():
+        _report(path, args.output, plan, mine, _join(args.output / 'sweep', plan, parts))
+    note_formats()
 
 
 def _claim(parts: TableParts, mine: str, resume: bool, points: int) -> str:

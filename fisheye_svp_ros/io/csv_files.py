@@ -13,6 +13,7 @@ import io
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -335,9 +336,17 @@ def read_poses(path: str | Path) -> FramePoses:
     return FramePoses(frame[order], pose.take(order))
 
 
-def write_poses(path: str | Path, frame: Index, pose: Pose) -> None:
-    """Write frames (F,) and poses (F,).  Raises OutputError where the file cannot be written."""
-    write_table(path, pose_columns(frame, pose))
+def write_poses(
+    path: str | Path,
+    frame: Index,
+    pose: Pose,
+    more: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+) -> None:
+    """Write frames (F,) and poses (F,); more: columns (F,), which no reader asks for.
+
+    Raises OutputError where the file cannot be written.
+    """
+    write_table(path, pose_columns(frame, pose) | dict(more))
 
 
 def pose_columns(frame: Index, pose: Pose) -> dict[str, NDArray[Any]]:

@@ -13,6 +13,7 @@ from pathlib import PurePath
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array, Batch, Index, Mask
 from fisheye_svp_ros.errors import ObservationError
@@ -349,6 +350,24 @@ def photograph_names(table: Observations) -> dict[tuple[int, str], str]:
     paths = {(frame, camera): PurePath(path) for frame, camera, path in table.photographs}
     parts = 1 if len({path.name for path in paths.values()}) == len(paths) else 2
     return {key: '/'.join(path.parts[-parts:]) for key, path in paths.items()}
+
+
+def photograph_column(
+    table: Observations, frames: Index, cameras: Sequence[str] | None = None
+) -> dict[str, NDArray[np.str_]]:
+    """Return the column of a table that has rows of frames (N,), and of cameras (N,) if given.
+
+    The photographs of each row; no column where none is known.
+    """
+    if not table.photographs:
+        return {}
+    views: list[tuple[int, str | None]] = [(frame, None) for frame in frames.tolist()]
+    if cameras is not None:
+        views = list(zip(frames.tolist(), cameras, strict=True))
+    names = {
+        view: photograph_entry(table, *view).get('photograph', '') for view in dict.fromkeys(views)
+    }
+    return {'photograph': np.array([names[view] for view in views])}
 
 
 def frame_names(table: Observations, frame: int, camera: str | None = None) -> list[str]:

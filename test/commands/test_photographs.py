@@ -122,7 +122,13 @@ def test_a_table_of_detected_points_replaces_the_photographs(
         assert cli.main(command.split()) == 0
     found = json.loads(Path('diagnosis/diagnosis.json').read_text())
     assert [cause['effect'] for cause in found['causes']] == ['viewpoint_shift']
-    rms = json.loads(Path('poses/localize.json').read_text())['rms_px']
+    document = json.loads(Path('poses/localize.json').read_text())
+    rms = document['rms_px']
+    assert [one['photograph'] for one in document['poses']][:2] == ['00.png', '01.png']
+    for table in ('poses', 'covariance', 'residuals'):
+        rows = Path(f'poses/{table}.csv').read_text().splitlines()
+        assert rows[0].endswith(',photograph') and rows[1].endswith(',00.png')
+    assert len(read_poses('poses/poses.csv').frame) == len(document['poses'])
     assert 3 * rms < load_lens(Path('lens.yaml')).calibration['rms_px'] < 0.1
 
 

@@ -11,6 +11,7 @@ from fisheye_svp_ros.scene.observations import (
     frame_name,
     list_frames,
     make_observations,
+    photograph_column,
     photograph_entry,
     photograph_names,
 )
@@ -67,3 +68,15 @@ def test_frames_without_photographs_keep_their_numbers() -> None:
     assert photograph_entry(bare, 1) == {}
     assert list_frames(bare, [3, 4, 5]) == 'frames 3, 4 and 5'
     assert list_frames(bare, range(14), most=3) == 'frames 0, 1, 2 and 11 more'
+
+
+def test_a_column_of_photographs_is_by_frame_or_by_view() -> None:
+    frames = np.array([1, 0, 1])
+    assert photograph_column(FOLDERS, frames)['photograph'].tolist()[:2] == [
+        'left/20.jpg and right/20.jpg',
+        'left/19.jpg and right/19.jpg',
+    ]
+    right = photograph_column(FOLDERS, frames, ['right'] * 3)['photograph'].tolist()
+    assert right == ['right/20.jpg', 'right/19.jpg', 'right/20.jpg']
+    assert photograph_column(FOLDERS, np.array([9]))['photograph'].tolist() == ['']
+    assert photograph_column(rig(), frames) == {}

@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from helpers.commands import refused
 from helpers.nodes import ROOT, until
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.commands.node_sweeps import read_sweep
+from fisheye_svp_ros.commands.sweep import _sole_writer
 from fisheye_svp_ros.errors import OutputError, ParameterError
 from fisheye_svp_ros.io import columns as tables
 from fisheye_svp_ros.io.columns import plain_columns, read_table
@@ -396,6 +398,24 @@ def test_parts_are_neither_repeated_nor_mixed_nor_lost(
     monkeypatch.undo()
     sweep(path, '-o', out, '--resume')
     assert 'already holds this sweep' in capsys.readouterr().err
+
+
+def test_a_folder_is_one_sweep_s_at_a_time(
+    write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = [tmp_path / f'{seed}.yaml' for seed in (1, 2)]
+    for seed, path in enumerate(paths):
+        path.write_text(f'synthetic_camera: {{ros__parameters: {{sweep.seed: [{seed}]}}}}')
+    out = tmp_path / 'out'
+    with _sole_writer(out / 'parts'):
+        assert 'another sweep is writing there' in refused(capsys, 'sweep', paths[0], '-o', out)
+    sweep(paths[0], '-o', out)
+    before = (out / 'sweep.csv').read_bytes()
+    said = refused(capsys, 'sweep', paths[1], '-o', out, '--resume')
+    assert 'it holds another, finished sweep' in said
+    assert (out / 'sweep.csv').read_bytes() == before and not (out / 'parts').exists()
+    sweep(paths[1], '-o', out)  # replaces it, as every command does
+    assert (out / 'sweep.csv').read_bytes() != before
 
 
 @pytest.mark.slow
