@@ -113,12 +113,44 @@ def test_candidates_are_ranked_by_what_they_explain_beyond_chance(tests):
         expected = score.statistic - score.rank * np.log(null.full.rows)
         assert one.criterion == pytest.approx(expected)
         assert one.corrected == tests.correct(one.effect, one.score.p_value)
+    assert {one.score.rank for one in found} >= {1, 2, 3}
     few = tests.candidates(own, worth=lambda score: score.rank == 1)
     assert {one.score.rank for one in few} == {1}
     promising = [one for one in found if one.corrected < SIGNIFICANCE and one.criterion > 0]
     for one in tests.significant_candidates(own):
         assert one.form in {other.form for other in promising}
         assert one.corrected < SIGNIFICANCE
+
+
+def test_what_is_in_the_model_is_no_candidate(tests):
+    """Nothing of it is left to be tested."""
+    own, form = tests.null.included_columns, form_of(tests, 'skew')
+    with_it = np.concatenate([own, tests.null.form_columns(form)])
+    assert form in {one.form for one in tests.candidates(own)}
+    assert form not in {one.form for one in tests.candidates(with_it)}
+
+
+def test_what_is_significant_is_so_at_one_percent_and_beyond_chance(tests, monkeypatch):
+    """1 % for all effects together, and a criterion above zero."""
+    (some, *_) = tests.candidates(tests.null.included_columns)
+    cases = {(0.0099, 1.0): True, (0.0101, 1.0): False, (0.001, -1.0): False, (0.0, 0.1): True}
+    for (corrected, criterion), promising in cases.items():
+        one = replace(some, corrected=corrected, criterion=criterion)
+        monkeypatch.setattr(EffectTests, 'candidates', lambda *_, one=one: [one])
+        monkeypatch.setattr(EffectTests, 'adjust_p_value', lambda self, score, *_: score)
+        for adjusted, significant in ((0.0099, promising), (0.0101, False)):
+            monkeypatch.setattr(EffectTests, 'correct', lambda *_, p=adjusted: p)
+            found = list(tests.significant_candidates(np.arange(0)))
+            assert bool(found) == significant
+            assert [other.corrected for other in found] == [adjusted] * significant
+
+
+def test_what_is_left_of_a_column_counts_in_units_of_the_noise_variance():
+    """Of a normalized column 1e-8 and less is rounding, whatever the noise."""
+    null = SimpleNamespace(scale=np.ones(1), variances=SimpleNamespace(sigma=0.01))
+    for left, rank in ((5e-9, 0), (5e-8, 1)):
+        information = np.array([[left, left], [left, 1.0]]) / null.variances.sigma**2
+        assert EffectTests(null).score(information, np.array([0])).rank == rank
 
 
 @pytest.mark.parametrize('gain', [7.0, -1.0])
@@ -294,8 +326,9 @@ def test_an_alternative_is_held_against_the_columns_with_them_and_without():
     assert _alternative_gain(null, np.array([0]), np.array([1, 2]), None) == 0.0
 
 
+@pytest.mark.parametrize('rank', [1, 2])
 @pytest.mark.parametrize('scatter', [0.2, 3.0])
-def test_a_statistic_is_divided_by_the_scatter_from_landmark_to_landmark(monkeypatch, scatter):
+def test_a_statistic_is_divided_by_the_scatter_of_landmarks(monkeypatch, scatter, rank):
     """Where that is more than expected; F with landmarks less rank degrees (Liang and Zeger)."""
     rng = np.random.default_rng(3)
     frames, points = 4, 6
@@ -314,9 +347,9 @@ def test_a_statistic_is_divided_by_the_scatter_from_landmark_to_landmark(monkeyp
         random=SimpleNamespace(columns=SimpleNamespace(unit=landmark)),
         variances=SimpleNamespace(sigma=sigma),
     )
-    score = Score(20.0, 1, 1e-5, np.ones(1), np.inf)
+    score = Score(20.0, rank, 1e-5, np.ones(1), np.inf)
     found = _cluster_p_value(null, score, combination, np.array([0]), np.array([1]))
     sums = (np.where(used, weight * remaining, 0.0)).reshape(frames, points, 2).sum(axis=(0, 2))
     ratio = (sums**2).sum() / (info[1, 1] * sigma**2)
     assert (ratio > 1) == (scatter > 1)
-    assert found == pytest.approx(stats.f.sf(20.0 / max(ratio, 1.0), 1, points - 1))
+    assert found == pytest.approx(stats.f.sf(20.0 / max(ratio, 1.0) / rank, rank, points - rank))

@@ -64,7 +64,9 @@ def test_corrections_are_in_it_as_far_as_they_can_be() -> None:
     assert worst > 0.5  # of a shape that it does not have
 
 
-@pytest.mark.parametrize('height', [one for one in HEIGHTS if one != 'perspective'])
+@pytest.mark.parametrize(
+    'height', [name for name, (_, degrees) in HEIGHTS.items() if degrees > 85]
+)
 @pytest.mark.parametrize('shift', SHIFTS)
 def test_every_curve_of_a_fisheye_has_one(height: str, shift: str) -> None:
     lens = make_lens(height, shift)

@@ -104,7 +104,7 @@ def test_a_point_is_an_outlier_beyond_eight_standard_deviations(sigmas, far, dir
     assert list(found) == ([table.row(3, 20)] if far else [])
     if far:
         why, px = found[table.row(3, 20)]
-        assert why == FAR_POINT and px == pytest.approx(sigmas * NOISE, rel=0.15)
+        assert why == FAR_POINT and px == pytest.approx(sigmas * NOISE, rel=0.06)
 
 
 def test_an_outlier_bends_no_pose_that_judges_the_others():
@@ -134,7 +134,7 @@ def test_a_point_of_a_larger_sigma_may_lie_so_much_further_off(sigmas, far):
     found = table.outliers()
     assert list(found) == ([table.row(2, 7)] if far else [])
     if far:
-        assert found[table.row(2, 7)][1] == pytest.approx(sigmas * NOISE, rel=0.1)
+        assert found[table.row(2, 7)][1] == pytest.approx(sigmas * NOISE, rel=0.03)
 
 
 def test_sigma_counts_beside_the_median_and_only_where_it_is_larger():
