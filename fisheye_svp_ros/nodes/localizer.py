@@ -12,6 +12,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3Stamped
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io import decoding
@@ -27,10 +28,12 @@ from fisheye_svp_ros.nodes.transforms import TransformPublisher
 from fisheye_svp_ros.nodes.validation import Items, KnownPoints
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.reporting.wording.poses import rolling_shutter_note
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.scene.pose_priors import PlanarPrior
 from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.solve.pose_gate import GatedPose
+from fisheye_svp_ros.solve.readout import exceeds, readout_bias, steady_velocity
 from fisheye_svp_ros.study.settings import LocalizerSettings
 from fisheye_svp_ros.study.solutions import (
     LOCALIZATION_METRICS,
@@ -67,6 +70,8 @@ class Localizer(SolverNode):
         self._transforms = TransformPublisher(self, self.settings.publish_tf)
         self._base = BasePose(self, self.settings)
         self._latest: deque[tuple[int, Pose]] = deque(maxlen=2)  # stamps and poses, to go on from
+        self._motion: deque[tuple[float, Pose]] = deque(maxlen=3)  # times, s, and poses
+        self._first_stamp = 0  # ns, from which these times count
         self._rms_before = 0.0  # px
         self._misfits = 0  # sets up to the one before that fit badly, without outliers found
         self._errors: LensErrors | None = None  # of the latest lens
@@ -124,6 +129,8 @@ class Localizer(SolverNode):
         covariance = solution.covariance
         if errors is not None:
             covariance = errors.of_solved_poses(views, solution, None).total
+        bias, rolling = self._readout_bias(stamp, model, views, solution, covariance)
+        covariance = covariance + bias[:, :, None] * bias[:, None, :]
         self._pose.publish(
             messages.pose_with_covariance_message(pose, covariance[0], stamp, world)
         )
@@ -148,11 +155,36 @@ class Localizer(SolverNode):
             error = pose.difference(true)
             self._position_error.publish(messages.vector_message(error[:3], stamp, world))
             self._rotation_error.publish(messages.vector_message(error[3:], stamp, world))
-        problem = '; '.join(filter(None, (solved.reasons[0], doubt)))
+        problem = '; '.join(filter(None, (solved.reasons[0], rolling, doubt)))
         self.publish_result(stamp, solved.metrics, problem)
         if self._markers.get_subscription_count():
             shape = camera_shape(pose, 'estimated', alpha=0.6)
             self._markers.publish(messages.markers_message([shape], stamp, world))
+
+    def _readout_bias(
+        self,
+        stamp: int,
+        model: ForwardModel,
+        views: Views,
+        solution: Localization,
+        covariance: Array,
+    ) -> tuple[Array, str]:
+        """Return what a rolling shutter may move a pose by, (1, 6), and what is to be told of it.
+
+        Zeros where that is less than the covariance (1, 6, 6) states, and where the lens knows.
+        """
+        seconds, nothing = self.settings.readout_time, np.zeros((1, 6))
+        self._first_stamp = self._first_stamp or stamp
+        self._motion.append((1e-9 * (stamp - self._first_stamp), solution.pose.take(0)))
+        velocity = steady_velocity(*zip(*self._motion, strict=True))
+        models_it = model.without_motion() is not model
+        if not seconds or not self.settings.lens or models_it or velocity is None:
+            return nothing, ''
+        bias = readout_bias(model, views, solution.pose, velocity, seconds)
+        if not exceeds(bias[0], covariance[0]):
+            return nothing, ''
+        turn = float(np.linalg.norm(velocity[3:]))
+        return bias, rolling_shutter_note(turn, seconds, float(np.linalg.norm(bias[0, :3])))
 
     def report(self) -> tuple[Mapping[str, object], str]:
         """Return what became of every set, and which poses were kept back."""

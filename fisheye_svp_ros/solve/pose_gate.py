@@ -17,6 +17,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.pose import Pose, carried_pose, vector_from_rotation
 from fisheye_svp_ros.solve.localization import squared_distances
+from fisheye_svp_ros.solve.weak_geometry import CHI2_999
 
 MAX_MISFIT = 3.0  # times sigma: residuals of a wrong lens, image or map
 _HISTORY = 15  # poses that the next one is held against
@@ -107,25 +108,38 @@ class OdometryGate:
         self._history.append(_Known(pose, odometry, way, angle))
         if not known or not limits.max_innovation:
             return Verdict()
-        off = np.array([self._innovation(one, self._history[-1]) for one in known])
+        off, own = np.array([self._innovation(one, self._history[-1]) for one in known]).T
         agree = off <= limits.max_innovation
         if 2 * np.count_nonzero(agree) <= len(agree):
             return Verdict(
                 f'{np.median(off):.3g} sigmas off where odometry has it (max_innovation '
                 f'{limits.max_innovation:g})'
             )
-        others = frozenset().union(*(known[i].pose.tags for i in np.flatnonzero(agree)))
-        if pose.tags and len(pose.tags) <= _FEW_TAGS and not others - pose.tags:
+        inside = np.flatnonzero(own**2 < CHI2_999)
+        if 0 < len(pose.tags) <= _FEW_TAGS and not any(
+            _confirms(known[i].pose, pose) for i in inside
+        ):
             names = ' and '.join(map(str, sorted(pose.tags)))
             return Verdict('', f'no other tag confirms the pose by tag {names}')
         return Verdict()
 
-    def _innovation(self, before: _Known, now: _Known) -> float:
-        """Return how far a pose is off where odometry carries another, in sigmas."""
+    def _innovation(self, before: _Known, now: _Known) -> tuple[float, float]:
+        """Return how far a pose is off where odometry carries another, in sigmas.
+
+        Of both and the odometry; and in its own alone.
+        """
         moved = before.odometry.inverse().compose(now.odometry)
         there, covariance = carried_pose(before.pose.base, before.pose.covariance, moved)
         drift = np.repeat([now.way - before.way, now.angle - before.angle], 3)
         drift = (self._limits.odom_error * drift) ** 2
-        covariance = covariance + now.pose.covariance + np.diag(drift)
+        own = now.pose.covariance
+        both = np.stack([covariance + own + np.diag(drift), own])
         change = now.pose.base.difference(there)
-        return float(np.sqrt(squared_distances(change[None, None], covariance[None])[0, 0]))
+        squares = squared_distances(np.broadcast_to(change, (2, 1, 6)), both)[:, 0]
+        return float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
+
+
+def _confirms(before: GatedPose, pose: GatedPose) -> bool:
+    """Say whether a tag that moved would have had another effect on a pose before."""
+    others = before.tags - pose.tags
+    return len(others) >= _FEW_TAGS or (bool(others) and others == before.tags)

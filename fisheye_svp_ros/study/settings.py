@@ -267,6 +267,14 @@ class LocalizerSettings(RobotSettings):
         'Include the errors of the lens in the covariance of the pose, besides `sigma_px`; '
         'the lens file must state them, as those of `calibrate` and `diagnose` do',
     )
+    readout_time: float = parameter(
+        0.03,
+        'Time that a rolling shutter takes from the first row to the last, the stamp being that '
+        'of the middle; where the motion of the camera then moves a pose by more than its '
+        'covariance states, that is told and added. 0: a global shutter',
+        's',
+        (0.0, 1.0),
+    )
     planar: bool = parameter(
         False,
         'With base_frame: the base drives on a plane, so that its height '

@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 from geometry_msgs.msg import TransformStamped  # isort: skip
 from sensor_msgs.msg import PointCloud2  # isort: skip
 
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
@@ -24,9 +25,10 @@ from fisheye_svp_ros.nodes.solver import exchange_reason
 from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.scene.observations import group_views, views_of
 from fisheye_svp_ros.scene.rigs import rig
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
-from fisheye_svp_ros.study.solutions import gate_reason
+from fisheye_svp_ros.study.solutions import gate_reason, localize_sets
 from fisheye_svp_ros.study.sweep import plan_sweep, sweep_rows
 
 SEEN = simulate_scenario(Scenario(noise_px=0.3)).observations
@@ -84,6 +86,22 @@ def test_what_fails_the_gate_has_a_reason_and_no_pose(graph: Callable[..., Graph
     assert read_key_values(driven.reports[-1])['image_points: dropped'] == '0'
     assert set_parameter(driven.node, 'gate', 0).successful
     assert driven.tell(4, longer(1.05)).values
+
+
+@pytest.mark.parametrize(('readout', 'told'), [(0.03, True), (0.0, False)])
+def test_a_rolling_shutter_of_a_camera_that_turns_is_told(
+    graph: Callable[..., Graph], readout: float, told: bool
+) -> None:
+    driven = Driven(graph(*SOLVING, f'readout_time:={readout}'))
+    model = ForwardModel(load_lens(lens_path('fish214')))
+    start, views = localize_sets(model, group_views(SEEN)).solution.pose, views_of(SEEN.xyz)
+    texts = []
+    for i in range(4):
+        turned = start.retract(np.array([[0.0, 0.0, 0.0, 0.0, 0.05 * i, 0.0]]))
+        uv = model.predict(turned, views, limited=False).uv[0]
+        texts.append(driven.tell(10**9 + 50_000_000 * i, uv).message)
+    assert texts[:2] == ['', ''] and bool(texts[3]) == told
+    assert not told or 'a rolling shutter of 30 ms moves the pose by' in texts[3]
 
 
 def test_a_sweep_offline_has_the_same_gate() -> None:

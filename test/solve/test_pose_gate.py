@@ -78,8 +78,12 @@ def test_a_wrong_first_pose_does_not_keep_out_the_others() -> None:
 
 def test_few_tags_are_confirmed_by_others() -> None:
     gate = OdometryGate(LIMITS)
+    alone = ('', 'no other tag confirms the pose by tag 3')
     assert judge(gate, 0, tags=(3,)) == ('', '')
-    assert judge(gate, 1, tags=(3,)) == ('', 'no other tag confirms the pose by tag 3')
-    assert judge(gate, 2, tags=(5, 3)) == ('', 'no other tag confirms the pose by tag 3 and 5')
-    assert judge(gate, 3, tags=(3,)) == ('', ''), 'an earlier pose holds tag 5'
+    assert judge(gate, 1, tags=(3,)) == alone
+    assert judge(gate, 2, tags=(3, 5)) == ('', f'{alone[1]} and 5')
+    assert judge(gate, 3, tags=(3,)) == alone, 'tag 3 weighs in the pose by 3 and 5'
     assert judge(gate, 4, tags=(3, 5, 7)) == ('', '')
+    assert judge(gate, 5, tags=(3,)) == ('', ''), 'two other tags agree'
+    assert judge(gate, 5, 0.07, tags=(3,)) == alone, 'not as closely as it states'
+    assert judge(gate, 6, tags=(9,)) == ('', ''), 'a pose by other tags alone agrees'

@@ -1,0 +1,55 @@
+"""A rolling shutter that the lens does not model is bounded by how the camera moves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.tag_room import LENS, TagRoom, oval
+
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.solve.readout import exceeds, readout_bias, steady_velocity
+from fisheye_svp_ros.solve.weak_geometry import CHI2_999
+
+MODEL, ROOM = ForwardModel(LENS), TagRoom(16)
+READOUT = 0.03
+
+
+def rolled(camera: Pose, velocity: np.ndarray, seconds: float) -> np.ndarray:
+    """Return image points of all tags in view, each as the camera stood when its row was read."""
+    tags = ROOM.visible(camera)
+    uv = ROOM.project(camera, tags)
+    for _ in range(3):
+        late = seconds * (uv[:, 1] / LENS.height - 0.5)
+        each = [camera.retract(velocity * time) for time in late]
+        uv = np.stack([ROOM.project(one, tags)[i] for i, one in enumerate(each)])
+    return uv
+
+
+@pytest.mark.parametrize('pace', [1.0, 0.02])
+def test_the_bias_is_that_of_solved_images(pace: float) -> None:
+    rng, velocity = np.random.default_rng(1), pace * np.array([0.3, 0.1, 0.0, 0.0, 0.0, 1.0])
+    for place in (0.1, 0.4, 0.8):
+        camera = oval(place)
+        uv = rolled(camera, velocity, READOUT)
+        views = ROOM.views(camera, uv, ROOM.visible(camera), 0.2, rng)
+        solved = localize(MODEL, views._replace(uv=uv[None]))
+        off = solved.pose.difference(camera.take(None))[0]
+        bias = readout_bias(MODEL, views, solved.pose, velocity, READOUT)[0]
+        np.testing.assert_allclose(bias, off, atol=0.1 * np.linalg.norm(off))
+        covariance = solved.covariance[0]
+        outside = off @ np.linalg.solve(covariance, off) > CHI2_999
+        assert exceeds(bias, covariance) == outside == (pace == 1.0)
+        covariance = covariance + np.outer(bias, bias)
+        assert off @ np.linalg.solve(covariance, off) < CHI2_999
+
+
+def test_a_velocity_is_that_of_a_steady_motion() -> None:
+    velocity = np.array([0.3, 0.1, 0.0, 0.0, 0.0, 0.7])
+    times = [1.0, 1.1, 1.25]
+    poses = [oval(0.2).retract(velocity * time) for time in times]
+    np.testing.assert_allclose(steady_velocity(times, poses), velocity, atol=0.05)
+    assert steady_velocity(times[:2], poses[:2]) is None
+    assert steady_velocity([1.0, 1.1, 1.9], poses) is None, 'long ago'
+    assert steady_velocity(times, [poses[0], poses[2], poses[1]]) is None, 'noise'
