@@ -86,7 +86,7 @@ def flaw_summary(flaw: Flaw) -> str:
         'than a detector leaves (0.02 to 0.3 px)',
         FlawKind.LENS_UNKNOWN: f'these views leave rays{of} uncertain by up to {mrad} at 1 m',
         FlawKind.ANGLE_SHORT: f'points{of} reach {angle:.0f} of the {degrees(flaw.beside):.0f} '
-        'deg that the lens claims',
+        'deg claimed',
         FlawKind.OFF_CENTER: f'the principal point{of} lies {flaw.size:.0f}, {flaw.beside:.0f} px '
         'off the center of the image',
     }
