@@ -83,7 +83,7 @@ def judge_data(
     reached = float(np.nanmax(linear.scene.theta[linear.data.views.used]))
     changes = find_frame_changes(evaluation, causes, components)
     flaws = [*_mirrors(evaluation), *_impossible_lengths(evaluation, candidates)]
-    flaws += _misfits(evaluation, changes, components)
+    flaws += _misfits(evaluation, changes, components, are_rays_known(rays))
     flaws += _differing_sides(evaluation)
     if evaluation.noise_px > _MAX_NOISE:
         flaws.append(Flaw(FlawKind.NOISE_TOO_LARGE, evaluation.noise_px, _MAX_NOISE))
@@ -155,11 +155,12 @@ def _differing_sides(evaluation: Evaluation) -> Iterator[Flaw]:
 
 
 def _misfits(
-    evaluation: Evaluation, changes: FrameChanges, components: Sequence[Component]
+    evaluation: Evaluation, changes: FrameChanges, components: Sequence[Component], known: bool
 ) -> Iterator[Flaw]:
     """Yield what no one lens is meant by: frames of several cameras, or of one that changes.
 
     A board that bends from frame to frame is no reason: what it costs the lens is in its errors.
+    known: whether these are small; then fields that frames have of their own are no reason either.
     """
     focal = next(iter(evaluation.problem.inputs.lenses.values())).fx
     frames = float(np.hypot.reduce([p.sd_px for p in components if p.stage == 'frame'] or [0.0]))
@@ -172,7 +173,7 @@ def _misfits(
             return
     if max(changes.focal_error, changes.center_error) > MAX_RAY_ERROR:
         yield _changing_intrinsics(evaluation, changes)
-    elif differ:
+    elif differ and not known:
         yield Flaw(FlawKind.FRAMES_DIFFER, left, scatter, _worst_frames(evaluation))
     elif is_no_fit(left, scatter):
         yield Flaw(FlawKind.NO_FIT, left, scatter)

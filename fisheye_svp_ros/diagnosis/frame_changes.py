@@ -17,7 +17,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
-from fisheye_svp_ros.diagnosis.random_effects import NAMES
+from fisheye_svp_ros.diagnosis.random_effects import BEND, NAMES
 from fisheye_svp_ros.diagnosis.variance_budget import Component, significant_components
 from fisheye_svp_ros.effects.recording_effects import FocalDriftEffect, SessionStepEffect
 from fisheye_svp_ros.optics.lens import Lens
@@ -62,13 +62,15 @@ def find_frame_changes(
     evaluation: Evaluation, causes: Sequence[Cause], components: Sequence[Component]
 ) -> FrameChanges:
     """Return what named causes and significant random effects change from frame to frame."""
-    significant = {part.name for part in significant_components(components)}
+    sizes = {part.name: part.sd_px for part in significant_components(components)}
+    # What a bend that is not quite quadratic leaves looks like a warp of the image.
+    warps = [name for name in _WARP if sizes.get(name, 0.0) > sizes.get(BEND, 0.0)]
     linear = evaluation.null.linear
     focal, center = _named_changes(evaluation, causes)
     half = _half_extent(evaluation)
-    if _FOCAL in significant:
+    if _FOCAL in sizes:
         focal = focal + evaluation.fitted.frame_coefficients(_FOCAL).sum(axis=1) / half
-    if _CENTER in significant:
+    if _CENTER in sizes:
         own = evaluation.fitted.frame_coefficients(_CENTER)
         center = center + own.reshape(len(own), -1, 2).sum(axis=1)
     focal, center = focal - focal.mean(), center - center.mean(axis=0)
@@ -79,10 +81,8 @@ def find_frame_changes(
         center,
         float(focal.std()) * by_focal,
         float(np.sqrt(center.var(axis=0) @ by_center**2)),
-        *(
-            _field_rms(evaluation, [name for name in names if name in significant]) / lens.fx
-            for names in (_WARP, _SHAPELESS)
-        ),
+        _field_rms(evaluation, warps) / lens.fx,
+        _field_rms(evaluation, [name for name in _SHAPELESS if name in sizes]) / lens.fx,
     )
 
 
