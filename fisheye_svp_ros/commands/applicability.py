@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from fisheye_svp_ros.detect.patterns import LOOSE_TAGS
 from fisheye_svp_ros.errors import ParameterError
 
 
@@ -23,6 +24,16 @@ def _has_photographs(args: argparse.Namespace) -> bool:
     """Whether an input is no table: with a board, it is searched."""
     inputs = (args.observations, getattr(args, 'held_out', None), getattr(args, 'against', None))
     return any(Path(path).suffix.lower() != '.csv' for path in inputs if path)
+
+
+def _is_perspective(projection: str) -> bool:
+    return projection.startswith('perspective')
+
+
+def _has_views(args: argparse.Namespace) -> bool:
+    """Whether views of a lens are asked for."""
+    asked = args.projections or ()
+    return any(_is_perspective(one) or one == 'cubemap' for one in asked)
 
 
 _READING = ('calibrate', 'diagnose', 'localize')
@@ -62,6 +73,12 @@ RULES = (
         'works for one camera at a time; leave --rig out',
     ),
     Rule(
+        ('localize',),
+        ('--tag-map',),
+        lambda args: (args.board or '').startswith(f'{LOOSE_TAGS}:'),
+        'belongs to photographs of loose tags; add --board tags:36h11',
+    ),
+    Rule(
         ('render',),
         ('--count', '--ranges'),
         lambda args: not args.poses,
@@ -72,6 +89,18 @@ RULES = (
         ('--ranges',),
         lambda args: args.target != 'room',
         'is of one board or a cube; the poses in a room are inside it: leave it out',
+    ),
+    Rule(
+        ('undistort',),
+        ('--rig',),
+        lambda args: not _has_views(args),
+        'has no effect on views, which are of each camera for itself; leave it out',
+    ),
+    Rule(
+        ('undistort',),
+        ('--fov',),
+        lambda args: not any(map(_is_perspective, args.projections or ())),
+        'has no effect on --as perspective, whose last number it is; leave it out',
     ),
     Rule(
         ('undistort',),

@@ -19,7 +19,7 @@ import numpy as np
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.commands.outputs import output_file, output_folder
 from fisheye_svp_ros.detect.finders import DETECTORS
-from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
+from fisheye_svp_ros.detect.patterns import LOOSE_TAGS, Pattern, parse_pattern
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import keep_existing, write_json, write_together
 from fisheye_svp_ros.io.readers import (
@@ -156,7 +156,8 @@ def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False)
         required=required,
         metavar='SPEC',
         help='the board in the photographs: chessboard:9x6:24.23mm (inner '
-        'corners), charuco:7x5:30mm:22mm:DICT_5X5_100, '
+        'corners), charuco:7x5:30mm:22mm:DICT_5X5_100 (of a second board :17, the id of its first '
+        'marker), tags:tags.yaml (loose tags of a map), '
         'aprilgrid:target.yaml, circles:7x5:20mm[:asymmetric], '
         'squares:3x4:30mm:30mm (side, gap)',
     )
@@ -268,6 +269,8 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     from fisheye_svp_ros.reporting.terminal import progress
 
     pattern = parse_pattern(args.board)
+    if pattern.note:
+        say(pattern.note)
     if args.detector and pattern.kind not in DETECTORS[args.detector][0]:
         raise ParameterError(f'--detector {args.detector} does not find {args.board}')
     for line in doubtful_folders(paths):
@@ -310,7 +313,7 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     unknown = [
         Path(one.name).name
         for one in detection.searched
-        if one.points and np.isnan(one.points.sigma).any()
+        if one.points and np.isnan(one.points.sigma).any() and pattern.kind != LOOSE_TAGS
     ]
     if unknown:
         more = ', ...' if len(unknown) > _MAX_LISTED else ''
@@ -338,7 +341,11 @@ def _note_tags(detection: Detection, pattern: Pattern) -> None:
     seen = sum(one.tags.seen for one in detection.searched)
     beyond = sum(one.tags.beyond for one in detection.searched)
     if beyond > _MIN_BEYOND_SHARE * seen:
-        words = 'tagCols and tagRows' if pattern.kind == 'aprilgrid' else 'its columns and rows'
+        words = (
+            'tagCols and tagRows'
+            if pattern.kind == 'aprilgrid'
+            else 'its columns and rows, or add the id of its first marker'
+        )
         say(
             f'{beyond} of {seen} tags have ids beyond the {pattern.columns}x{pattern.rows} board; '
             f'check {words}'

@@ -28,6 +28,7 @@ from fisheye_svp_ros.commands.notes import (
     say,
 )
 from fisheye_svp_ros.commands.outputs import add_output_folder
+from fisheye_svp_ros.detect.patterns import LOOSE_TAGS
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_files import write_table
 from fisheye_svp_ros.io.files import write_json, write_together
@@ -59,6 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_observation_arguments(parser)
     add_lens_argument(parser)
     parser.add_argument(
+        '--tag-map',
+        metavar='TAGS.yaml',
+        help='map of the loose tags in the photographs, with --board tags:36h11 or '
+        'tags:36h11:160mm: from `map`, tags.yaml of apriltag_ros, or a field layout of WPILib',
+    )
+    parser.add_argument(
         '--model-error',
         action='store_true',
         help='include in the covariances the errors stated in the lens file: of '
@@ -81,6 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Localize every frame, print the poses, write the results."""
+    tags = _name_tag_map(args)
     given = load_lenses(args.lens)
     observations, sizes = read_input(args.observations, args)
     lenses = lenses_of(observations.cameras, given)
@@ -103,7 +111,7 @@ def run(args: argparse.Namespace) -> None:
                 measured, parts = localize_with_errors(LensErrors.from_lens(lens), table)
                 uncertainty = pose_summary(parts)
             else:
-                measured = localize_measured(model, table)
+                measured = localize_measured(model, table, tags)
         note_extrapolated(name or 'image points', lens, measured.views.uv[measured.views.used])
         note_mirrored(name or 'image points', lens, table)
         title = ' '.join(filter(None, (args.observations, name)))
@@ -116,6 +124,13 @@ def run(args: argparse.Namespace) -> None:
         if args.output:
             with write_together():
                 _write(args.output / name, model, table, measured, uncertainty)
+
+
+def _name_tag_map(args: argparse.Namespace) -> bool:
+    """Add the map of tags to the board; say whether there are loose tags in photographs."""
+    if args.tag_map:
+        args.board = f'{args.board.rstrip(":")}:{args.tag_map}'
+    return (args.board or '').startswith(f'{LOOSE_TAGS}:')
 
 
 def _localize_rig(

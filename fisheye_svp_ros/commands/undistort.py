@@ -172,10 +172,6 @@ def _views(args: argparse.Namespace) -> list[View]:
         return cube_views() if args.fov is None else cube_views(float(np.radians(args.fov)))
     if not asked[0].startswith(_PERSPECTIVE):
         return []
-    if args.fov is not None:
-        raise ParameterError(
-            f'--fov {args.fov:g}: the field of view is the last number of --as {asked[0]}'
-        )
     return [_view(one) for one in asked]
 
 
@@ -286,10 +282,6 @@ def _view_sides(
     args: argparse.Namespace, views: Sequence[View], lenses: Mapping[str, Lens]
 ) -> _Sides:
     """Return the rectifications of views, a folder for each, in one of its camera."""
-    if args.rig:
-        raise ParameterError(
-            f'--rig {args.rig}: views are of each camera for itself; leave --rig out'
-        )
     cube = args.projections == [CUBEMAP]
     if cube and args.size and args.size[0] != args.size[1]:
         raise ParameterError(f'--size {args.size[0]}x{args.size[1]}: faces of a cube are square')

@@ -29,7 +29,7 @@ from fisheye_svp_ros.detect.finders import (
     report_tags,
 )
 from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals, of_rig, turn_field
-from fisheye_svp_ros.detect.patterns import Pattern, Turn, check_of_board
+from fisheye_svp_ros.detect.patterns import LOOSE_TAGS, Pattern, Turn, check_of_board
 from fisheye_svp_ros.detect.photographs import Photograph, Pixels, caught_stderr, exif_turned
 from fisheye_svp_ros.detect.points import (
     SATURATED_SHARE,
@@ -41,9 +41,11 @@ from fisheye_svp_ros.detect.points import (
 )
 from fisheye_svp_ros.detect.rig_photographs import Pairing, pair_photographs, stamp_of
 from fisheye_svp_ros.detect.tag_grids import common_layout
+from fisheye_svp_ros.detect.tags import known_points
 from fisheye_svp_ros.detect.workers import TimedOut, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
 from fisheye_svp_ros.io.files import read_bytes
+from fisheye_svp_ros.io.tag_maps import tags_of
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
@@ -272,6 +274,8 @@ def examine(task: _Task) -> SearchedPhotograph:
         if any(line.startswith('Corrupt JPEG') for line in said):
             notes = (*notes, _DAMAGE_NOTE)
         points, inverted = _look(pixels, task)
+        if pattern.kind == LOOSE_TAGS and isinstance(points, Points):
+            points = known_points(points, pattern)
         grid = points.grid if isinstance(points, Points) else None
         tags = report_tags(eight_bit(pixels), pattern, grid)
     except (FisheyeSvpError, cv2.error, MemoryError) as cause:
@@ -532,6 +536,7 @@ def _observations(
         cameras=cameras,
         source=source,
         sigma=np.concatenate([part.sigma for part in points]),
+        board=tags_of(index) if pattern.kind == LOOSE_TAGS else None,
     )
     return replace(
         table,

@@ -118,7 +118,8 @@ def charuco(image: Grey, pattern: Pattern) -> LocatedPoints | None:
     dictionary = dictionary_of(pattern)
     size = (pattern.columns, pattern.rows)
     if hasattr(_ARUCO, 'CharucoDetector'):
-        board = _ARUCO.CharucoBoard(size, pattern.size, pattern.marker, dictionary)
+        ids = np.arange(pattern.first, pattern.first + pattern.tag_count, dtype=np.int32)
+        board = _ARUCO.CharucoBoard(size, pattern.size, pattern.marker, dictionary, ids)
         corners, ids, tags, tag_ids = _ARUCO.CharucoDetector(board).detectBoard(image)
         turned = pattern.rows % 2 == 0 and hasattr(board, 'setLegacyPattern')
         if ids is None and tag_ids is not None and turned:
@@ -129,6 +130,8 @@ def charuco(image: Grey, pattern: Pattern) -> LocatedPoints | None:
             )
     else:
         board = _ARUCO.CharucoBoard_create(*size, pattern.size, pattern.marker, dictionary)
+        if pattern.first:
+            board.setIds((board.ids + pattern.first).astype(np.int32))
         tags, tag_ids, _ = _ARUCO.detectMarkers(image, dictionary)
         if tag_ids is None:
             return None
@@ -208,7 +211,7 @@ def report_tags(image: Grey, pattern: Pattern, grid: GridReading | None) -> TagR
     if not pattern.tag_count:
         return NO_TAGS
     layouts: frozenset[TagLayout] = frozenset()
-    border, first = 1, 0
+    border, first = 1, pattern.first
     if pattern.kind == 'aprilgrid':
         grid = grid or _read_aprilgrid(image, pattern)
         layouts = grid.layouts
@@ -240,8 +243,8 @@ UNFITTED_DETECTORS = ('sb', 'classic')  # keep their own points; the others are 
 
 
 def default_detector(pattern: Pattern) -> str:
-    """Return the name of the detector that a pattern is searched with."""
-    return next(name for name, (kinds, _) in DETECTORS.items() if pattern.kind in kinds)
+    """Return the name of the detector that a pattern is searched with; '' for loose tags."""
+    return next((name for name, (kinds, _) in DETECTORS.items() if pattern.kind in kinds), '')
 
 
 def _all_corners(ok: bool, corners: Any) -> LocatedPoints | None:

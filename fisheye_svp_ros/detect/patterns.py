@@ -69,7 +69,8 @@ class Pattern:
     point, m, nothing but its own edges is printed; inward (N, 2): towards the dark corner of a
     square grid, along the board's axes; tint (N,): 1 where the square towards +x, +y is bright,
     -1 where it is dark, 0 where there is none; marker: side of a tag, m; dictionary: of tags;
-    gap: between the tags of an AprilGrid, over their side; layout: of its tags, None unknown.
+    gap: between the tags of an AprilGrid, over their side; layout: of its tags, None unknown;
+    first: id of the first tag of a ChArUco board; note: what was assumed, '' for nothing.
     """
 
     kind: str
@@ -85,6 +86,8 @@ class Pattern:
     dictionary: str = ''
     gap: float = 0.0
     layout: TagLayout | None = None
+    first: int = 0
+    note: str = ''
 
     @property
     def tag_count(self) -> int:
@@ -136,7 +139,9 @@ def parse_pattern(spec: str) -> Pattern:
     """Return the pattern that a line of text names.
 
     chessboard:9x6:24mm (inner corners, spacing); charuco:7x5:30mm:22mm:DICT_5X5_100 (squares, side
-    of a square and of a marker, ArUco dictionary); aprilgrid:target.yaml (Kalibr's target file);
+    of a square and of a marker, ArUco dictionary; where it is not 0, the id of the first marker);
+    aprilgrid:target.yaml (Kalibr's target file); tags:tags.yaml (loose tags 36h11 of a map; before
+    its file their side, as tags:160mm:tags.yaml);
     circles:7x5:20mm and circles:4x11:20mm:asymmetric (spacing as OpenCV counts it: half of that
     within a row of the asymmetric grid); squares:3x4:30mm:30mm (separate squares, side and gap).
     Raises ParameterError, with what is expected, for anything else.
@@ -179,6 +184,7 @@ def _chessboard(spec: str, words: list[str]) -> Pattern:
 
 
 def _charuco(spec: str, words: list[str]) -> Pattern:
+    first = int(words.pop(4)) if len(words) > 4 and words[4].isdecimal() else 0
     dictionary = words.pop(3).upper() if len(words) > 3 else 'DICT_5X5_100'
     (columns, rows), (size, marker) = _numbers(spec, words, 2, least=3)
     if marker >= size:
@@ -188,7 +194,7 @@ def _charuco(spec: str, words: list[str]) -> Pattern:
             f'board {spec!r}: OpenCV has no dictionary {dictionary}; known are '
             f'{", ".join(_MARKERS)}'
         )
-    needed, there = columns * rows // 2, _MARKERS[dictionary]
+    needed, there = first + columns * rows // 2, _MARKERS[dictionary]
     if needed > there:
         raise ParameterError(
             f'board {spec!r}: it needs {needed} markers, and {dictionary} has '
@@ -208,6 +214,7 @@ def _charuco(spec: str, words: list[str]) -> Pattern:
         size,
         marker,
         dictionary,
+        first=first,
     )
 
 
@@ -282,12 +289,19 @@ def _aprilgrid(spec: str, words: list[str]) -> Pattern:
     )
 
 
+def _loose_tags(spec: str, words: list[str]) -> Pattern:
+    from fisheye_svp_ros.detect.tags import read_tag_pattern  # which needs this module
+
+    return read_tag_pattern(spec, words)
+
+
 PATTERNS: dict[str, Callable[[str, list[str]], Pattern]] = {
     'chessboard': _chessboard,
     'charuco': _charuco,
     'aprilgrid': _aprilgrid,
     'circles': _circles,
     'squares': _squares,
+    LOOSE_TAGS: _loose_tags,
 }
 
 
@@ -373,8 +387,10 @@ def check_of_board(pattern: Pattern) -> str:
     """Return what to check where a board is never found."""
     if pattern.kind == 'aprilgrid':
         return 'check kind, tagCols and tagRows of the board'
+    if pattern.kind == LOOSE_TAGS:
+        return 'check the family of the tags (36h11), and whether the map has their ids'
     counted = {
         'chessboard': ' (inner corners: one less than squares)',
-        'charuco': ' (squares, columns first) and its dictionary',
+        'charuco': ' (squares, columns first), its dictionary and the id of its first marker',
     }
     return f'check kind and size of the board{counted.get(pattern.kind, "")}'

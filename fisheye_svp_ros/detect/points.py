@@ -73,6 +73,10 @@ def find_points(
     first, and the rest only where the board is not there any more.  finder: in place of the
     detector's own.
     """
+    if pattern.kind == LOOSE_TAGS:
+        from fisheye_svp_ros.detect.tags import find_tag_points  # which needs this module
+
+        return find_tag_points(pixels)
     height, width = pixels.shape
     if not _SHORTEST <= min(height, width) <= max(height, width) <= _LONGEST:
         return f'no board found: the image is {width} x {height} px'
@@ -139,10 +143,6 @@ def _measure(
 def search(task: tuple[Pixels, Pattern, str, Array | None]) -> Points | str | Exception:
     """Do what `find_points` does for its arguments; return what it raises."""
     try:
-        if task[1].kind == LOOSE_TAGS:
-            from fisheye_svp_ros.detect.tags import find_tag_points  # which needs this module
-
-            return find_tag_points(task[0])
         return find_points(*task)
     except Exception as error:
         return error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -16,14 +16,15 @@ from fisheye_svp_ros.detect.photographs import Photograph, Pixels
 from fisheye_svp_ros.detect.points import Points, eight_bit
 from fisheye_svp_ros.detect.tag_edges import fit_quads
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.io.tag_maps import CORNERS
-from fisheye_svp_ros.scene.observations import Landmarks
+from fisheye_svp_ros.io.tag_maps import CORNERS, TagMap, check_family, read_tag_map
 
 FAMILY = '36h11'
 # libapriltag goes round a tag from its lower left, against the clock; OpenCV's print of a tag is
 # that of libapriltag turned by half.
 _ORDER = [1, 0, 3, 2]
 _MIN_SIDE = 12.0  # px; the corners of a smaller tag run into its code
+_TAGS, _MAX_NAMES = 587, 5  # tags of the family, ids in a sentence
+_LENGTH = re.compile(r'[0-9.]+ *(mm|cm|m)', re.IGNORECASE)
 _SPEC = re.compile(r'tags:(?:36h11:)?([0-9.]+) *(mm|cm|m)', re.IGNORECASE)
 
 
@@ -58,15 +59,62 @@ def find_tags(image: Grey) -> tuple[Index, Array]:
     return ids[keep], fit_quads(image, corners[keep][:, _ORDER])
 
 
-def tag_pattern(spec: str, landmarks: Landmarks) -> Pattern:
+def tag_pattern(spec: str, tags: TagMap) -> Pattern:
     """Return what a detector looks for where loose tags hang as a map says.
 
+    Its points are by landmark, NaN for those of other tags.
     Raises ParameterError where OpenCV has no markers.
     """
     need_markers(spec)
-    count = len(landmarks.ids)
-    none = np.zeros((count, 2))
-    return Pattern(LOOSE_TAGS, spec, 0, 0, landmarks.points, 0.0, none, none[:, 0], 0.0)
+    points = np.full((CORNERS * _TAGS, 3), np.nan)
+    known = tags.ids < _TAGS
+    points.reshape(_TAGS, CORNERS, 3)[tags.ids[known]] = tags.corners[known]
+    none, side = np.zeros((len(points), 2)), float(tags.sizes.max())
+    return Pattern(
+        LOOSE_TAGS, spec, 0, 0, points, 0.0, none, none[:, 0], side, side, note=tags.note
+    )
+
+
+def read_tag_pattern(spec: str, words: Sequence[str]) -> Pattern:
+    """Return the pattern of tags:tags.yaml, also with family and side before the file.
+
+    Raises ParameterError where the map is missing, or says otherwise.
+    """
+    return tag_pattern(spec, tags_of_board(spec, words))
+
+
+def tags_of_board(spec: str, words: Sequence[str]) -> TagMap:
+    """Return the map of tags that a board names."""
+    left, size = list(words), None
+    if left and left[0].lower() == FAMILY:
+        left.pop(0)
+    if left and _LENGTH.fullmatch(left[0]):
+        size = tag_size(f'{LOOSE_TAGS}:{left.pop(0)}')
+    if not left:
+        raise ParameterError(
+            f'board {spec!r}: loose tags hang where a map says; add its file, as in '
+            'tags:tags.yaml, or --tag-map tags.yaml'
+        )
+    try:
+        tags = read_tag_map(':'.join(left), size)
+        check_family(FAMILY, tags.family, spec)
+    except ObservationError as error:
+        raise ParameterError(str(error)) from error
+    return tags
+
+
+def known_points(points: Points, pattern: Pattern) -> Points | str:
+    """Return the points of tags that the map has, or why there are none."""
+    keep = np.isfinite(pattern.points[points.ids]).all(axis=1)
+    if not keep.any():
+        seen = ', '.join(map(str, np.unique(points.ids // CORNERS)[:_MAX_NAMES]))
+        return f'no tag of the map; there are {seen}'
+    return points._replace(
+        ids=points.ids[keep],
+        uv=points.uv[keep],
+        sigma=points.sigma[keep],
+        reach=points.reach[keep],
+    )
 
 
 def find_tag_points(pixels: Pixels) -> Points | str:

@@ -1,4 +1,4 @@
-"""Maps of tags: YAML with the id, size and pose of each; bundles of apriltag_ros are read, too.
+"""Maps of tags: YAML with the id, size and pose of each; those of apriltag_ros and WPILib, too.
 
 A tag's frame is that of apriltag_ros: the middle of the tag, x right, y up, z out of it.
 """
@@ -23,16 +23,24 @@ CENTER_OFFSET = 100_000_000  # landmark of the middle of a tag, before its id
 _FAMILY_PREFIX = re.compile(r'^(dict_)?(april)?_?(tag)?_?')
 _MAX_ID = 1_000_000
 _MAX_SIZE = 10.0  # m; a larger tag is a slip of the unit
+_LAYOUT_SIZE = 0.1651  # m: 6.5 inches, of the tags of FRC since 2024; layouts state no size
+# Our axes in those of WPILib's tags: x out of the tag, y to the right of a beholder, z up
+_OF_LAYOUT = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+_SIZE_TOLERANCE = 1e-6  # relative
 _UNIT_CORNERS = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
 
 
 class TagMap(NamedTuple):
-    """Tags (T,): id, side, m, pose in the frame of the map; family: '' where it is not stated."""
+    """Tags (T,): id, side, m, pose in the frame of the map; family: '' where it is not stated.
+
+    note: what was assumed, '' for nothing.
+    """
 
     ids: Index
     sizes: Array
     poses: Pose
     family: str = ''
+    note: str = ''
 
     @property
     def corners(self) -> Array:
@@ -62,10 +70,11 @@ def map_of_size(ids: Index, size: float, poses: Pose, family: str = '') -> TagMa
     return TagMap(ids, np.full(len(ids), size), poses, family)
 
 
-def read_tag_map(path: str | Path) -> TagMap:
-    """Read a map of tags, or the bundles and standalone tags of a tags.yaml of apriltag_ros.
+def read_tag_map(path: str | Path, size: float | None = None) -> TagMap:
+    """Read a map of tags, the bundles of a tags.yaml of apriltag_ros, or a layout of WPILib.
 
-    Raises ObservationError, naming file, tag and field.
+    size: side of the tags, m, as stated elsewhere.
+    Raises ObservationError, naming file, tag and field, also for another size in the file.
     """
     document = read_yaml(path, ObservationError)
     bundles = document.get('tag_bundles')
@@ -83,13 +92,28 @@ def read_tag_map(path: str | Path) -> TagMap:
             f'{path}: it holds no tags; a list `tags` with id, size and pose, or tag_bundles of '
             'apriltag_ros, is needed'
         )
-    tags = [_read_tag(entry, f'{path}: tag {number}') for number, entry in enumerate(entries)]
+    unsized = any(_is_of_layout(entry) and 'size' not in entry for entry in entries)
+    tags = [
+        _read_tag(
+            _from_layout(entry, size or _LAYOUT_SIZE, f'{path}: tag {number}')
+            if _is_of_layout(entry)
+            else entry,
+            f'{path}: tag {number}',
+        )
+        for number, entry in enumerate(entries)
+    ]
     ids = np.array([tag[0] for tag in tags], dtype=np.int64)
     if len(np.unique(ids)) < len(ids):
         twice = next(one for one in ids.tolist() if (ids == one).sum() > 1)
         raise ObservationError(f'{path}: tag id {twice} is listed twice; remove one')
     sizes, poses = np.array([tag[1] for tag in tags]), Pose.stack([tag[2] for tag in tags])
-    return TagMap(ids, sizes, poses, _read_family(document, path))
+    if size and (other := np.abs(sizes / size - 1) > _SIZE_TOLERANCE).any():
+        raise ObservationError(
+            f'{path}: tag {ids[other][0]} is {1000 * sizes[other][0]:.4g} mm wide, not '
+            f'{1000 * size:.4g} mm as stated; leave that size out'
+        )
+    tag_map = TagMap(ids, sizes, poses, _read_family(document, path))
+    return tag_map._replace(note=_size_note(path)) if unsized and not size else tag_map
 
 
 def check_family(seen: str, stated: str, where: str) -> None:
@@ -135,6 +159,36 @@ def _read_family(document: Mapping[str, Any], path: str | Path) -> str:
     if not isinstance(family, str):
         raise ObservationError(f'{path}: family is {family!r:.40}; a name such as 36h11 is needed')
     return family
+
+
+def _is_of_layout(entry: Any) -> bool:
+    """Say whether a tag is one of a field layout of WPILib."""
+    return isinstance(entry, Mapping) and 'ID' in entry
+
+
+def _from_layout(entry: Mapping[str, Any], size: float, where: str) -> dict[str, Any]:
+    """Return a tag of a field layout of WPILib as one of a map; size: where it states none, m."""
+    try:
+        place, turn = entry['pose']['translation'], entry['pose']['rotation']['quaternion']
+        position = [float(place[axis]) for axis in 'xyz']
+        quaternion = np.array([float(turn[axis]) for axis in 'XYZW'])
+        if not (np.isfinite(quaternion).all() and quaternion.any()):
+            raise ValueError
+    except (TypeError, KeyError, ValueError) as cause:
+        raise ObservationError(
+            f'{where} (ID {entry["ID"]!r:.40}): pose needs translation (x, y, z) and '
+            'rotation.quaternion (W, X, Y, Z)'
+        ) from cause
+    turned = quaternion_from_rotation(rotation_from_quaternion(quaternion) @ _OF_LAYOUT)
+    pose = {'position': position, 'quaternion': turned.tolist()}
+    return {'id': entry['ID'], 'size': entry.get('size', size), 'pose': pose}
+
+
+def _size_note(path: str | Path) -> str:
+    return (
+        f'{path}: a field layout states no size of its tags; {1000 * _LAYOUT_SIZE:.1f} mm is '
+        'taken; for another, add "size" in m to each tag'
+    )
 
 
 def _from_bundle(entry: Any) -> Any:

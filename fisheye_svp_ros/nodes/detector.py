@@ -188,7 +188,7 @@ class Detector(BaseNode):
                 raise ParameterError('guide needs a board; it cannot be used with loose tags')
             if settings is not self.settings:
                 check_access(file, self.settings.folder, 'board')
-            return tag_pattern(settings.board, read_tag_map(file).landmarks())
+            return tag_pattern(settings.board, read_tag_map(file))
         return parse_pattern(settings.board)
 
     def configure(self, pattern: Pattern) -> None:
@@ -197,7 +197,10 @@ class Detector(BaseNode):
         self._failures_at_first = 0
         board = Landmarks(np.arange(len(pattern.points)), pattern.points)
         if pattern.kind == LOOSE_TAGS:
-            board = read_tag_map(pattern.spec.partition(':')[2]).landmarks()
+            tags = read_tag_map(pattern.spec.partition(':')[2])
+            board = tags.landmarks()
+            if tags.note:
+                self.get_logger().warning(tags.note)
         self._landmarks.publish(messages.landmarks_message(board, 0, self.settings.board_frame))
 
     def report(self) -> tuple[dict[str, object], str]:

@@ -84,6 +84,8 @@ class Localizer(SolverNode):
             super().collect_image_points(topic)
             return
         tags = read_tag_map(settings.tag_map)
+        if tags.note:
+            self.get_logger().warning(tags.note)
         self.hold_landmarks(decoding.LandmarkSet(tags.landmarks(), settings.map_frame))
         limits = TagLimits(settings.max_hamming, settings.min_decision_margin, tags.family)
         kind, read = detections_reader(settings.detections, limits)

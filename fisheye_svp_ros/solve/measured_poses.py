@@ -47,15 +47,19 @@ class MeasuredPoses(NamedTuple):
         return np.where(self.gross[..., None], np.nan, self.result.residual)
 
 
-def localize_measured(model: ForwardModel, observations: Observations) -> MeasuredPoses:
+def localize_measured(
+    model: ForwardModel, observations: Observations, tags: bool = False
+) -> MeasuredPoses:
     """Pose every frame of one camera's table that can be posed.
 
+    tags: the boards of the table are loose tags, whose points stand or fall together.
     Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed.
     """
     wrong = find_wrong_landmarks(observations, model, lambda _: model)
     right = ~np.isin(observations.landmark, [landmark.number for landmark in wrong])
     views, left_out = posable_views(observations, model, right)
-    checked = examine(model, views, localize(model, views), sigma_known(observations))
+    solved = localize(model, views)
+    checked = examine(model, views, solved, sigma_known(observations), tags=tags)
     result, reasons = checked.result, checked.reasons
     gross = np.asarray(checked.gross | views.used & (views.weight == 0))
     fixed = result.converged

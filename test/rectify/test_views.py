@@ -151,9 +151,9 @@ def test_views_of_two_cameras_have_a_folder_each(tmp_path: Path) -> None:
         (['--as', 'perspective:180,0,60'], 'and nothing of yaw180_pitch0'),
         (['--as', 'cubemap', '--as', 'pinhole'], 'one projection, or several perspectives'),
         (['--as', 'perspective:1,0,60', '--as', 'perspective:1,0,50'], 'two views are called'),
-        (['--as', 'perspective:1,0,60', '--fov', '60'], 'is the last number of --as'),
+        (['--as', 'perspective:1,0,60', '--fov', '60'], '--fov has no effect on --as perspective'),
         (['--as', 'cubemap', '--size', '60x40'], 'faces of a cube are square'),
-        (['--as', 'cubemap', '--rig', 'rig.yaml'], 'leave --rig out'),
+        (['--as', 'cubemap', '--rig', 'rig.yaml'], '--rig has no effect on views'),
     ],
 )
 def test_what_is_no_view_is_refused(
