@@ -29,6 +29,9 @@ LINES = {
     'localize a.csv --lens l.yaml --rig r.yaml --model-error': '--model-error works for one',
     'render --lens l --board chessboard:9x6:1mm -o r --poses p.csv --count 3': '--count is of',
     'render --lens l --board chessboard:9x6:1mm -o r --target room --ranges 1 2': '--ranges is of',
+    'localize a.csv --lens l.yaml --tag-map t.yaml': '--tag-map belongs to photographs of loose',
+    'undistort l.yaml -o u --as cubemap --rig r.yaml': '--rig has no effect on views',
+    'undistort l.yaml -o u --as perspective:9,0,60 --fov 60': '--fov has no effect on --as persp',
     'undistort l.yaml -o u --split 2': '--split has an effect on photographs alone',
 }
 APPLIED = (
@@ -39,6 +42,8 @@ APPLIED = (
     'diagnose a.csv --lens l.yaml --held-out photographs --board chessboard:3x3:1mm',
     'diagnose a.csv --lens l.yaml --next 3 --for e0 --room 0.1 1',
     'render --lens l --board chessboard:9x6:1mm -o r --target cube --ranges 1 2 --count 3',
+    'localize photographs --lens l.yaml --board tags:36h11 --tag-map t.yaml',
+    'undistort l.yaml -o u --as cubemap --fov 100',
     'undistort l.yaml photographs -o u --split 2',
     'undistort --lens left=l --lens right=l photographs -o u --split 2',
 )
