@@ -71,8 +71,8 @@ docs: $(VENV)/ready
 study: $(VENV)/ready
 	$(BIN)/python -m benchmark.studies.$(NAME) $(ARGS)
 
-# Hostile input, killed commands, small faults in the code, frozen answers:
-# make hardening NAME=fuzz, soak, kills (as root), mutation or frozen; minutes to hours.
+# Hostile input, killed commands, small faults in the code, statistical rules taken out, frozen
+# answers: make hardening NAME=fuzz, soak, kills (as root), mutation, rules or frozen.
 hardening: $(VENV)/ready
 	$(if $(filter mutation,$(NAME)),$(BIN)/pip install --quiet 'cosmic-ray>=8.3' 'pytest-cov>=7')
 	$(BIN)/python -m benchmark.hardening.$(NAME) $(ARGS)

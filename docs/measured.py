@@ -149,6 +149,14 @@ CLAIMS = (
         'a random sample',
         'make hardening NAME=mutation',
     ),
+    Claim(
+        'Statistical rules taken out are found by the tests of their module alone',
+        'rules',
+        r'\| all \| (\d+) \| (\d+) \| (\d+)% \|',
+        '{1} of {0} ({2} %)',
+        'one rule at a time',
+        'make hardening NAME=rules',
+    ),
 )
 
 

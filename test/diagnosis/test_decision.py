@@ -127,6 +127,23 @@ def test_a_correction_that_gains_nothing_is_not_blamed_on_offsets_of_nothing() -
     assert found.confidence is None
 
 
+@pytest.mark.parametrize(('low', 'answer'), [(0.01, 'correct'), (-0.01, 'measure_again')])
+def test_a_target_is_corrected_where_the_low_end_of_the_gain_is_above_zero(
+    low: float, answer: str
+) -> None:
+    """Not where the gain is: as likely as not it would be a loss."""
+    found = decide_target(TARGET._replace(gain=(0.5, low, 0.9)))
+    assert found.say == answer and found.figure == ('gain', 0.5, '1')
+
+
+@pytest.mark.parametrize(('pose_error', 'harmless'), [(0.99e-3, True), (1.01e-3, False)])
+def test_offsets_are_harmless_up_to_a_milliradian(pose_error: float, harmless: bool) -> None:
+    facts = TARGET._replace(largest=None, pose_error=pose_error, local_p=0.02)
+    found = decide_target(facts)
+    assert found.say == ('keep' if harmless else 'measure_again')
+    assert found.confidence == pytest.approx(0.98)
+
+
 def test_photographs_are_enough_or_not() -> None:
     facts = PhotographsFacts(26, [], [], 0.1, 0.09, 'keep')
     assert decide_photographs(facts).say == 'enough'

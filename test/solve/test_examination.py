@@ -14,6 +14,8 @@ from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.scene.rigs import rig
 from fisheye_svp_ros.solve.localization import Localization, localize
 from fisheye_svp_ros.solve.reliability import (
+    _consensus_pose,
+    _gross_reason,
     _noise_from_median,
     _suspect,
     doubt_of_pairs,
@@ -197,6 +199,25 @@ def test_outliers_are_named_largest_first_and_no_more_than_five():
     reason = examine(model, views, localize(model, views)).reasons[0]
     names = [part.split(' (')[0].split()[-1] for part in reason.split(', ')]
     assert names == ['11', '19', '5', '17', '14'] and reason.endswith(' and 2 more')
+
+
+def test_a_point_without_an_image_is_named_before_all_others():
+    views = views_of(np.zeros((3, 3)), np.zeros((1, 3, 2)))
+    residual = np.array([[3.0, 4.0], [np.nan, np.nan], [30.0, 40.0]])
+    reason = _gross_reason(views, np.array([False, True, True]), residual, False)
+    assert reason == 'outliers rejected: landmarks 1 (inf px), 2 (50 px)'
+
+
+@pytest.mark.parametrize(('noise', 'agrees'), [(0.7, True), (1.1, False)])
+def test_a_pose_that_most_agree_on_passes_the_test_of_its_misfit(noise, agrees):
+    """Of the variance of sigma times the tolerance 2.2 times, for 34 degrees of freedom."""
+    model, views, true = clean(seed=12)
+    exact = model.predict(true, views).uv
+    off = views.uv - exact
+    size = np.sqrt((localize(model, views).residual ** 2).sum() / 34)
+    views = views._replace(uv=exact + noise / size * off, weight=np.ones(views.weight.shape))
+    found = _consensus_pose(model, views, views, localize(model, views), 0.3, 2.0)
+    assert (found is not None) == agrees
 
 
 class TestPairs:
