@@ -23,6 +23,8 @@ QUICK := $(patsubst %,test/%,optics scene mixed_model effects io simulate solve 
 export PYTHONDONTWRITEBYTECODE :=
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
+# By a path, which type checkers and editors follow, as they do no import hook.
+EDITABLE := --config-settings editable_mode=compat -e
 
 .PHONY: demo check test test-all tests coverage lint paper docs study hardening peers bench test-oldest clean
 
@@ -95,7 +97,7 @@ bench: .venv-bench/ready
 	@echo "Installing what is compared into .venv-bench: some minutes, this once"
 	$(PYTHON) -m venv .venv-bench
 	.venv-bench/bin/pip install --quiet --upgrade pip
-	$(QUIETLY) .venv-bench/bin/pip install --quiet -e '.[fast,parquet$(ROS)]' -r benchmark/requirements.txt
+	$(QUIETLY) .venv-bench/bin/pip install --quiet $(EDITABLE) '.[fast,parquet$(ROS)]' -r benchmark/requirements.txt
 	.venv-bench/bin/pip install --quiet --no-deps mrcal || echo 'mrcal: not to be had here'
 	test -d .venv-bench/mrcal || git clone --quiet --depth 1 https://github.com/dkogan/mrcal \
 		.venv-bench/mrcal || echo 'mrcal: no sources to be had; its rows are left out'
@@ -107,7 +109,7 @@ COMPARE_PYTHON ?= python3.12
 .venv-compare/ready: setup.py
 	@echo "Installing what is compared into .venv-compare: some minutes, this once"
 	$(COMPARE_PYTHON) -m venv .venv-compare
-	$(QUIETLY) .venv-compare/bin/pip install --quiet -e '.[fast]' numpysane gnuplotlib packaging pyyaml
+	$(QUIETLY) .venv-compare/bin/pip install --quiet $(EDITABLE) '.[fast]' numpysane gnuplotlib packaging pyyaml
 	for peer in mrcal lensboy calibsense ds-msp; do .venv-compare/bin/pip install --quiet \
 		--no-deps $$peer || echo "$$peer: not to be had here"; done
 	touch $@
@@ -120,14 +122,14 @@ COMPARE_PYTHON ?= python3.12
 # OpenCV 5 has no hand-eye calibration any more.
 .venv-hand-eye/ready: setup.py
 	$(PYTHON) -m venv .venv-hand-eye
-	$(QUIETLY) .venv-hand-eye/bin/pip install --quiet -e '.[fast]' 'opencv-python-headless<5'
+	$(QUIETLY) .venv-hand-eye/bin/pip install --quiet $(EDITABLE) '.[fast]' 'opencv-python-headless<5'
 	touch $@
 
 # The oldest versions that are supported: those of Ubuntu 24.04 and OpenCV 4.6.
 test-oldest:
 	@echo "Installing the oldest versions into .venv-oldest: about a minute"
 	$(PYTHON) -m venv .venv-oldest
-	$(QUIETLY) .venv-oldest/bin/pip install --quiet -e '.[fast,parquet,test$(ROS)]' -c test/oldest.txt
+	$(QUIETLY) .venv-oldest/bin/pip install --quiet $(EDITABLE) '.[fast,parquet,test$(ROS)]' -c test/oldest.txt
 	.venv-oldest/bin/python -m pytest -n $(WORKERS) --dist loadgroup
 
 # Modules are compiled when they are first imported: most never are.
@@ -135,7 +137,7 @@ $(VENV)/ready: setup.py
 	@echo "Installing the package and its tools into $(VENV): about a minute, this once"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
-	$(QUIETLY) $(BIN)/pip install --quiet --no-compile -e '.[fast,parquet,dask,test,lint,docs$(ROS)]'
+	$(QUIETLY) $(BIN)/pip install --quiet --no-compile $(EDITABLE) '.[fast,parquet,dask,test,lint,docs$(ROS)]'
 	touch $@
 
 clean:

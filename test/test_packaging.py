@@ -217,3 +217,9 @@ def test_what_is_checked_at_every_save_is_there(monkeypatch):
     ).stdout
     paths = re.findall(r' (test/\S+)', told)
     assert len(paths) > 10 and all((ROOT / path).exists() for path in paths), paths
+
+
+def test_editable_installations_are_paths_that_type_checkers_follow() -> None:
+    text = (ROOT / 'Makefile').read_text()
+    assert 'EDITABLE := --config-settings editable_mode=compat -e\n' in text
+    assert " -e '." not in text and text.count('$(EDITABLE)') >= 1

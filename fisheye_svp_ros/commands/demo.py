@@ -12,7 +12,7 @@ import numpy as np
 from fisheye_svp_ros.commands.node_sweeps import start_in_step, values
 from fisheye_svp_ros.commands.notes import note_formats
 from fisheye_svp_ros.commands.outputs import add_output_folder
-from fisheye_svp_ros.commands.processes import Processes, missing_rclpy
+from fisheye_svp_ros.commands.processes import Processes
 from fisheye_svp_ros.commands.record import TOPICS
 from fisheye_svp_ros.errors import OutputError
 from fisheye_svp_ros.io.bags import Bag
@@ -26,6 +26,7 @@ from fisheye_svp_ros.io.recording import (
     tabulate,
 )
 from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.nodes.executables import missing_rclpy
 from fisheye_svp_ros.paper.demonstration import (
     TASKS,
     DemoRow,

@@ -20,13 +20,14 @@ from concurrent.futures import (
 from contextlib import ExitStack, contextmanager
 from typing import NamedTuple, TypeVar
 
+from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.errors import SweepError
 
 T = TypeVar('T')
 R = TypeVar('R')
 
 _TASKS_PER_WORKER = 3  # tasks under way for each worker: none waits for the next
-_PATIENCE = 10  # s for a scheduler to answer, and for its first worker
+_PATIENCE, _WORKER_PATIENCE = 10, 60  # s for a scheduler to answer, and for its first worker
 
 
 class Workers(NamedTuple):
@@ -101,10 +102,14 @@ def dask(address: str) -> Iterator[Workers]:
         stack.enter_context(_no_logging())  # what it tells of a scheduler that died, one line says
         stack.enter_context(client)
         try:
-            client.wait_for_workers(1, timeout=_PATIENCE)
+            if not client.nthreads():
+                say(f'{address}: no worker yet; waiting up to {_WORKER_PATIENCE} s for one')
+            client.wait_for_workers(1, timeout=_WORKER_PATIENCE)
             ahead = _TASKS_PER_WORKER * sum(client.nthreads().values())
         except (OSError, CancelledError) as cause:
-            raise SweepError(f'{address}: the Dask cluster has no worker; start one') from cause
+            raise SweepError(
+                f'{address}: no worker came to the Dask cluster in {_WORKER_PATIENCE} s; start one'
+            ) from cause
         try:
             yield Workers(client.get_executor(pure=False), ahead)
         except (distributed.KilledWorker, CommClosedError, CancelledError) as cause:

@@ -15,7 +15,7 @@ from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file
 from fisheye_svp_ros.io.share import is_there, typed_lens_path, without_camera
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.optics.ports import MEDIA, DomeGlass, FlatGlass, Port
-from fisheye_svp_ros.solve.lens_checks import is_known_in_part
+from fisheye_svp_ros.solve.lens_checks import is_known_in_part, probable_size
 
 LARGE_DEVIATION = 0.5  # px, of a lens from what another tool's file says
 _MAX_SHIFT = 0.1  # m, of the viewpoint at the edge of the field: no lens has so much
@@ -51,6 +51,13 @@ def note_odd(lens: Lens, path: str | Path, worst: float) -> None:
         say(
             f'{path}: the principal point ({lens.cx:.1f}, {lens.cy:.1f}) lies outside the image '
             f'of {lens.width}x{lens.height} px; check cx, cy and the image size'
+        )
+    elif size := probable_size(lens):
+        off = lens.cx - (lens.width - 1) / 2, lens.cy - (lens.height - 1) / 2
+        say(
+            f'{path}: the principal point lies {off[0]:.0f}, {off[1]:.0f} px off the center of '
+            f'{lens.width}x{lens.height} px; it would be the center of {size[0]}x{size[1]} px: '
+            'check the image size'
         )
     limit = np.degrees(lens.max_incidence)
     shift = float(lens.shift_at(np.asarray(lens.max_incidence)))

@@ -15,28 +15,15 @@ from contextlib import suppress
 from pathlib import Path
 
 from fisheye_svp_ros.errors import GraphError
+from fisheye_svp_ros.nodes.executables import missing_rclpy, ros_needed
 
 _RANGE, _LOCALHOST = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST'
 # Of a ROS 2 that is sourced, or of a user who has said how far its nodes are to be seen.
 _ENVIRONMENT = {'ROS_DISTRO', _RANGE, 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS'}
-_WAYS = (
-    'source ROS 2 Jazzy (Ubuntu 24.04: apt install ros-jazzy-ros-base) or, on x86-64 Linux with '
-    'Python 3.11 to 3.14, install the extra `ros` of this package'
-)
 _POLL = 0.05  # s
 _PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of <sys/prctl.h>
 _END = 4000  # bytes
 _GRACE = 10.0  # s to end after a signal
-
-
-def missing_rclpy() -> str:
-    """Return why rclpy cannot be imported; empty where it can."""
-    try:
-        import rclpy.node  # noqa: F401 - it loads the C library, too
-    except ImportError as error:
-        # Of a C library that was built for another Python, the first line says enough.
-        return str(error).partition('\n')[0]
-    return ''
 
 
 def prepare_ros() -> None:
@@ -45,10 +32,7 @@ def prepare_ros() -> None:
     Raises GraphError, with the ways to get it, where rclpy cannot be imported.
     """
     if reason := missing_rclpy():
-        version = '.'.join(map(str, sys.version_info[:2]))
-        raise GraphError(
-            f'nodes need ROS 2, which Python {version} does not have ({reason}); {_WAYS}'
-        )
+        raise GraphError(ros_needed(reason))
     if not _ENVIRONMENT & os.environ.keys():
         os.environ[_RANGE] = _LOCALHOST
 

@@ -29,6 +29,26 @@ set_thread_count()  # other nodes use the other cores
 draw_to_files()
 
 
+def missing_rclpy() -> str:
+    """Return why rclpy cannot be imported; empty where it can."""
+    try:
+        import rclpy.node  # noqa: F401 - it loads the C library, too
+    except ImportError as error:
+        # Of a C library that was built for another Python, the first line says enough.
+        return str(error).partition('\n')[0]
+    return ''
+
+
+def ros_needed(reason: str) -> str:
+    """Return how to get what nodes need; reason: why rclpy cannot be imported."""
+    version = '.'.join(map(str, sys.version_info[:2]))
+    return (
+        f'nodes need ROS 2, which Python {version} does not have ({reason}); source ROS 2 Jazzy '
+        '(Ubuntu 24.04: apt install ros-jazzy-ros-base) or, on x86-64 Linux with Python 3.11 to '
+        '3.14, install the extra `ros` of this package'
+    )
+
+
 @contextmanager
 def ending_quietly() -> Iterator[None]:
     """End the process at once on SIGINT or SIGTERM: while modules load, nothing is to be saved."""
@@ -95,11 +115,17 @@ def _run_executable(name: str) -> int:
     """Run a node; refuse or answer the arguments that nodes commonly overlook."""
     words = sys.argv[1:]
     misplaced = [word for word in takewhile('--ros-args'.__ne__, words) if word.startswith('-')]
+    if '--version' in words:
+        print(f'{name} {__version__}')
+        return 0
+    with ending_quietly():
+        reason = missing_rclpy()
+    if reason:
+        print(f'{name}: {ros_needed(reason)}', file=sys.stderr)
+        return 2
     if {'-h', '--help'} & {*words}:
         with ending_quietly():
             print_parameters(name)
-    elif '--version' in words:
-        print(f'{name} {__version__}')
     elif misplaced:
         print(
             f'{name}: {misplaced[0]!r} comes before --ros-args; ROS arguments follow it: {name} '

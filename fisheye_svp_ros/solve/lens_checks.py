@@ -71,6 +71,19 @@ def _nearest_edge(lens: Lens) -> float:
     return min(lens.cx, lens.width - lens.cx, lens.cy, lens.height - lens.cy)
 
 
+def probable_size(lens: Lens) -> tuple[int, int] | None:
+    """Return the image size that a principal point far off the center is the center of, px.
+
+    None for one that is not, or whose center is that of no image of the same shape.
+    """
+    scale = np.array([(2 * lens.cx + 1) / lens.width, (2 * lens.cy + 1) / lens.height])
+    if np.abs(scale - 1).max() <= 2 * _MAX_CENTER_OFFSET or scale.min() <= 0:
+        return None
+    if abs(scale[0] / scale[1] - 1) > _MAX_CENTER_OFFSET:
+        return None
+    return round(2 * lens.cx + 1), round(2 * lens.cy + 1)
+
+
 def is_no_fit(rms_px: float, sigma_px: float) -> bool:
     """Whether a lens leaves so much that it is no model of its points; sigma: NaN if unknown."""
     return rms_px > max(_LOST, _POOR * sigma_px if np.isfinite(sigma_px) else 0.0)

@@ -48,10 +48,15 @@ def test_a_ros_of_another_python_is_none(tmp_path: Path) -> None:
     (tmp_path / 'rclpy' / 'node.py').write_text(
         'raise ImportError("no C extension for this Python\\nPlease refer to ...")'
     )
-    code = 'from fisheye_svp_ros.commands import processes; print(processes.missing_rclpy())'
+    code = 'from fisheye_svp_ros.nodes import executables; print(executables.missing_rclpy())'
     env = os.environ | {'PYTHONPATH': f'{tmp_path}{os.pathsep}{ROOT}'}
     done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True, text=True)
     assert done.stdout == 'no C extension for this Python\n', done.stderr
+    script = 'import sys; from fisheye_svp_ros.nodes.executables import localizer; localizer()'
+    script = script.replace('localizer()', 'sys.exit(localizer())')
+    done = subprocess.run([sys.executable, '-c', script], env=env, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.count('\n') == 1
+    assert 'localizer: nodes need ROS 2' in done.stderr and 'the extra `ros`' in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from fisheye_svp_ros.commands.processes import missing_rclpy
+from fisheye_svp_ros.nodes.executables import missing_rclpy
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT = 60.0  # s; only a hang takes this long, however busy the machine is

@@ -9,7 +9,7 @@ cv2.fisheye.stereoCalibrate returns them.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,8 @@ _LISTS = tuple(
     )
 )
 _COUNTS = [shape for n in (4, 5, 6, 8, 12, 14) for shape in ((1, n), (n, 1))]
+_ERRORS = ('avgreprojectionerror', 'reprojectionerror', 'rms', 'rmserror', 'reprojerr')
+_MAX_ERROR = 5.0  # px, of a calibration that may be one
 _FISHEYE_NOTE = (
     '4 coefficients are read as those of cv2.fisheye; add `fisheye_model: 0` for those of '
     'cv2.calibrateCamera'
@@ -114,9 +116,22 @@ def read(text: str, where: str) -> Foreign:
     )
     r, p = (_matrix_numbers(named.get(name)) for name in _RECTIFIED)
     return given._replace(
-        notes=(_FISHEYE_NOTE,) * (assumed and _has_four(named)),
+        notes=(*(_FISHEYE_NOTE,) * (assumed and _has_four(named)), *_failures(named, lenses)),
         rectified=fields.rectified(r, p, where),
     )
+
+
+def _failures(named: Mapping[str, Any], lenses: Mapping[str, tuple[Lens, float]]) -> Iterator[str]:
+    """Yield why the calibration that a file is of has failed, by its own figures."""
+    stated = next((named[name] for name in _ERRORS if name in named), None)
+    poor = isinstance(stated, int | float) and stated > _MAX_ERROR
+    for camera, (lens, _) in lenses.items():
+        begun = abs(lens.fx - lens.width / np.pi) < 1e-6 * lens.width and lens.fx == lens.fy
+        begun = begun and not any(lens.image_height.coefficients)
+        if begun or poor:
+            reasons = [f'the file states {stated:.3g} px'] * poor
+            reasons += ["f = width / pi without distortion is OpenCV's start value"] * begun
+            yield f'{camera}: {", ".join(reasons)}: this fit failed; calibrate again'
 
 
 def _names_of_side(names: Sequence[str], side: str) -> list[str]:

@@ -37,6 +37,8 @@ _LARGE_SHARE = 0.5  # of the squares of all frames: such a pose is wrong
 _MIN_FRAMES = 6
 _ENOUGH_FRAMES = 8  # as for `diagnose`, which takes long to load
 _MAX_SCALE = 2.0  # of lengths, either way: more is another unit, or the size of another board
+_MAX_SCALE_ERROR, _MIN_SIGMAS = 0.02, 3.0  # of lengths that are measured, and standard errors
+_MAX_NOISE_M, _MAX_NOISE_RAD = 2e-3, np.radians(0.3)  # of an arm; ten times its repeatability
 _MIN_MM = 100.0  # such a factor, too large for a mistaken board, is that of mm
 
 
@@ -168,6 +170,18 @@ def hand_eye_warnings(hand_eye: HandEye) -> list[str]:
         warnings.append(
             f'lengths of robot and target differ by a factor of {factor:.4g}{likely}; '
             'both are needed in m'
+        )
+    elif abs(hand_eye.scale - 1) > max(_MAX_SCALE_ERROR, _MIN_SIGMAS * hand_eye.stderr[-1]):
+        warnings.append(
+            f'lengths of the target are {100 * (hand_eye.scale - 1):+.1f} % off those of the '
+            f'robot: a square of 25 mm would have to be {25 / hand_eye.scale:.1f} mm; measure the '
+            'squares'
+        )
+    if hand_eye.noise_m > _MAX_NOISE_M or hand_eye.noise_rad > _MAX_NOISE_RAD:
+        warnings.append(
+            f'noise of the robot is {1e3 * hand_eye.noise_m:.2g} mm and '
+            f'{np.degrees(hand_eye.noise_rad):.2g} deg, far above the repeatability of an arm: '
+            'check stamps, tool frame and lens'
         )
     noise = np.repeat((hand_eye.noise_m, hand_eye.noise_rad), 3)
     squares = ((hand_eye.residual / noise) ** 2).sum(axis=1)
