@@ -1,8 +1,8 @@
 """Where cameras stand, by the lenses that `calibrate` writes: `make study NAME=rig_transforms`.
 
 Four different lenses stand on an arc, 18 deg apart, and take 24 photographs of one board of 7 x 5
-corners, 27 cm wide; few are seen by all. Corners are off by 0.05 mm, image fields of lenses and of
-frames by 0.04 px each, 0.08 px of noise; the board is flat, or bent by 1.5 mm. Each set is
+corners, 27 cm wide; each sees half or more. Corners are off by 0.05 mm, image fields of lenses and
+of frames by 0.04 px each, 0.08 px of noise; the board is flat, or bent by 1.5 mm. Each set is
 calibrated as `calibrate` does (generalized), and all cameras together by least squares; the
 transforms into the first camera are compared with the true ones.
 """
