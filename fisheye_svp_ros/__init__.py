@@ -27,6 +27,7 @@ _HOMES = {
     'load_rig': 'io.rig_files',
     'save_lens': 'library.functions',
     'resize_lens': 'library.lenses',
+    'opencv_matrices': 'library.lenses',
     'project': 'library.functions',
     'back_project': 'library.functions',
     'localize': 'library.functions',

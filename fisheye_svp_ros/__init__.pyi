@@ -24,6 +24,7 @@ from fisheye_svp_ros.library.functions import simulate_scenario as simulate_scen
 from fisheye_svp_ros.library.functions import stereo_depth as stereo_depth
 from fisheye_svp_ros.library.functions import sweep as sweep
 from fisheye_svp_ros.library.functions import undistort_maps as undistort_maps
+from fisheye_svp_ros.library.lenses import opencv_matrices as opencv_matrices
 from fisheye_svp_ros.library.lenses import resize_lens as resize_lens
 from fisheye_svp_ros.library.lenses import undistort_views as undistort_views
 from fisheye_svp_ros.library.plots import plot_budget as plot_budget

@@ -371,34 +371,52 @@ def diagnose(
     *,
     free_intrinsics: bool | None = None,
     held_out: AnyObservations | None = None,
+    against: AnyObservations | None = None,
     poses: AnyPoses | None = None,
+    with_: Sequence[str] = (),
+    without: Sequence[str] = (),
     progress: Progress = _silent,
 ) -> Diagnosed:
     """Find what a lens's simulation gets wrong about observations, and extend it.
 
     free_intrinsics: whether they are to be fitted, by default where a fit made the lens;
-    held_out: other frames of the same camera and target to measure the gain on; poses: of the
-    camera, or of the flange of a robot that carries it, which the data tell apart;
+    held_out: other frames of the same camera and target to measure the gain on; against: of the
+    same camera with another target or of another day, where causes of the lens must hold, too;
+    poses: of the camera, or of the flange of a robot that carries it, which the data tell apart;
+    with_, without: names of effects that are known to be there, or not to be;
     progress: called with each stage and the share that is done.
-    Raises GeometryError or ObservationError where the data cannot be solved at all.
+    Raises GeometryError or ObservationError where the data cannot be solved at all,
+    ParameterError for an unknown effect, or one that is both.
     """
+    from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose_against
     from fisheye_svp_ros.diagnosis import diagnose as find_causes
     from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
     from fisheye_svp_ros.solve.measured_poses import poses_by_frame, usable_observations
 
+    included, left_out = (
+        tuple(map(str, check_list(names, name)))
+        for name, names in (('with_', with_), ('without', without))
+    )
+    if both := [name for name in included if name in left_out]:
+        raise ParameterError(f'{both[0]!r} is in with_ and in without; remove one of them')
+    options = DiagnosisOptions(included, left_out)
     table, known = table_and_lens(observations, lens)
     table, test = usable_observations(table, known).observations, None
     if held_out is not None:
         test = usable_observations(*table_and_lens(held_out, known)).observations
     given = None if poses is None else poses_by_frame(table, _by_frame(poses), 'poses')
-    found = find_causes(
-        table,
-        known,
-        free_intrinsics=free_intrinsics,
-        held_out=test,
-        poses=given,
-        progress=progress,
-    )
+    settings: dict[str, Any] = {
+        'free_intrinsics': free_intrinsics,
+        'held_out': test,
+        'poses': given,
+        'options': options,
+        'progress': progress,
+    }
+    if against is None:
+        found = find_causes(table, known, **settings)
+    else:
+        other = usable_observations(*table_and_lens(against, known)).observations
+        found = diagnose_against(table, other, known, **settings)
     return Diagnosed(found.verdict, as_read(diagnosis_document(found)), found.lens)
 
 

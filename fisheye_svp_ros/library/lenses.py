@@ -7,9 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects import resizing
 from fisheye_svp_ros.effects.resizing import ImageChange
 from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.io.lens_formats import models
 from fisheye_svp_ros.library.checks import (
     check_number,
     check_numbers,
@@ -56,6 +58,15 @@ def resize_lens(
         None if size is None else check_size(size, 'size'),
     )
     return change_image(known, change)[0]
+
+
+def opencv_matrices(lens: AnyLens) -> tuple[Array, Array]:
+    """Return K (3, 3), px, and D (4,) for cv2.fisheye; a viewpoint shift stays behind.
+
+    Raises LensError for a curve that these do not hold to a hundredth of a pixel.
+    """
+    near = models.nearest_kannala_brandt(load_lens(lens))
+    return models.camera_matrix(near), np.array(models.coefficients(near))
 
 
 def undistort_views(

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import PurePath
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 from fisheye_svp_ros.arrays import Array, Batch, Index, Mask
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.scene.pose_priors import PlanarPrior
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 SPREADS = ('whole', 'inner', 'outer')
 RADII = (2.0, 0.5, 0.2)
@@ -99,6 +102,29 @@ class Observations:
             f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in _HEADER
         }
         return replace(self, **rows)
+
+    def to_dataframe(self) -> DataFrame:
+        """Return the rows as a pandas.DataFrame, by the names of the CSV.
+
+        Raises ObservationError where pandas is not installed.
+        """
+        try:
+            from pandas import DataFrame
+        except ImportError as cause:
+            raise ObservationError('to_dataframe needs pandas; pip install pandas') from cause
+        names = np.array(self.cameras, dtype=object)
+        return DataFrame(
+            {
+                'frame': self.frame,
+                'camera': names[self.camera],
+                'landmark': self.landmark,
+                **dict(zip('uv', self.uv.T, strict=True)),
+                **dict(zip('xyz', self.xyz.T, strict=True)),
+                'board': self.board,
+                't': self.t,
+                'sigma': self.sigma,
+            }
+        )
 
     @property
     def frames(self) -> Index:
