@@ -35,7 +35,7 @@ TESTS = {
     },
     'solve/outliers.py': ['solve/test_outliers.py'],
     'solve/reliability.py': ['solve/test_examination.py', 'solve/test_reliability.py'],
-    'solve/weak_geometry.py': ['solve/test_tilt_integrals.py', 'solve/test_weak_geometry.py'],
+    'solve/weak_geometry.py': ['solve/test_weak_geometry.py'],
     'solve/wrong_landmarks.py': ['solve/test_wrong_landmarks.py'],
     'solve/ray_errors.py': ['solve/test_ray_errors.py'],
     'diagnosis/effect_tests.py': ['diagnosis/test_effect_tests.py'],
