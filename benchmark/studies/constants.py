@@ -3,9 +3,9 @@
 Boards that are sound, off, bent, or bent by another amount in every photograph, five to eighteen
 photographs of each, and real sets where `--data` names their folder, are diagnosed once. Then the
 decisions are made again with each number of the rooms that decide changed to its double and its
-half, all else as it is. A number that changes no answer, no reason and no flaw of any set is a
-candidate to go. Numbers that a search needs before it decides (selection, variances) are no part
-of this.
+half (of a share from one half on, what is missing to 1), all else as it is. A number that changes
+no answer, no reason and no flaw of any set is a candidate to go. Numbers that a search needs
+before it decides (selection, variances) are no part of this.
 
 Writes docs/results/constants.md.
 """
@@ -102,8 +102,10 @@ def _names(node: ast.Assign) -> Iterator[str]:
 
 @contextmanager
 def changed(constant: Constant, factor: float) -> Iterator[None]:
-    """Have every room that uses a constant see a multiple of it."""
+    """Have every room see a multiple of a constant; of a share near 1, of what is missing."""
     value = type(constant.value)(factor * constant.value)
+    if 0.5 <= constant.value < 1:
+        value = 1 - factor * (1 - constant.value)
     users = [room for room in ROOMS if constant.name in vars(room)]
     if constant.name.startswith('_'):
         users = [room for room in ROOMS if room.__name__ == constant.room]

@@ -138,7 +138,7 @@ def test_an_impossible_shift_asks_for_the_unit_first(found: Diagnosis) -> None:
     shift = Finding(
         'viewpoint_shift(order=1)', Reason.IMPLAUSIBLE, 1e-9, 1e-8, parameters=parameters
     )
-    adequacy = judge_data(found.evaluation, [], found.components, found.ray_error, [shift])
+    adequacy = judge_data(found.evaluation, [], found.components, {}, [shift])
     assert adequacy.flaws[0] == Flaw(FlawKind.SHIFT_TOO_LARGE, 0.049, MAX_SHIFT)
     assert _flawed(found, adequacy)[0] == (
         'The viewpoint would shift by 49 mm, more than in any real lens: x, y, z are probably not '
