@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.contradictions import check
-from helpers.flawed_sets import flawed
+from helpers.flawed_sets import board, flawed
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.commands.lenses import load_with_notes
@@ -71,6 +71,45 @@ def test_nothing_reassures_on_inadequate_data(name):
     assert 'describes these data' not in verdict_words(found)
     if found.adequacy.is_misfit:
         assert found.verdict == 'unexplained'
+
+
+def _mirror_numbers(table, frames):
+    """Return a table in which corners of some frames are numbered from the right."""
+    points = board()
+    x, y = np.round(points[:, :2].T / 0.03).astype(int)
+    mirrored = 9 * y + 8 - x
+    landmark = np.where(np.isin(table.frame, frames), mirrored[table.landmark], table.landmark)
+    return replace(table, landmark=landmark, xyz=points[landmark])
+
+
+UNKNOWN = {
+    'few': (lambda: flawed('sound', frames=4), FlawKind.FEW_FRAMES),
+    'noisy': (lambda: flawed('sound', noise=2.0), FlawKind.NOISE_TOO_LARGE),
+    'mirrored': (
+        lambda: (_mirror_numbers(flawed('sound')[0], [1, 5, 9, 13]), (1280, 960)),
+        FlawKind.SIDES_DIFFER,
+    ),
+    'size': (lambda: (flawed('sound')[0], (1600, 1200)), FlawKind.OFF_CENTER),
+    'breathing': (lambda: flawed('autofocus'), FlawKind.FOCAL_VARIES),
+}
+
+
+@pytest.mark.parametrize('name', UNKNOWN)
+def test_where_the_loss_is_not_known_that_comes_first(name):
+    """Two frames, 2 px of noise, mirrored corners and a wrong image size were "Keep, Enough"."""
+    make, kind = UNKNOWN[name]
+    table, size = make()
+    lens = calibrate(table, 'kannala_brandt', size).adjusted.lens
+    found = diagnose(table, lens, options=DiagnosisOptions(quick=True))
+    assert found.adequacy.flaws[0].kind == kind
+    assert {one.say for one in found.decision.values()} <= {'undecided', 'more', 'retake'}
+    check(found)
+    if kind == FlawKind.SIDES_DIFFER:
+        assert found.adequacy.flaws[0].groups == ((1, 5, 9, 13),)
+    if kind == FlawKind.FOCAL_VARIES:
+        assert found.adequacy.frames_error > 5e-3  # 2 %
+        (in_use,) = (one for one in found.ray_error_mrad()['in_use'] if one['range_m'] == 1.0)
+        assert in_use['value'] > 5.0
 
 
 @once('sound')
