@@ -1,7 +1,8 @@
 """Which constants of the decisions matter: each doubled and halved (`make study NAME=constants`).
 
-Boards that are sound, off, bent, or bent by another amount in every photograph, five to eighteen
-photographs of each, and real sets where `--data` names their folder, are diagnosed once. Then the
+Boards as they are said to be, with landmarks off, bent, or with all of it through a lens whose
+viewpoint may move, five to eighteen photographs of each, and real sets where `--data` names their
+folder, are diagnosed once. Then the
 decisions are made again with each number of the rooms that decide changed to its double and its
 half (of a share from one half on, what is missing to 1), all else as it is. A number that changes
 no answer, no reason and no flaw of any set is a candidate to go. Numbers that a search needs
