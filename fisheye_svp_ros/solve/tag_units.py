@@ -99,13 +99,14 @@ def choose_tags(model: ForwardModel, view: Views, allowed: float) -> TagChoices 
     tag alone, or more than _MAX_REJECTED_SHARE would have to be left out.
     """
     used = view.weight[0] > 0
+    inside = used & model.back_project(view.uv).valid[0]
     tags = np.unique(view.board[0, used])
     choices = [tags]
     for _ in range(int(_MAX_REJECTED_SHARE * len(tags))):
         smaller = {tuple(np.delete(tags, i)) for tags in choices for i in range(len(tags))}
         choices = [np.array(choice) for choice in sorted(smaller)]
         kept = np.stack([np.isin(view.board[0], choice) & used for choice in choices])
-        rich = np.flatnonzero(kept.sum(axis=1) >= MIN_POINTS)
+        rich = np.flatnonzero((kept & inside).sum(axis=1) >= MIN_POINTS)
         if not rich.size:
             return None
         kept, choices = kept[rich], [choices[i] for i in rich]
