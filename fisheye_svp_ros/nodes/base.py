@@ -123,6 +123,7 @@ class BaseNode(Node):  # type: ignore[misc]
             self.undeclare_parameter(name)
         self.settings = declare(self, self.SETTINGS, self.given)
         self._inputs: dict[str, Input] = {}
+        self.unread: list[Any] = []  # what else has messages to `take` before a set is solved
         self._silences: set[tuple[str, str]] = set()
         self._complaints = Complaints(self.get_logger().warning)
         self._unforeseen: set[tuple[object, ...]] = set()

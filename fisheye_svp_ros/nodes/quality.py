@@ -22,7 +22,7 @@ INPUT = QoSProfile(depth=1000)
 # Of camera_info: drivers send it as sensor data, and each set has one of its own.
 INFO_INPUT = QoSProfile(depth=INPUT.depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 TRANSFORMS = {
-    '/tf': RELIABLE,
+    '/tf': INPUT,
     '/tf_static': QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL),
 }
 

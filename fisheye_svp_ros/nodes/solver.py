@@ -408,6 +408,9 @@ class SolverNode(ManagedNode):
         A solver that is behind would else find out late which sets are too old to be solved.
         """
         end = time.monotonic() + _LONGEST_INTAKE
+        for one in self.unread:
+            while one.take() and time.monotonic() < end:
+                pass
         while (
             sum(subscription.take() for subscription in self._inputs.values())
             and time.monotonic() < end

@@ -171,7 +171,7 @@ class RobotSettings(GateSettings):
     base_frame: str = parameter(
         '',
         'Frame id of the base of a robot: publish its pose on ~/base_pose, the camera in it being '
-        'looked up on /tf_static. Empty: do not',
+        'looked up on /tf_static and /tf. Empty: do not',
         fixed=True,
         frame=True,
     )
@@ -181,6 +181,22 @@ class RobotSettings(GateSettings):
         'as amcl does; needs base_frame and odometry on /tf. Empty: do not',
         fixed=True,
         frame=True,
+    )
+    transform_tolerance: float = parameter(
+        1.0,
+        'With odom_frame: time by which the transform is dated after the image, as of amcl; it is '
+        'sent again, dated after the odometry, while no pose is found',
+        's',
+        (0.0, 60.0),
+        fixed=True,
+    )
+    transform_gap: float = parameter(
+        0.25,
+        'With base_frame: largest time between two transforms on /tf that are interpolated for an '
+        'image between them; across a longer gap nothing is published',
+        's',
+        (0.0, 60.0),
+        fixed=True,
     )
     max_std_m: float = parameter(
         0.2,
