@@ -103,7 +103,7 @@ def test_base_pose_and_odometry_are_published(
     g.until(lambda: len(poses) > 2)
     assert not bases
     assert (
-        "no chain from 'base_link' (base_frame) to 'camera_optical_frame'"
+        "has a chain from 'base_link' (base_frame) to 'camera_optical_frame'"
         in capfd.readouterr().err
     )
     mount = messages.transform_message(MOUNT, 0, 'base_link', 'camera_optical_frame')
