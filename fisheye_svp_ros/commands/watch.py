@@ -55,8 +55,9 @@ def _result_table(watcher: Watcher, width: int) -> RenderableType:
     for name in ('latest', 'mean', 'largest'):
         table.add_column(name, justify='right', no_wrap=True)
     for node, results in sorted(watcher.results.items()):
-        lost = f', {results.lost} not solved ({results.note})' if results.lost else ''
-        table.add_row(node, f'{results.sets} sets{lost}')
+        lost = f', {results.lost} not solved' if results.lost else ''
+        note = f'; the latest: {results.note}' if results.note else ''
+        table.add_row(node, f'{results.sets} sets{lost}{note}')
         for name, metric in results.metrics.items():
             text = metric_text(name)
             values = metric.latest, metric.total / metric.count, metric.largest

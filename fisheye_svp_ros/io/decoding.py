@@ -283,27 +283,53 @@ def read_framed_rig(message: Any, topic: str = 'rig') -> FramedRig:
     return FramedRig(pose, str(message.child_frame_id), str(message.header.frame_id))
 
 
-def read_camera_info(message: Any, topic: str = 'camera_info') -> CameraModel:
-    """Return the model of a CameraInfo: of the whole, raw image."""
-    k, d = [float(value) for value in message.k], tuple(float(value) for value in message.d)
-    if not k[0]:
-        raise ObservationError(f'{topic}: k is 0, as of a camera that is not calibrated')
-    if not (np.abs([*k, *d]) <= MAX_VALUE).all():  # not so for NaN
+def read_camera_info(
+    message: Any, topic: str = 'camera_info', rectified: bool = False
+) -> CameraModel:
+    """Return the model of a CameraInfo, of the image as it is sent: a part, binned.
+
+    rectified: that of the rectified image, from P, which has no distortion.  Its intrinsics are
+    those of the whole image, as image_geometry takes them: the part first, then the binning.
+    """
+    name = 'p' if rectified else 'k'
+    matrix = np.array([float(value) for value in getattr(message, name)]).reshape(3, -1)
+    d = () if rectified else tuple(float(value) for value in message.d)
+    if not matrix[0, 0]:
         raise ObservationError(
-            f'{topic}: k or d holds a value that is not a finite number, or beyond {MAX_VALUE:g}'
+            f'{topic}: {name} is 0, as of a camera that is not '
+            + ('rectified; set detections_rectified:=false' if rectified else 'calibrated')
         )
-    size, roi = (int(message.width), int(message.height)), message.roi
-    part = roi.x_offset or roi.y_offset or (roi.width or size[0], roi.height or size[1]) != size
-    if part or max(message.binning_x, message.binning_y) > 1:
+    if not (np.abs([*matrix.ravel(), *d]) <= MAX_VALUE).all():  # not so for NaN
         raise ObservationError(
-            f'{topic}: of a part of the image, or binned; whole images are needed'
+            f'{topic}: {name} or d holds a value that is not a finite number, or beyond '
+            f'{MAX_VALUE:g}'
         )
-    return CameraModel(str(message.distortion_model), size, (k[0], k[4], k[2], k[5], k[1]), d)
+    roi, width, height = message.roi, int(message.width), int(message.height)
+    bins = max(int(message.binning_x), 1), max(int(message.binning_y), 1)
+    low = int(roi.x_offset), int(roi.y_offset)
+    part = int(roi.width) or width, int(roi.height) or height
+    if low[0] + part[0] > width or low[1] + part[1] > height:
+        raise ObservationError(
+            f'{topic}: roi {part[0]}x{part[1]} at ({low[0]}, {low[1]}) is not in the image of '
+            f'{width}x{height} px; width and height are those of the whole image'
+        )
+    matrix[0, 2] -= low[0]
+    matrix[1, 2] -= low[1]
+    matrix[:2] /= np.array(bins, dtype=float)[:, None]
+    fx, fy, cx, cy, skew = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2), (0, 1)))
+    return CameraModel(
+        '' if rectified else str(message.distortion_model),
+        (part[0] // bins[0], part[1] // bins[1]),
+        (fx, fy, cx, cy, skew),
+        d,
+    )
 
 
-def read_framed_camera(message: Any, topic: str = 'camera_info') -> FramedCamera:
-    """Return the model of a CameraInfo, and its frame_id."""
-    return FramedCamera(read_camera_info(message, topic), str(message.header.frame_id))
+def read_framed_camera(
+    message: Any, topic: str = 'camera_info', rectified: bool = False
+) -> FramedCamera:
+    """Return the model of a CameraInfo, see `read_camera_info`, and its frame_id."""
+    return FramedCamera(read_camera_info(message, topic, rectified), str(message.header.frame_id))
 
 
 def frames_differ(one: str, other: str) -> bool:

@@ -347,7 +347,9 @@ class SolverNode(ManagedNode):
                 self.collect(
                     CameraInfo,
                     topic,
-                    read_framed_camera,
+                    functools.partial(
+                        read_framed_camera, rectified=self.settings.from_rectified_images
+                    ),
                     functools.partial(hear, topic),
                     INFO_INPUT,
                     latched=True,

@@ -214,6 +214,9 @@ class Input:
         self._has_one_publisher = len(publishers) == 1
         if self._is_fixed():
             return
+        if self.typename in _IMAGE_TYPES:
+            self._match(publishers)
+            return
         usual = next(iter(self._subscriptions))
         for publisher in publishers:
             offered = publisher.qos_profile
@@ -228,6 +231,22 @@ class Input:
                 if latched:
                     qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
                 self._add_subscription(needed, qos)
+
+    def _match(self, publishers: Sequence[Any]) -> None:
+        """Subscribe to images reliably where all publishers offer that: they get lost otherwise.
+
+        In place of the subscription that is there: two would bring each image twice.
+        """
+        offers = [one.qos_profile for one in publishers if one.topic_type == self.typename]
+        reliable = all(one.reliability == ReliabilityPolicy.RELIABLE for one in offers)
+        if not offers or (reliable, False) in self._subscriptions:
+            return
+        qos = copy(self.profiles[0])
+        qos.reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        for kind in [*self._subscriptions]:
+            self._node.destroy_subscription(self._subscriptions.pop(kind).of_rclpy)
+        self._number = None
+        self._add_subscription((reliable, False), qos)
 
     def losses(self) -> str:
         """Say how many messages have been lost, where that is many; call it for each report.
@@ -246,13 +265,20 @@ class Input:
             return self._tell_losses(lost, total)
         return self._seldom_lost if total else ''
 
+    def _can_be_reliable(self) -> bool:
+        """Say whether a user's override alone keeps this node from what publishers offer."""
+        publishers = self._node.get_publishers_info_by_topic(self.resolved)
+        offers = [one.qos_profile.reliability == ReliabilityPolicy.RELIABLE for one in publishers]
+        asks = [one.reliability == ReliabilityPolicy.RELIABLE for one in self.profiles]
+        return bool(offers) and all(offers) and not any(asks)
+
     def _lost_since(self, before: Count) -> tuple[int, int]:
         """Return how many messages were lost since a count, and how many there should be."""
         lost = self.count.lost - before.lost
         return lost, lost + self.count.received - before.received
 
     def _tell_losses(self, lost: int, total: int) -> str:
-        remedy = _loss_remedy(self.typename, self.resolved)
+        remedy = _loss_remedy(self.typename, self.resolved, self._can_be_reliable())
         return wording.messages_lost(self.name, lost, total, remedy)
 
     def _count_losses(self, number: int | None) -> None:
@@ -273,7 +299,7 @@ class Input:
         node = self._node
         adapt = node.guard_callback(lambda _: self.adapt())
         events = SubscriptionEventCallbacks(
-            matched=adapt if self.latched else None,
+            matched=adapt if self.latched or self.typename in _IMAGE_TYPES else None,
             incompatible_qos=None if self._is_fixed() else adapt,
         )
         hear_data, first = self._filter.callback(), not self._subscriptions
@@ -401,6 +427,8 @@ def _remedy(subscription: Input, offers: Sequence[Any]) -> str:
         if subscription.latched and volatile:
             return ' (volatile: what was sent before this node started is lost; publish it again)'
         return f'; check its own input, and run ros2 topic hz {subscription.resolved}'
+    if any(asked.reliability == ReliabilityPolicy.RELIABLE for asked in subscription.profiles):
+        return f'; check its own input, and run ros2 topic hz {subscription.resolved}'
     if all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers):
         override = f'set {PREFIX}{subscription.resolved}.subscription.reliability:=reliable'
         return f'; if ros2 topic hz {subscription.resolved} shows messages, {override}'
@@ -408,8 +436,13 @@ def _remedy(subscription: Input, offers: Sequence[Any]) -> str:
     return f' (best effort loses large messages: {remedy})'
 
 
-def _loss_remedy(typename: str, topic: str) -> str:
-    """Say what helps against the loss of messages of a type on a topic."""
+def _loss_remedy(typename: str, topic: str, reliable: bool = False) -> str:
+    """Say what helps against the loss of messages of a type on a topic.
+
+    reliable: its publishers send reliably, and this node is told not to ask for that.
+    """
+    if reliable:
+        return f'set {PREFIX}{topic}.subscription.reliability:=reliable'
     if typename not in _IMAGE_TYPES:
         return wording.small_message_remedy(f'{PREFIX}{topic}')
     takes_profiles = get_rmw_implementation_identifier().startswith('rmw_fastrtps')

@@ -36,7 +36,10 @@ class MetricHistory:
 
 @dataclass
 class SolverResults:
-    """What a node has told: sets it was given, sets it could not solve, its metrics."""
+    """What a node has told: sets it was given, sets it could not solve, its metrics.
+
+    note: why the latest set is not solved, or what is doubtful in it.
+    """
 
     sets: int = 0
     lost: int = 0
@@ -78,8 +81,8 @@ class Watcher(Node):  # type: ignore[misc]
             except (ObservationError, ValueError):
                 return
             results.sets += 1
-            if not numbers:
-                results.lost, results.note = results.lost + 1, message.status[0].message
+            results.lost += not numbers
+            results.note = message.status[0].message
             for name, value in numbers.items():
                 if math.isfinite(value):
                     results.metrics.setdefault(name, MetricHistory()).add(value)

@@ -110,6 +110,11 @@ class SolverSettings(Settings):
     )
 
     @property
+    def from_rectified_images(self) -> bool:
+        """Whether image points are those of rectified images, which `P` of a camera_info has."""
+        return False
+
+    @property
     def solves_svp(self) -> bool:
         """Whether to solve without the viewpoint shift of the lens."""
         return self.svp == 'true' or (self.svp == 'auto' and not self.lens)
@@ -166,6 +171,12 @@ class RobotSettings(GateSettings):
         False,
         'Publish the estimated pose on tf2, from the frame of the landmarks to that of the '
         'camera; only if no other node publishes the latter',
+        fixed=True,
+    )
+    detections_rectified: bool = parameter(
+        False,
+        'With lens:=camera_info: image points or detections are those of rectified images '
+        '(image_rect, as apriltag_ros takes by default); P of camera_info then is the lens',
         fixed=True,
     )
     base_frame: str = parameter(
@@ -232,6 +243,11 @@ class RobotSettings(GateSettings):
         span=(0.0, 10.0),
         fixed=True,
     )
+
+    @property
+    def from_rectified_images(self) -> bool:
+        """See SolverSettings."""
+        return self.detections_rectified
 
     @property
     def most_waiting(self) -> int:

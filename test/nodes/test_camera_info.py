@@ -168,13 +168,49 @@ def test_what_a_camera_info_says() -> None:
         ({'k': [0.0] * 9}, 'not calibrated'),
         ({'d': [np.nan] * 4}, 'not a finite number'),
         ({'k': [1e300, 0.0, 320.0, 0.0, 1e300, 240.0, 0.0, 0.0, 1.0]}, r'beyond 1e\+12'),
-        ({'binning_x': 2}, 'binned'),
-        ({'roi': RegionOfInterest(x_offset=4)}, 'a part of the image'),
+        ({'roi': RegionOfInterest(x_offset=4)}, r'roi 640x480 at \(4, 0\) is not in the image'),
     ],
 )
 def test_a_camera_info_of_no_use(changes: dict[str, Any], reason: str) -> None:
     with pytest.raises(ObservationError, match=reason):
         read_camera_info(info(**changes))
+
+
+def test_a_part_of_the_image_and_its_binning_move_the_intrinsics() -> None:
+    roi = RegionOfInterest(x_offset=100, y_offset=40, width=400, height=300)
+    model = read_camera_info(info(roi=roi, binning_x=2, binning_y=3))
+    assert model.size == (200, 100)
+    expected = K[0] / 2, K[1] / 3, (K[2] - 100) / 2, (K[3] - 40) / 3, 0.0
+    assert model.intrinsics == pytest.approx(expected)
+
+
+def test_of_rectified_images_p_is_the_lens() -> None:
+    p = [500.0, 0.0, 310.0, -60.0, 0.0, 501.0, 235.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    model = read_camera_info(info(p=p, binning_x=2), 'camera_info', rectified=True)
+    assert model == ('', (320, 480), (250.0, 501.0, 155.0, 235.0, 0.0), ())
+    with pytest.raises(ObservationError, match='p is 0.*set detections_rectified:=false'):
+        read_camera_info(info(), 'camera_info', rectified=True)
+
+
+def test_a_localizer_takes_points_of_rectified_images(graphs: list[Graph]) -> None:
+    g = start(graphs, 'detections_rectified:=true', 'patience:=0.1')
+    results = g.hear(DiagnosticArray, 'localizer/result')
+    g.start(Localizer)
+    driver, points = g.tell(CameraInfo, 'camera_info'), g.tell(PointCloud2, 'image_points')
+    landmarks, pose = environment('whole', 2.0), paper_pose()
+    g.tell(PointCloud2, 'landmarks', LATCHED).publish(
+        messages.landmarks_message(landmarks, 0, 'world')
+    )
+    p = [300.0, 0.0, 310.0, 0.0, 0.0, 301.0, 235.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+    x, y, z = pose.into_body(landmarks.points).T
+    seen = z > 0.3 * np.hypot(x, y)
+    uv = np.stack([310 + 300 * x / z, 235 + 301 * y / z], axis=-1)[seen]
+    message = info(p=p)
+    message.header.stamp.nanosec = 7
+    driver.publish(message)
+    points.publish(messages.image_points_message(landmarks.ids[seen], uv, 7, 'camera'))
+    g.until(lambda: results)
+    assert numbers(results[-1])['rms_px'] < 1e-6
 
 
 @pytest.mark.parametrize(

@@ -168,19 +168,57 @@ def said(reports: list[Any]) -> str:
     return ' '.join(status.message for report in reports for status in report.status)
 
 
-@pytest.mark.parametrize('reliability', ['reliable', 'best_effort'])
+@pytest.mark.parametrize('asked', ['', 'best_effort'])
+@pytest.mark.parametrize('offered', ['reliable', 'best_effort'])
 def test_the_remedy_for_silent_images_is_that_of_their_publisher(
-    graph: Callable[..., Graph], reliability: str
+    graph: Callable[..., Graph], offered: str, asked: str
 ) -> None:
-    g = graph('board:=chessboard:9x6:25mm')
+    override = 'qos_overrides./image.subscription.reliability:='
+    g = graph('board:=chessboard:9x6:25mm', *([override + asked] if asked else []))
     reports = g.hear(DiagnosticArray, '/diagnostics')
-    policy = ReliabilityPolicy[reliability.upper()]
+    policy = ReliabilityPolicy[offered.upper()]
     g.probe.create_publisher(Image, 'image', QoSProfile(depth=5, reliability=policy))
     g.start(Detector)
     g.until(lambda: 'no message has arrived' in said(reports))
-    assert ('rmem_max' in said(reports)) == (reliability == 'best_effort')
-    override = 'qos_overrides./image.subscription.reliability:=reliable'
-    assert (override in said(reports)) == (reliability == 'reliable')
+    assert ('rmem_max' in said(reports)) == (offered == 'best_effort')
+    wanted = f'{override}reliable' in said(reports)
+    assert wanted == (offered == 'reliable' and bool(asked))
+
+
+def test_images_are_heard_as_their_publishers_send_them(graph: Callable[..., Graph]) -> None:
+    g = graph('board:=chessboard:9x6:25mm')
+    node = g.start(Detector)
+    one = node._inputs['image']
+
+    def asked() -> list[str]:
+        return [profile.reliability.name for profile in one.profiles]
+
+    assert asked() == ['BEST_EFFORT']
+    sender = g.tell(Image, 'image', QoSProfile(depth=30))
+    g.until(lambda: asked() == ['RELIABLE'])
+    g.until(lambda: sender.get_subscription_count() == 1)
+    blank = messages.image_message(np.zeros((16, 16), np.uint8), 1, 'camera')
+    for _ in range(4):
+        sender.publish(blank)
+    g.until(lambda: one.count.received == 4)
+    lossy = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    g.probe.create_publisher(Image, 'image', lossy)
+    g.until(lambda: asked() == ['BEST_EFFORT'])
+
+
+def test_of_lost_images_that_are_sent_reliably_the_override_is_named(
+    graph: Callable[..., Graph],
+) -> None:
+    g = graph(
+        'board:=chessboard:9x6:25mm', 'qos_overrides./image.subscription.reliability:=best_effort'
+    )
+    one = g.start(Detector)._inputs['image']
+    g.tell(Image, 'image', QoSProfile(depth=5))
+    g.until(lambda: g.probe.count_publishers('image'))
+    one.count.received, one.count.lost = 10, 20
+    g.until(lambda: one._can_be_reliable())
+    text = one.losses()
+    assert text.endswith('set qos_overrides./image.subscription.reliability:=reliable')
 
 
 def test_the_remedy_for_small_messages_is_no_buffer(graph: Callable[..., Graph]) -> None:

@@ -68,7 +68,7 @@ def test_results_are_shown_with_their_metrics(
         'lock_step:=localizer/result',
     )
     assert camera.finish() == 0
-    shown.wait_for('2 sets, 1 not solved')
+    shown.wait_for('2 sets, 1 not solved; the latest: ')
     assert shown.finish(signal.SIGINT) == 0
     text = '\n'.join(shown.lines)
     assert '/here/localizer' in text and 'position_error_m' in text
