@@ -188,7 +188,7 @@ def test_of_rectified_images_p_is_the_lens() -> None:
     p = [500.0, 0.0, 310.0, -60.0, 0.0, 501.0, 235.0, 0.0, 0.0, 0.0, 1.0, 0.0]
     model = read_camera_info(info(p=p, binning_x=2), 'camera_info', rectified=True)
     assert model == ('', (320, 480), (250.0, 501.0, 155.0, 235.0, 0.0), ())
-    with pytest.raises(ObservationError, match='p is 0.*set detections_rectified:=false'):
+    with pytest.raises(ObservationError, match=r'p is 0.*set detections_rectified:=false'):
         read_camera_info(info(), 'camera_info', rectified=True)
 
 
