@@ -1,12 +1,13 @@
-"""A simulated robot in a room of 12 tags: photographs, map, poses of its base, a filter.
+"""A simulated robot in a room of 12 tags: a walk, a map, poses of its base, a filter.
 
-A robot with one fisheye drives a loop.  Its camera's photographs are rendered, the tags in them
-found, mapped (`fisheye-svp map` does the same) and localized by; the pose of the base with its
+Without --map, somebody walks through the room with the robot's fisheye: its photographs, for
+`fisheye-svp map`, and its lens are written.  With the map that comes of these, the robot drives a
+loop: the tags in its photographs are found and localized by, and the pose of the base with its
 covariance goes into an extended Kalman filter with the formulas of robot_localization (odometry as
 twist, the pose as absolute measurement).  The truth then says how large errors are, and whether
 covariances are: the normalized squared error (NEES) of a pose has the mean of its dimension.
 
-    python examples/where_is_my_robot.py [DIR] [--images 60]
+    python examples/where_is_my_robot.py [DIR] [--images 24] [--seed 0] [--map DIR/tags.yaml]
 """
 
 from __future__ import annotations
@@ -23,12 +24,11 @@ from fisheye_svp_ros.detect.tags import find_tags
 from fisheye_svp_ros.effects.forward import ForwardModel, back_project_corrected, project_corrected
 from fisheye_svp_ros.io.files import write_json
 from fisheye_svp_ros.io.lens_files import save_lens
-from fisheye_svp_ros.io.tag_maps import TagMap, write_tag_map
+from fisheye_svp_ros.io.tag_maps import TagMap, read_tag_map, write_tag_map
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, carried_pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import views_of
-from fisheye_svp_ros.solve.tag_mapping import map_tags
 from fisheye_svp_ros.study.solutions import localize_sets
 
 LENS = Lens(
@@ -77,6 +77,14 @@ def drive(count: int) -> Pose:
     heading = np.arctan2(0.9 * np.cos(angle), -1.5 * np.sin(angle))
     turn = np.stack([0 * angle, 0 * angle, heading], axis=-1)
     return Pose(rotation_from_vector(turn), np.stack([x, y, 0 * x], axis=-1))
+
+
+def walk(count: int, rng: np.random.Generator) -> Pose:
+    """Return poses of a camera (count,) that somebody carries about where the robot drives."""
+    base = drive(count)
+    turn = rotation_from_vector(rng.normal(0, 0.1, (count, 3))) @ base.rotation
+    carried = Pose(turn, base.position + rng.normal(0, 0.1, (count, 3)))
+    return carried.compose(MOUNT.broadcast_to(count))
 
 
 class Renderer:
@@ -173,15 +181,10 @@ class Track(NamedTuple):
         return np.asarray((self.error * solved).sum(axis=-1))
 
 
-def photographs(tags: TagMap, base: Pose, folder: Path) -> list[np.ndarray]:
-    """Render and write what the camera sees from each pose of the base."""
-    renderer, rng = Renderer(tags), np.random.default_rng(0)
-    folder.mkdir(parents=True, exist_ok=True)
-    images = []
-    for i in range(len(base.position)):
-        images.append(renderer.photograph(base.take(i).compose(MOUNT), rng))
-        cv2.imwrite(str(folder / f'{i:04d}.png'), images[-1])
-    return images
+def photographs(tags: TagMap, cameras: Pose, seed: int) -> list[np.ndarray]:
+    """Render what a camera sees from each of its poses."""
+    renderer, rng = Renderer(tags), np.random.default_rng(seed)
+    return [renderer.photograph(cameras.take(i), rng) for i in range(len(cameras.position))]
 
 
 def localize_bases(
@@ -198,12 +201,20 @@ def localize_bases(
     points = np.tile(tags.corners.reshape(-1, 3), (len(posed), 1, 1))
     uv = uv.reshape(len(found), -1, 2)[posed]
     views = views_of(points, uv, np.full(uv.shape[:2], 1 / SIGMA))
+    landmark = np.tile((4 * tags.ids[:, None] + np.arange(4)).ravel(), (len(posed), 1))
+    views = views._replace(landmark_covariance=tags.landmark_covariance(landmark))
     solution = localize_sets(ForwardModel(LENS), views, examined=True).solution
     carried = [
         carried_pose(solution.pose.take(i), solution.covariance[i], MOUNT.inverse())
         for i in range(len(posed))
     ]
     return posed, Pose.stack([one[0] for one in carried]), np.stack([one[1] for one in carried])
+
+
+def into_room(frame: Pose, pose: Pose, covariance: np.ndarray) -> tuple[Pose, np.ndarray]:
+    """Return poses (F,) and covariances (F, 6, 6) that were in a frame which stands in a room."""
+    turn = np.kron(np.eye(2), frame.rotation)
+    return frame.broadcast_to(len(covariance)).compose(pose), turn @ covariance @ turn.T
 
 
 def planar(pose: Pose, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -257,56 +268,72 @@ def draw(
     figure.savefig(path, dpi=110)
 
 
-def main() -> None:
-    """Drive, map, localize, filter; print and write what came of it."""
-    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
-    parser.add_argument('output', type=Path, nargs='?', default=Path('robot'))
-    parser.add_argument('--images', type=int, default=24)
-    args = parser.parse_args()
-    tags, path = room_tags(), drive(TWISTS * args.images)
-    base = path.take(np.arange(0, TWISTS * args.images, TWISTS))
-    images = photographs(tags, base, args.output / 'walk')
-    save_lens(LENS, args.output / 'lens.yaml')
-    write_tag_map(tags, args.output / 'true_tags.yaml')
-    found = [find_tags(image) for image in images]
-    image = np.repeat(np.arange(len(found)), [len(ids) for ids, _ in found])
-    ids, corners = (np.concatenate([one[k] for one in found]) for k in (0, 1))
-    mapped = map_tags(ForwardModel(LENS), image, ids, corners, SIZE, origin=0)
-    into = tags.poses.take(0)  # the map in the frame of tag 0, which stands there in the room
-    known = TagMap(
-        mapped.ids,
-        np.full(len(mapped.ids), SIZE),
-        into.broadcast_to(len(mapped.ids)).compose(mapped.poses),
-    )
-    write_tag_map(known, args.output / 'tags.yaml', mapped.stderr)
-    true_tags = tags.poses.take(np.searchsorted(tags.ids, mapped.ids))
-    map_error = np.linalg.norm(known.poses.position - true_tags.position, axis=1)
-    posed, pose, covariance = localize_bases(tags, found)
+def take_a_walk(tags: TagMap, count: int, seed: int, folder: Path) -> None:
+    """Write the photographs of a walk, the lens and the true map."""
+    cameras = walk(count, np.random.default_rng(seed))
+    (folder / 'walk').mkdir(parents=True, exist_ok=True)
+    for i, image in enumerate(photographs(tags, cameras, seed)):
+        cv2.imwrite(str(folder / 'walk' / f'{i:04d}.png'), image)
+    save_lens(LENS, folder / 'lens.yaml')
+    write_tag_map(tags, folder / 'true_tags.yaml')
+
+
+def drive_by_map(
+    tags: TagMap, known: TagMap, count: int, seed: int, folder: Path
+) -> dict[str, float]:
+    """Drive by a map whose origin is tag 0 of the room; draw it, return what came of it."""
+    path = drive(TWISTS * count)
+    base = path.take(np.arange(0, TWISTS * count, TWISTS))
+    cameras = base.compose(MOUNT.broadcast_to(count))
+    found = [find_tags(image) for image in photographs(tags, cameras, 1000 + seed)]
+    origin = tags.poses.take(0)  # where the frame of the map stands in the room
+    posed, *solved = localize_bases(known, found)
+    pose, covariance = into_room(origin, *solved)
     measured, planar_covariance = planar(pose, covariance)
     alone = Track(pose.difference(base.take(posed)), covariance)
     filtered = run_filter(path, posed, measured, planar_covariance)
     flat_error = np.column_stack([alone.error[:, :2], alone.error[:, 5]])
     draw(
-        args.output / 'where_is_my_robot.png',
+        folder / 'where_is_my_robot.png',
         tags,
         base,
         measured,
         {'base_pose': Track(flat_error, planar_covariance), 'filter': filtered},
     )
-    figures = {
-        'images': args.images,
+    true_tags = tags.poses.take(np.searchsorted(tags.ids, known.ids))
+    there = origin.broadcast_to(len(known.ids)).compose(known.poses)
+    return {
+        'images': count,
         'posed': len(posed),
-        'tags_mapped': len(mapped.ids),
-        'map_rms_px': mapped.rms_px,
-        'map_error_mm': 1e3 * float(map_error.mean()),
-        'map_stderr_mm': 1e3 * float(mapped.stderr.mean()),
-        'base_error_mm': 1e3 * float(np.linalg.norm(alone.error[:, :3], axis=1).mean()),
+        'tags_mapped': len(known.ids),
+        'map_error_mm': 1e3 * rms(there.position - true_tags.position),
+        'map_stderr_mm': 1e3 * rms(known.stderr[:, None]),
+        'base_error_mm': 1e3 * rms(alone.error[:, :3]),
         'base_nees_of_6': float(alone.nees().mean()),
         'base_within_95': float((alone.nees() < 12.59).mean()),
-        'filter_error_mm': 1e3 * float(np.linalg.norm(filtered.error[:, :2], axis=1).mean()),
+        'filter_error_mm': 1e3 * rms(filtered.error[:, :2]),
         'filter_nees_of_3': float(filtered.nees().mean()),
-        'filter_within_95': float((filtered.nees() < 7.81).mean()),
     }
+
+
+def rms(vectors: np.ndarray) -> float:
+    """Return the root mean square length of vectors (N, D)."""
+    return float(np.sqrt((vectors**2).sum(axis=-1).mean()))
+
+
+def main() -> None:
+    """Walk, or drive by a map; print and write what came of it."""
+    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
+    parser.add_argument('output', type=Path, nargs='?', default=Path('robot'))
+    parser.add_argument('--images', type=int, default=24)
+    parser.add_argument('--seed', type=int, default=0, help='of the noise')
+    parser.add_argument('--map', type=Path, help='map of the walk, to drive by')
+    args = parser.parse_args()
+    if args.map is None:
+        take_a_walk(room_tags(), args.images, args.seed, args.output)
+        return
+    known = read_tag_map(args.map)
+    figures = drive_by_map(room_tags(), known, args.images, args.seed, args.output)
     write_json(args.output / 'figures.json', figures)
     for name, value in figures.items():
         print(f'{name}: {value:.3g}')

@@ -47,7 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--output',
         type=output_file,
         metavar='TAGS.yaml',
-        help='tag map to write; the poses of the camera are written next to it as .poses.csv',
+        help='tag map to write; next to it the errors of all tags as .covariance.npz, the poses '
+        'of the camera as .poses.csv',
     )
 
 
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> None:
     """Find the tags, map them, print and write the map."""
     from fisheye_svp_ros.detect.photographs import find_photographs
     from fisheye_svp_ros.detect.tags import FAMILY, find_tag_views, tag_size
-    from fisheye_svp_ros.io.tag_maps import map_of_size, write_tag_map
+    from fisheye_svp_ros.io.tag_maps import map_of_size, tag_covariance, write_tag_map
     from fisheye_svp_ros.solve.tag_mapping import map_tags
 
     size, lenses = tag_size(args.board), lenses_of([''], load_lenses(args.lens))
@@ -65,7 +66,8 @@ def run(args: argparse.Namespace) -> None:
     check_sizes(args.recording[0], {'': seen.size}, {'': lens})
     with progress('mapping'):
         tag_map = map_tags(ForwardModel(lens), seen.image, seen.ids, seen.uv, size, args.origin)
-    tags = map_of_size(tag_map.ids, size, tag_map.poses, FAMILY)
+    covariance = tag_covariance(tag_map.information)
+    tags = map_of_size(tag_map.ids, size, tag_map.poses, FAMILY, covariance)
     print_table(
         f'{len(tag_map.ids)} tags from {len(tag_map.images)} of {len(seen.names)} images, '
         f'rms {tag_map.rms_px:.3f} px',
@@ -73,7 +75,7 @@ def run(args: argparse.Namespace) -> None:
         [
             (str(number), *(f'{1000 * one:.1f}' for one in place), f'{1000 * error:.2f}')
             for number, place, error in zip(
-                tag_map.ids, tag_map.poses.position, tag_map.stderr, strict=True
+                tags.ids, tags.poses.position, tags.stderr, strict=True
             )
         ],
     )
@@ -81,7 +83,7 @@ def run(args: argparse.Namespace) -> None:
         say(note)
     if args.output:
         with write_together():
-            write_tag_map(tags, args.output, tag_map.stderr, 'fisheye-svp map')
+            write_tag_map(tags, args.output, 'fisheye-svp map', tag_map.information)
             write_poses(
                 args.output.with_suffix('.poses.csv'),
                 tag_map.images,

@@ -1,21 +1,32 @@
 """Maps of tags: YAML with the id, size and pose of each; those of apriltag_ros and WPILib, too.
 
 A tag's frame is that of apriltag_ros: the middle of the tag, x right, y up, z out of it.
+The errors of all tags stand in a file beside the map, which names it (`covariance`): the inverse
+of their covariance, which is sparse.  A map that has `stderr_m` alone has tags with errors of
+their own.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
+from numpy.linalg import LinAlgError
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import ObservationError
-from fisheye_svp_ros.io.files import dump_yaml, read_yaml, write_text
-from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_quaternion
+from fisheye_svp_ros.io.files import dump_yaml, read_bytes, read_yaml, replacing, write_text
+from fisheye_svp_ros.pose import (
+    Pose,
+    cross_matrix,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 from fisheye_svp_ros.scene.observations import Landmarks
 
 CORNERS = 4  # of a tag, landmark CORNERS * id + corner: from its lower left, against the clock
@@ -27,6 +38,8 @@ _LAYOUT_SIZE = 0.1651  # m: 6.5 inches, of the tags of FRC since 2024; layouts s
 # Our axes in those of WPILib's tags: x out of the tag, y to the right of a beholder, z up
 _OF_LAYOUT = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 _SIZE_TOLERANCE = 1e-6  # relative
+_MAX_STDERR = 10.0  # m
+_COVARIANCE_SUFFIX = '.covariance.npz'
 _UNIT_CORNERS = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2
 
 
@@ -34,6 +47,8 @@ class TagMap(NamedTuple):
     """Tags (T,): id, side, m, pose in the frame of the map; family: '' where it is not stated.
 
     note: what was assumed, '' for nothing.
+    covariance (6 T, 6 T), m and rad, of the changes in `Pose.retract` of all tags; None: they
+    are exact.
     """
 
     ids: Index
@@ -41,6 +56,15 @@ class TagMap(NamedTuple):
     poses: Pose
     family: str = ''
     note: str = ''
+    covariance: Array | None = None
+
+    @property
+    def stderr(self) -> Array:
+        """Root mean square distances (T,) of tags from where the map has them, m."""
+        if self.covariance is None:
+            return np.zeros(len(self.ids))
+        variances = np.diagonal(self.covariance).reshape(-1, 6)
+        return np.asarray(np.sqrt(variances[:, :3].sum(axis=1)))
 
     @property
     def corners(self) -> Array:
@@ -58,16 +82,49 @@ class TagMap(NamedTuple):
             np.concatenate([points, self.poses.position]),
         )
 
+    def landmark_covariance(self, landmark: Index) -> Array | None:
+        """Return the covariances (S, N, 3, N, 3), m^2, of landmarks (S, N) of this map.
+
+        None where they are exact.  Those of a number below 0, padding, are those of any tag.
+        """
+        if self.covariance is None:
+            return None
+        center, order = landmark >= CENTER_OFFSET, np.argsort(self.ids)
+        slot = np.searchsorted(self.ids, tags_of(landmark), sorter=order)
+        tag = order[np.minimum(slot, len(order) - 1)]
+        arm = self.corners[tag, landmark % CORNERS] - self.poses.position[tag]
+        turned = -cross_matrix(np.where(center[..., None], 0.0, arm))
+        by_tag = np.concatenate([np.broadcast_to(np.eye(3), turned.shape), turned], axis=-1)
+        rows = 6 * tag[..., None] + np.arange(6)
+        of_tags = self.covariance[rows[:, :, None, :, None], rows[:, None, :, None]]
+        points = by_tag[:, :, None] @ of_tags @ np.swapaxes(by_tag, -1, -2)[:, None]
+        return np.asarray(np.swapaxes(points, 2, 3))
+
 
 def tags_of(landmarks: Index) -> Index:
-    """Return the tags (N,) that landmarks (N,) of `TagMap.landmarks` belong to."""
+    """Return the tags (...) that landmarks (...) of `TagMap.landmarks` belong to."""
     corner = landmarks < CENTER_OFFSET
     return np.asarray(np.where(corner, landmarks // CORNERS, landmarks - CENTER_OFFSET))
 
 
-def map_of_size(ids: Index, size: float, poses: Pose, family: str = '') -> TagMap:
+def map_of_size(
+    ids: Index, size: float, poses: Pose, family: str = '', covariance: Array | None = None
+) -> TagMap:
     """Return a map of tags (T,) of one size, m."""
-    return TagMap(ids, np.full(len(ids), size), poses, family)
+    return TagMap(ids, np.full(len(ids), size), poses, family, '', covariance)
+
+
+def tag_covariance(information: Array) -> Array:
+    """Return the covariance (6 T, 6 T) of tags from its inverse (6 T, 6 T).
+
+    What has no information at all, a tag that is the origin of the map, has no error.
+    """
+    free = np.flatnonzero(np.diagonal(information) > 0)
+    scale = np.sqrt(np.diagonal(information)[free])
+    unit = np.linalg.inv(information[np.ix_(free, free)] / np.outer(scale, scale))
+    covariance = np.zeros_like(information)
+    covariance[np.ix_(free, free)] = (unit + unit.T) / 2 / np.outer(scale, scale)
+    return covariance
 
 
 def read_tag_map(path: str | Path, size: float | None = None) -> TagMap:
@@ -112,8 +169,12 @@ def read_tag_map(path: str | Path, size: float | None = None) -> TagMap:
             f'{path}: tag {ids[other][0]} is {1000 * sizes[other][0]:.4g} mm wide, not '
             f'{1000 * size:.4g} mm as stated; leave that size out'
         )
-    tag_map = TagMap(ids, sizes, poses, _read_family(document, path))
-    return tag_map._replace(note=_size_note(path)) if unsized and not size else tag_map
+    covariance = _own_errors(np.array([tag[3] for tag in tags]))
+    if (name := document.get('covariance')) is not None:
+        covariance = _read_covariance(Path(path), name, ids, covariance)
+    note = _size_note(path) if unsized and not size else ''
+    family, errors = _read_family(document, path), covariance if covariance.any() else None
+    return TagMap(ids, sizes, poses, family, note, errors)
 
 
 def check_family(seen: str, stated: str, where: str) -> None:
@@ -130,9 +191,13 @@ def check_family(seen: str, stated: str, where: str) -> None:
 
 
 def write_tag_map(
-    tags: TagMap, path: str | Path, stderr: Array | None = None, about: str = ''
+    tags: TagMap, path: str | Path, about: str = '', information: Array | None = None
 ) -> None:
-    """Write a map of tags; stderr (T,): of positions, m; about: a line of comment."""
+    """Write a map of tags; about: a line of comment.
+
+    information (6 T, 6 T): the inverse of its covariance, see `tag_covariance`, which is written
+    beside the map; without it, tags have standard errors alone.
+    """
     entries = [
         {
             'id': int(tags.ids[i]),
@@ -141,13 +206,18 @@ def write_tag_map(
                 'position': tags.poses.position[i].tolist(),
                 'quaternion': quaternion_from_rotation(tags.poses.rotation[i]).tolist(),
             },
-            **({} if stderr is None else {'stderr_m': float(stderr[i])}),
+            **({} if tags.covariance is None else {'stderr_m': float(tags.stderr[i])}),
         }
         for i in range(len(tags.ids))
     ]
+    document: dict[str, Any] = {'tags': entries}
+    if information is not None:
+        beside = Path(path).with_suffix(_COVARIANCE_SUFFIX)
+        _write_information(beside, tags.ids, information)
+        document = {'covariance': beside.name, **document}
     head = f'# {about}\n' if about else ''
     family = {'family': tags.family} if tags.family else {}
-    write_text(path, head + dump_yaml({**family, 'tags': entries}))
+    write_text(path, head + dump_yaml({**family, **document}))
 
 
 def _plain_family(name: str) -> str:
@@ -191,6 +261,63 @@ def _size_note(path: str | Path) -> str:
     )
 
 
+def _own_errors(stderr: Array) -> Array:
+    """Return the covariance (6 T, 6 T) of tags with errors (T,) of their own, m, of places."""
+    variances = np.zeros((len(stderr), 6))
+    variances[:, :3] = stderr[:, None] ** 2 / 3
+    return np.diag(variances.ravel())
+
+
+def _write_information(path: Path, ids: Index, information: Array) -> None:
+    """Write the blocks that are not zero, of tags ids[row] and ids[column]."""
+    blocks = np.swapaxes(information.reshape(len(ids), 6, len(ids), 6), 1, 2)
+    row, column = np.nonzero(np.triu(blocks.any(axis=(2, 3))))
+    with replacing(path) as temporary:
+        np.savez_compressed(
+            temporary, ids=ids, row=row, column=column, information=blocks[row, column]
+        )
+
+
+def _read_covariance(path: Path, name: Any, ids: Index, own: Array) -> Array:
+    """Return the covariance (6 T, 6 T) that a map names; of tags not in that file, their own.
+
+    Raises ObservationError, naming the file.
+    """
+    if not isinstance(name, str):
+        raise ObservationError(f'{path}: covariance is {name!r:.40}; the name of a file is needed')
+    data = read_bytes(path.parent / name, ObservationError)
+    try:
+        known, covariance = _covariance_in(data)
+    except (ValueError, KeyError, IndexError, EOFError, BadZipFile, LinAlgError) as cause:
+        raise ObservationError(
+            f'{path.parent / name}: no covariance of tags; run `fisheye-svp map` again, or remove '
+            f'`covariance` from {path.name}'
+        ) from cause
+    mine, theirs = (
+        (6 * found[:, None] + np.arange(6)).ravel()
+        for found in np.intersect1d(ids, known, return_indices=True)[1:]
+    )
+    own[mine] = 0.0
+    own[np.ix_(mine, mine)] = covariance[np.ix_(theirs, theirs)]
+    return own
+
+
+def _covariance_in(archive: bytes) -> tuple[Index, Array]:
+    """Return ids (T,) and their covariance (6 T, 6 T); raise ValueError where it is none."""
+    with np.load(BytesIO(archive), allow_pickle=False) as data:
+        ids, row, column = (data[key].astype(np.int64) for key in ('ids', 'row', 'column'))
+        upper = data['information'].astype(np.float64)
+    blocks = np.zeros((len(ids), len(ids), 6, 6))
+    blocks[column, row], blocks[row, column] = np.swapaxes(upper, -1, -2), upper
+    information = np.swapaxes(blocks, 1, 2).reshape(6 * len(ids), -1)
+    covariance = tag_covariance(information)
+    values = np.diagonal(information)
+    if not (np.isfinite(covariance).all() and (values >= 0).all()):
+        raise ValueError
+    np.linalg.cholesky(information[np.ix_(values > 0, values > 0)])
+    return ids, covariance
+
+
 def _from_bundle(entry: Any) -> Any:
     """Return a tag of a bundle, which has its pose as seven numbers, as one of a map."""
     if not isinstance(entry, Mapping):
@@ -202,7 +329,7 @@ def _from_bundle(entry: Any) -> Any:
     return {'id': entry.get('id'), 'size': entry.get('size'), 'pose': pose}
 
 
-def _read_tag(entry: Any, where: str) -> tuple[int, float, Pose]:
+def _read_tag(entry: Any, where: str) -> tuple[int, float, Pose, float]:
     if not isinstance(entry, Mapping):
         raise ObservationError(f'{where} is {entry!r:.40}; id, size and pose are needed')
     number, size, pose = (entry.get(key) for key in ('id', 'size', 'pose'))
@@ -223,4 +350,13 @@ def _read_tag(entry: Any, where: str) -> tuple[int, float, Pose]:
         raise ObservationError(
             f'{where}: pose needs a position of 3 numbers, m, and a quaternion x, y, z, w'
         )
-    return number, float(size), Pose(rotation_from_quaternion(quaternion), position)
+    stderr = entry.get('stderr_m', 0.0)
+    if (
+        isinstance(stderr, bool)
+        or not isinstance(stderr, int | float)
+        or not 0 <= stderr <= _MAX_STDERR
+    ):
+        raise ObservationError(
+            f'{where}: stderr_m is {stderr!r:.40}; meters from 0 to {_MAX_STDERR:g} are needed'
+        )
+    return number, float(size), Pose(rotation_from_quaternion(quaternion), position), float(stderr)

@@ -16,7 +16,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io import decoding
-from fisheye_svp_ros.io.tag_maps import read_tag_map
+from fisheye_svp_ros.io.tag_maps import TagMap, read_tag_map
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base_pose import BasePose
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
@@ -28,6 +28,7 @@ from fisheye_svp_ros.nodes.transforms import TransformPublisher
 from fisheye_svp_ros.nodes.validation import Items, KnownPoints
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.reporting.wording import inputs as wording
 from fisheye_svp_ros.reporting.wording.poses import rolling_shutter_note
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.scene.pose_priors import PlanarPrior
@@ -59,6 +60,7 @@ class Localizer(SolverNode):
     SETTINGS = LocalizerSettings
     METRICS = LOCALIZATION_METRICS
     settings: LocalizerSettings
+    _tags: TagMap | None = None
 
     def __init__(self, node_name: str | None = None, **options: Any) -> None:
         super().__init__(node_name, **options)
@@ -77,17 +79,26 @@ class Localizer(SolverNode):
         self._errors: LensErrors | None = None  # of the latest lens
         self.start()
 
+    def collect_landmarks(self) -> None:
+        """Listen to the landmarks, or take those of a map of tags for good."""
+        name, frame = self.settings.tag_map, self.settings.map_frame
+        if not name:
+            super().collect_landmarks()
+            return
+        self._tags = read_tag_map(name)
+        self.hold_landmarks(decoding.LandmarkSet(self._tags.landmarks(), frame))
+        if self._tags.note:
+            self.get_logger().warning(self._tags.note)
+        self.get_logger().info(wording.tag_map_in_use(name, self._tags.stderr))
+
     def collect_image_points(self, topic: str) -> None:
         """Listen to the image points, or with a map of tags to detections of these."""
         settings = self.settings
-        if not settings.tag_map:
+        if not settings.tag_map or settings.detections == 'image_points':
             super().collect_image_points(topic)
             return
-        tags = read_tag_map(settings.tag_map)
-        if tags.note:
-            self.get_logger().warning(tags.note)
-        self.hold_landmarks(decoding.LandmarkSet(tags.landmarks(), settings.map_frame))
-        limits = TagLimits(settings.max_hamming, settings.min_decision_margin, tags.family)
+        family = '' if self._tags is None else self._tags.family
+        limits = TagLimits(settings.max_hamming, settings.min_decision_margin, family)
         kind, read = detections_reader(settings.detections, limits)
         use = functools.partial(self._add, topic)
         self.collect(kind, topic, read, use, name='detections')
@@ -118,6 +129,10 @@ class Localizer(SolverNode):
         """Localize the camera of one set; raise GeometryError where its points fix no pose."""
         points: KnownPoints = items['image_points']
         views, model = self.views(stamp, points), self.model(stamp, items)
+        if self._tags is not None:
+            views = views._replace(
+                landmark_covariance=self._tags.landmark_covariance(views.landmark)
+            )
         errors = self._lens_errors(stamp, items) if self.settings.model_error else None
         if errors is not None:
             sigma = errors.inflate_sigma(self.settings.sigma_px)

@@ -145,9 +145,7 @@ class SolverNode(ManagedNode):
         self._mirrors: dict[str, tuple[Lens, int, Mirror | None]] = {}  # and sets of it, so far
         self._guarded_work = self.guard_callback(self._work)
         self._rest = self.create_guard_condition(self._guarded_work)
-        self.collect(
-            PointCloud2, 'landmarks', self._read_landmarks, self._hear_landmarks, latched=True
-        )
+        self.collect_landmarks()
         self._collect(DiagnosticArray, 'scenario', read_key_values)
         for topic in self._poses:
             self._collect(PoseStamped, topic, read_framed_pose)
@@ -167,6 +165,12 @@ class SolverNode(ManagedNode):
         if self._compilation is not None:
             self._compilation.stop()
         super().destroy_node()
+
+    def collect_landmarks(self) -> None:
+        """Listen to the landmarks."""
+        self.collect(
+            PointCloud2, 'landmarks', self._read_landmarks, self._hear_landmarks, latched=True
+        )
 
     def collect_image_points(self, topic: str) -> None:
         """Listen to the image points of a camera."""

@@ -47,18 +47,36 @@ def with_own_errors(model: ForwardModel, views: Views, pose: Pose) -> Views:
     """
     if views.landmark_covariance is None:
         return views
-    linear = model.linearize(pose, views)
-    j, noise = whiten(model.d_pose(linear, views), views)
-    solved = np.linalg.solve(noise, j)
+    j, noise = _whiten_at(model, views, pose)
+    solved = np.asarray(np.linalg.solve(noise, j), dtype=float)
     transposed = np.swapaxes(j, -1, -2)
     relative, scale = with_unit_diagonal(transposed @ solved, 0.0)
     inverse = never_singular(np.linalg.inv, relative) / (scale[:, :, None] * scale[:, None, :])
-    pull = inverse @ np.swapaxes(solved, -1, -2)
-    shared = pull @ (noise - np.eye(noise.shape[-1])) @ np.swapaxes(pull, -1, -2)
-    rest = np.diagonal(noise - j @ shared @ transposed, axis1=-2, axis2=-1)
-    variance = rest.reshape(*views.weight.shape, 2).mean(axis=-1)
+    shared = j @ _pulled_noise(inverse, solved, noise) @ transposed
+    variance = np.diagonal(noise - shared, axis1=-2, axis2=-1)
+    variance = variance.reshape(*views.weight.shape, 2).mean(axis=-1)
     weight = views.weight / np.sqrt(np.maximum(variance, 1.0))
     return views._replace(weight=weight, landmark_covariance=None)
+
+
+def covariance_by_landmarks(
+    model: ForwardModel, views: Views, pose: Pose, covariance: Array
+) -> Array:
+    """Return the part (S, 6, 6) that landmarks have in the covariance (S, 6, 6) of poses (S,)."""
+    j, noise = _whiten_at(model, views, pose)
+    solved = np.asarray(np.linalg.solve(noise, j), dtype=float)
+    return _pulled_noise(covariance, solved, noise)
+
+
+def _pulled_noise(covariance: Array, solved: Array, noise: Array) -> Array:
+    """Return the covariance of poses by noise that is correlated; solved: noise^-1 J."""
+    pull = covariance @ np.swapaxes(solved, -1, -2)
+    return np.asarray(pull @ (noise - np.eye(noise.shape[-1])) @ np.swapaxes(pull, -1, -2))
+
+
+def _whiten_at(model: ForwardModel, views: Views, pose: Pose) -> tuple[Array, Array]:
+    linear = model.linearize(pose, views)
+    return whiten(model.d_pose(linear, views), views)
 
 
 def whiten(jacobian: Array, views: Views) -> tuple[Array, Array]:

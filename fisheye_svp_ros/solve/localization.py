@@ -15,7 +15,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.scene.pose_priors import PlanarPrior
 from fisheye_svp_ros.solve.initial_pose import candidate_poses, initial_poses
-from fisheye_svp_ros.solve.landmark_errors import generalized_equations
+from fisheye_svp_ros.solve.landmark_errors import covariance_by_landmarks, generalized_equations
 from fisheye_svp_ros.solve.least_squares import (
     UNDETERMINED_EIGENVALUE,
     Arrays,
@@ -133,6 +133,9 @@ def _weigh(model: ForwardModel, views: Views, localization: Localization, rows: 
         weighed.gap[two] = np.abs(second.cost - first.cost)
     if seen.prior is not None:  # residuals are tested without it
         weighed.cost[:] = np.maximum(weighed.cost - seen.prior.equations(weighed.pose)[0], 0.0)
+    if seen.landmark_covariance is not None:
+        added = covariance_by_landmarks(model, seen, weighed.pose, weighed.covariance)
+        weighed.added[:] = added
     localization.put(rows, weighed._replace(iterations=before.iterations))
 
 

@@ -2,11 +2,13 @@
 
 Starts from the tag that most images show: images that show mapped tags are localized, and of a
 further tag, which alone has two poses in an image, the one is taken that all images agree on.
-Then one bundle adjustment of all poses with weights that fade for outliers (Cauchy).
+Then one bundle adjustment of all poses, with weights that fade for outliers (Cauchy), and without
+the outliers least squares, which is where the covariance holds.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,18 +18,25 @@ from fisheye_svp_ros.effects.forward import ForwardModel, back_project_corrected
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.pose import Pose, cross_matrix, identity
 from fisheye_svp_ros.scene.observations import Views, views_of
+from fisheye_svp_ros.solve.least_squares import never_singular, solve_damped, with_unit_diagonal
 from fisheye_svp_ros.solve.localization import localize
 
 _CORNERS = 4
 _MAX_ITERATIONS, _TOLERANCE = 40, 1e-9
 _CAUCHY_PX = 1.5  # px of residual at which a corner's weight falls to half
 _OUTLIER_PX = 1e3  # px, in place of what is out of sight
+_OUTLIER_SIGMAS = 8.0  # beyond which a corner is an outlier; small tags are noisier than most
+_MEDIAN = 0.6745  # of the absolute value of a Gaussian of unit deviation
+_EXACT_PX = 1e-6  # px below which residuals are rounding
 _MAX_CANDIDATES = 40  # poses of a new tag that are compared
 
 
 class TagMapping(NamedTuple):
-    """Tags (T,): id, pose in the frame of the first, standard error of position, m.
+    """Tags (T,): id, pose in the frame of the origin, which is one of them.
 
+    information (6 T, 6 T): of the changes in `Pose.retract` of all tags, 1 / m^2 and 1 / rad^2:
+    the inverse of their covariance, with zeros between tags that no image shows together and all
+    along the origin, which has no error.
     images (F,): numbers of those that could be posed; cameras (F,); rms_px over inlying corners;
     missing: ids of tags that no image ties to the others; outside: how many sightings of a tag
     reach beyond the field of view of the lens, and were left out; focal: by which share the tags
@@ -36,7 +45,7 @@ class TagMapping(NamedTuple):
 
     ids: Index
     poses: Pose
-    stderr: Array
+    information: Array
     images: Index
     cameras: Pose
     rms_px: float
@@ -91,20 +100,26 @@ def map_tags(
         raise GeometryError(
             f'no image shows tag {known[first]} together with another; take images of two or more'
         )
-    images = np.flatnonzero(posed)
-    kept = np.flatnonzero(mapped)
+    images, kept = np.flatnonzero(posed), np.flatnonzero(mapped)
     scene = _Scene(scene.uv[images][:, kept], scene.local[kept])
-    anchor = int(np.flatnonzero(kept == first)[0])
-    tags, cameras = _adjust(model, scene, tags.take(kept), cameras.take(images), anchor)
-    stderr, rms, focal = _assess(model, scene, tags, cameras, anchor)
+    anchor = int(np.searchsorted(kept, first))
+    tags, cameras = tags.take(kept), cameras.take(images)
+    tags, cameras = _adjust(model, scene, tags, cameras, anchor, _fading)
+    scene = _without_outliers(model, scene, tags, cameras)
+    rows, slots = _find_connected(scene, anchor)
+    images, kept, anchor = images[rows], kept[slots], int(np.searchsorted(slots, anchor))
+    scene = _Scene(scene.uv[rows][:, slots], scene.local[slots])
+    tags, cameras = tags.take(slots), cameras.take(rows)
+    tags, cameras = _adjust(model, scene, tags, cameras, anchor, _squares)
+    information, rms, focal = _assess(model, scene, tags, cameras, anchor)
     return TagMapping(
         known[kept],
         tags,
-        stderr,
+        information,
         numbers[images],
         cameras,
         rms,
-        tuple(known[~mapped].tolist()),
+        tuple(np.setdiff1d(known, known[kept]).tolist()),
         int((~inside).sum()),
         focal,
     )
@@ -169,15 +184,22 @@ def _place_tag(
 
 
 def _adjust(
-    model: ForwardModel, scene: _Scene, tags: Pose, cameras: Pose, anchor: int
+    model: ForwardModel,
+    scene: _Scene,
+    tags: Pose,
+    cameras: Pose,
+    anchor: int,
+    loss: Callable[[Array], tuple[float, Array]],
 ) -> tuple[Pose, Pose]:
-    """Adjust all poses but that of the anchor, and return them."""
+    """Adjust all poses but that of the anchor, and return them.
+
+    loss: cost and weights of residuals.
+    """
     frames, count = scene.uv.shape[:2]
     free = _free_columns(frames, count, anchor)
     damping, (residual, jacobian, _) = 1e-4, _linearize(model, scene, tags, cameras)
-    cost = _cost(residual)
+    cost, weight = loss(residual)
     for _ in range(_MAX_ITERATIONS):
-        weight = _weights(residual)
         columns = jacobian[:, free]
         weighted = columns * weight[:, None]
         hessian, gradient = weighted.T @ columns, weighted.T @ residual
@@ -187,10 +209,11 @@ def _adjust(
         moves = step.reshape(-1, 6)
         trial = Pose(*tags.retract(moves[frames:])), Pose(*cameras.retract(moves[:frames]))
         fresh = _linearize(model, scene, *trial)
-        lower = _cost(fresh[0])
+        lower, weight_there = loss(fresh[0])
         if lower <= cost:
             done = cost - lower <= _TOLERANCE * cost
-            (tags, cameras), (residual, jacobian, _), cost = trial, fresh, lower
+            (tags, cameras), (residual, jacobian, _) = trial, fresh
+            cost, weight = lower, weight_there
             damping = max(damping / 5, 1e-12)
             if done:
                 break
@@ -205,39 +228,76 @@ def _free_columns(frames: int, count: int, anchor: int) -> Index:
     return np.delete(np.arange(6 * (frames + count)), held)
 
 
+def _without_outliers(model: ForwardModel, scene: _Scene, tags: Pose, cameras: Pose) -> _Scene:
+    """Return the corners without the sightings of tags that hold an outlier."""
+    views = scene.views(tags, np.ones(len(tags.position), dtype=bool), np.arange(len(scene.uv)))
+    off = (views.uv - model.predict(cameras, views).uv).reshape(scene.uv.shape)
+    off = np.abs(np.where(np.isfinite(scene.uv), off, np.nan))
+    scale = max(float(np.nanmedian(off)) / _MEDIAN, _EXACT_PX)
+    wrong: Mask = np.asarray((off > _OUTLIER_SIGMAS * scale).any(axis=(2, 3)))
+    return scene._replace(uv=np.where(wrong[..., None, None], np.nan, scene.uv))
+
+
+def _find_connected(scene: _Scene, anchor: int) -> tuple[Index, Index]:
+    """Return which images and tags sightings tie to the anchor, with others in between."""
+    seen: Mask = np.asarray(np.isfinite(scene.uv[..., 0, 0]))
+    tags = np.array([anchor])
+    while True:
+        images = np.flatnonzero(seen[:, tags].any(axis=1))
+        reached = np.flatnonzero(seen[images].any(axis=0))
+        if len(reached) <= len(tags):
+            return images, tags
+        tags = reached
+
+
 def _assess(
     model: ForwardModel, scene: _Scene, tags: Pose, cameras: Pose, anchor: int
 ) -> tuple[Array, float, tuple[float, float]]:
-    """Return standard errors of places (T,), m, the rms of corners, px, and the focal length.
+    """Return the information of tags (6 T, 6 T), the rms of corners, px, and the focal length.
 
     The last: by which share the corners would have it larger, one step with all poses free, and
     its standard error.
     """
     frames, count = scene.uv.shape[:2]
     residual, jacobian, uv = _linearize(model, scene, tags, cameras)
-    weight = _weights(residual)
     free = _free_columns(frames, count, anchor)
     columns = jacobian[:, free]
-    variance = float((weight * residual**2).sum()) / max(len(residual) - len(free), 1)
-    covariance = np.linalg.pinv((columns * weight[:, None]).T @ columns)
-    variances = np.zeros(6 * (frames + count))
-    variances[free] = variance * np.diag(covariance)
-    stderr = np.sqrt(variances.reshape(-1, 6)[frames:, :3].max(axis=1))
-    inlying = np.abs(residual) < 5 * _CAUCHY_PX
-    rms = float(np.sqrt(2 * (residual[inlying] ** 2).mean()))
+    variance = float((residual**2).sum()) / max(len(residual) - len(free), 1)
+    rms = float(np.sqrt(2 * (residual**2).mean()))
+    normal = columns.T @ columns
     growth = (uv - (model.lens.cx, model.lens.cy)).ravel()
-    growth = growth - columns @ (covariance @ (columns.T @ (weight * growth)))  # what poses leave
-    information = float((weight * growth**2).sum())
-    change = -float((weight * growth * residual).sum()) / information
-    return stderr, rms, (change, float(np.sqrt(variance / information)))
+    by_poses = solve_damped(normal[None], (columns.T @ growth)[None], np.zeros(1))[0]
+    growth = growth + columns @ by_poses  # what poses leave
+    information = float((growth**2).sum())
+    change = -float((growth * residual).sum()) / information
+    focal = change, float(np.sqrt(variance / information))
+    return _tag_information(jacobian, frames, anchor) / max(variance, _EXACT_PX**2), rms, focal
 
 
-def _weights(residual: Array) -> Array:
-    return np.asarray(1 / (1 + (residual / _CAUCHY_PX) ** 2))
+def _tag_information(jacobian: Array, frames: int, anchor: int) -> Array:
+    """Return the information (6 T, 6 T) of tags, cameras eliminated, zero along the anchor."""
+    by_camera, by_tag = np.split(jacobian, [6 * frames], axis=1)
+    cross = (by_camera.T @ by_tag).reshape(frames, 6, -1)
+    of_camera = by_camera.T @ by_camera
+    own = np.stack([of_camera[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(frames)])
+    scaled, scale = with_unit_diagonal(own, 0.0)
+    inverse = never_singular(np.linalg.inv, scaled) / (scale[:, :, None] * scale[:, None, :])
+    known = (np.swapaxes(cross, -1, -2) @ inverse @ cross).sum(axis=0)
+    information = by_tag.T @ by_tag - known
+    held = slice(6 * anchor, 6 * anchor + 6)
+    information[held] = information[:, held] = 0.0
+    return np.asarray(information + information.T) / 2
 
 
-def _cost(residual: Array) -> float:
-    return float(_CAUCHY_PX**2 * np.log1p((residual / _CAUCHY_PX) ** 2).sum())
+def _fading(residual: Array) -> tuple[float, Array]:
+    """Return Cauchy's cost and weights."""
+    square = (residual / _CAUCHY_PX) ** 2
+    return float(_CAUCHY_PX**2 * np.log1p(square).sum()), np.asarray(1 / (1 + square))
+
+
+def _squares(residual: Array) -> tuple[float, Array]:
+    """Return the cost and weights of least squares."""
+    return float((residual**2).sum()), np.ones_like(residual)
 
 
 def _linearize(

@@ -268,15 +268,17 @@ class LocalizerSettings(RobotSettings):
     tag_map: str = parameter(
         '',
         'Map of tags (`fisheye-svp map`, or tags.yaml of apriltag_ros): tags on the topic '
-        '`detections` then stand for `image_points`, the map for `landmarks`. Empty: neither',
+        '`detections` then stand for `image_points`, the map for `landmarks`; its errors are in '
+        'the covariances. Empty: neither',
         file=True,
         fixed=True,
     )
     detections: str = parameter(
         'apriltag_msgs',
         'Type of `detections`: AprilTagDetectionArray (four corners a tag, in raw images), or '
-        'Detection2DArray of vision_msgs (the middle of a tag)',
-        choices=('apriltag_msgs', 'vision_msgs'),
+        'Detection2DArray of vision_msgs (the middle of a tag); image_points: the topic of that '
+        'name, of the detector of this package',
+        choices=('apriltag_msgs', 'vision_msgs', 'image_points'),
         fixed=True,
     )
     max_hamming: int = parameter(

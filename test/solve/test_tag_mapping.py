@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.io.tag_maps import map_of_size
+from fisheye_svp_ros.io.tag_maps import map_of_size, tag_covariance
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
@@ -54,20 +55,55 @@ def test_a_walk_gives_the_map():
     assert map_errors(found, true).max() < 1e-6 and found.rms_px < 1e-5
 
 
-def test_standard_errors_are_those_of_the_map():
-    image, ids, corners, true = walk(0.2)
+@pytest.mark.parametrize('noise', [0.1, 1.0])  # px; the larger one is not mistaken for outliers
+def test_the_covariance_is_that_of_many_maps(noise):
+    squares, whole = [], []
+    for seed in range(12):
+        image, ids, corners, true = walk(noise, tags=4, frames=12, seed=seed)
+        found = map_tags(MODEL, image, ids, corners, SIZE, origin=10)
+        assert found.ids.tolist() == true.ids.tolist()
+        covariance = tag_covariance(found.information)
+        tags = map_of_size(found.ids, SIZE, found.poses, '', covariance)
+        assert tags.stderr[0] == 0 and (tags.stderr[1:] > 0).all()
+        squares += ((map_errors(found, true) / np.maximum(tags.stderr, 1e-9))[1:] ** 2).tolist()
+        off = found.poses.difference(
+            true.poses.take(0).inverse().broadcast_to(4).compose(true.poses)
+        )
+        unit = np.sqrt(np.diagonal(covariance)[6:])
+        error = off[1:].ravel() / unit
+        relative = covariance[6:, 6:] / np.outer(unit, unit)
+        whole.append(error @ np.linalg.solve(relative, error))
+    assert 0.6 < np.mean(squares) < 1.5
+    # Of all tags together: chi-square of 12 x 18 degrees of freedom
+    assert chi2.ppf(0.005, 216) < np.sum(whole) < chi2.ppf(0.995, 216)
+
+
+def test_what_no_image_shows_together_has_no_information():
+    image, ids, corners, _ = walk(0.2)
     found = map_tags(MODEL, image, ids, corners, SIZE, origin=10)
-    off = map_errors(found, true)
-    assert found.stderr[0] == 0 and (found.stderr[1:] > 0).all()
-    assert (off[1:] < 4 * found.stderr[1:]).all() and off.max() < 0.05
-    assert 0.15 < found.rms_px < 0.4
+    blocks = np.abs(found.information.reshape(6, 6, 6, 6)).max(axis=(1, 3))
+    seen = {number: set(image[ids == number]) for number in found.ids}
+    together = [[bool(seen[one] & seen[two]) for two in found.ids[1:]] for one in found.ids[1:]]
+    assert not np.all(together)
+    np.testing.assert_array_equal(blocks[1:, 1:] > 0, together)
+    assert not blocks[0].any()
 
 
-def test_wrong_corners_cost_little():
+def test_wrong_corners_and_tags_cost_little():
     image, ids, corners, true = walk(0.1)
     corners[7] += [40.0, -25.0]
+    corners[20, 2] += [3.0, 0.0]
     found = map_tags(MODEL, image, ids, corners, SIZE, origin=10)
-    assert map_errors(found, true).max() < 0.03
+    assert map_errors(found, true).max() < 0.03 and found.rms_px < 0.2
+
+
+def test_a_tag_that_only_wrong_corners_show_is_missing():
+    image, ids, corners, _ = walk(0.1)
+    rng = np.random.default_rng(1)
+    corners[ids == 15] += rng.uniform(-30, 30, corners[ids == 15].shape)
+    found = map_tags(MODEL, image, ids, corners, SIZE, origin=10)
+    assert 15 in found.missing and 15 not in found.ids
+    assert np.isfinite(tag_covariance(found.information)).all()
 
 
 def test_tags_that_nothing_ties_are_named():

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.lens_formats import READERS_TO_90_DEG, share_beyond_90_deg
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.lens_checks import ExtrapolatedPoints
@@ -51,6 +52,15 @@ def unknown_landmarks(topic: str, numbers: Sequence[int], of: int, of_tags: bool
 def _first_names(numbers: Sequence[int]) -> str:
     more = ', ...' if len(numbers) > _MAX_NAMES else ''
     return ', '.join(map(str, numbers[:_MAX_NAMES])) + more
+
+
+def tag_map_in_use(name: str, stderr: Array) -> str:
+    """Tell which landmarks hold, in place of the topic; stderr (T,): of tags, m."""
+    errors = f'up to {1e3 * stderr.max():.2g} mm' if stderr.any() else 'none stated'
+    return (
+        f'landmarks: {len(stderr)} tags of {name} (standard errors: {errors}); the topic '
+        'landmarks is not used'
+    )
 
 
 def landmarks_refused(reason: str) -> str:
