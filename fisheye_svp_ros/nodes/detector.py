@@ -13,6 +13,7 @@ import numpy as np
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.detect.drawing import draw_points
 from fisheye_svp_ros.detect.finders import default_detector
 from fisheye_svp_ros.detect.patterns import LOOSE_TAGS, Pattern, check_of_board, parse_pattern
 from fisheye_svp_ros.detect.photographs import Pixels, message_pixels
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 _RAW, _COMPRESSED = 'image', f'image{COMPRESSED_SUFFIX}'
 _LIVE_DETECTORS = {'saddle': 'quick'}  # a live camera has another image soon
 _MIN_FAILURES = 20  # images without a board before the first with one: it may be another board
+_NOTHING = np.zeros(0, dtype=np.int64), np.zeros((0, 2))  # ids and image points
 _LOOK = 0.005  # s, how often what a search found is looked for
 _GUIDE_PARAMETERS = ('e0', *INTRINSICS, 'k1', 'k2', 'k3', 'k4')  # that a guide can determine
 
@@ -127,6 +129,7 @@ class Detector(BaseNode):
         super().__init__(node_name, **options)
         self._points = self.announce(PointCloud2, 'image_points', wait=True)
         self._landmarks = self.announce(PointCloud2, 'landmarks', LATCHED)
+        self._drawn = self.announce(Image, '~/found')
         self._pattern: Pattern
         self._near: Array | None = None
         self._size: tuple[int, ...] | None = None
@@ -222,7 +225,8 @@ class Detector(BaseNode):
     def _take(self, stamp: int, image: Unread) -> None:
         """Keep the newest image, if anybody wants to know what is in it."""
         looked_at = self._guiding is not None and self._guiding.heard()
-        heard = looked_at or self._points.get_subscription_count()
+        outputs = self._points, self._drawn
+        heard = looked_at or any(one.get_subscription_count() for one in outputs)
         if not heard or not self.has_listeners():
             return
         if self._images.is_repeated(stamp, image):
@@ -287,6 +291,10 @@ class Detector(BaseNode):
             self._counts['searches ended'] += isinstance(result, TimedOut)
             if isinstance(result, Exception):
                 self.unforeseen(result)
+        if self._drawn.get_subscription_count():
+            ids, uv = (result.ids, result.uv) if isinstance(result, Points) else _NOTHING
+            drawn = draw_points(pixels, ids, uv)
+            self._drawn.publish(messages.image_message(drawn, stamp, frame))
         if self._guiding is not None:
             try:
                 self._guiding.look(stamp, frame, pixels, result)

@@ -78,6 +78,11 @@ class Localizer(SolverNode):
         self._misfits = 0  # sets up to the one before that fit badly, without outliers found
         self._errors: LensErrors | None = None  # of the latest lens
         self.start()
+        if self._tags is not None:
+            shapes, frame = messages.tag_map_shapes(self._tags), self.settings.map_frame
+            self.announce(MarkerArray, '~/tag_map', LATCHED).publish(
+                messages.markers_message(shapes, 0, frame)
+            )
 
     def collect_landmarks(self) -> None:
         """Listen to the landmarks, or take those of a map of tags for good."""

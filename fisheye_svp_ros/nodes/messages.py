@@ -35,6 +35,7 @@ from fisheye_svp_ros.io.decoding import (
     Points,
     structured_array,
 )
+from fisheye_svp_ros.io.tag_maps import TagMap
 from fisheye_svp_ros.optics.camera import incidence
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation
@@ -217,6 +218,25 @@ def landmarks_shape(points: Array) -> Segments:
     """Return balls at landmarks (N, 3), m, of a size that suits their distance."""
     size = 0.02 * float(np.linalg.norm(points, axis=-1).mean())
     return Segments('landmarks', points, (0.1, 0.1, 0.1, 1.0), size, lines=False)
+
+
+def tag_map_shapes(tags: TagMap) -> list[Segments]:
+    """Return the outlines of tags, and axes of their errors: two standard errors either way."""
+    edges = np.stack([tags.corners, np.roll(tags.corners, -1, axis=1)], axis=2)
+    shapes = [Segments('tags', edges.reshape(-1, 3), (0.1, 0.1, 0.1, 1.0), 0.01)]
+    if tags.covariance is not None:
+        count = len(tags.ids)
+        blocks = tags.covariance.reshape(count, 6, count, 6)[
+            np.arange(count), :3, np.arange(count), :3
+        ]
+        variances, axes = np.linalg.eigh(blocks)
+        ends = 2 * np.sqrt(np.maximum(variances, 0.0))[..., None] * np.swapaxes(axes, -1, -2)
+        center = tags.poses.position[:, None]
+        lines = np.stack([center - ends, center + ends], axis=2)
+        shapes.append(
+            Segments('errors of tags', lines.reshape(-1, 3), (0.9, 0.1, 0.1, 1.0), 0.004)
+        )
+    return shapes
 
 
 def camera_shape(pose: Pose, name: str, alpha: float) -> Segments:

@@ -102,3 +102,20 @@ def test_layouts_are_built_as_the_programs_read_them(layouts: tuple[Any, Any, An
         assert splitter.attrib['orientation'] in ('|', '-')
     assert all([child.tag for child in area] == ['plot'] for area in juggler.iter('DockArea'))
     assert juggler.find('tabbed_widget').attrib['parent'] == 'main_window'
+
+
+def test_layouts_of_a_robot_show_the_map_and_what_was_found() -> None:
+    folder = ROOT / 'config' / 'layouts'
+    rviz = yaml.safe_load((folder / 'robot.rviz').read_text())['Visualization Manager']
+    topics = {one['Topic']['Value'] for one in rviz['Displays'] if 'Topic' in one}
+    assert {'/localizer/tag_map', '/localizer/base_pose', '/detector/found'} <= topics
+    for display in rviz['Displays']:
+        latched = display['Class'].endswith('MarkerArray')
+        if 'Topic' in display:
+            durability = 'Transient Local' if latched else 'Volatile'
+            assert display['Topic']['Durability Policy'] == durability
+    foxglove = json.loads((folder / 'robot_foxglove.json').read_text())
+    panels = foxglove['configById']
+    assert '/localizer/tag_map' in panels['3D!scene']['topics']
+    assert panels['Image!found']['imageMode']['imageTopic'] == '/detector/found'
+    assert sorted(panels) == sorted(foxglove['layout'][side] for side in ('first', 'second'))

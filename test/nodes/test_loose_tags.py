@@ -47,3 +47,14 @@ def test_loose_tags_are_found(graph: Callable[..., Graph], tmp_path: Path) -> No
     np.testing.assert_allclose(seen.uv, expected, atol=0.15)
     known = read_landmarks(landmarks[0]).landmarks
     assert {12, 35} <= set(known.ids.tolist())
+    # What was found is drawn for whoever looks, and for nobody else.
+    drawn = g.hear(Image, 'detector/found')
+    g.until(lambda: found() and drawn)
+    picture = np.frombuffer(drawn[0].data, np.uint8).reshape(300, 300, 3).astype(int)
+    green = picture[..., 1] - picture[..., [0, 2]].max(axis=-1) > 100
+    rows, columns = np.nonzero(green)
+    assert drawn[0].encoding == 'bgr8' and green.any()
+    assert 40 < columns.min() < 60 and 40 < rows.min() < 60
+    # No image is made of an empty one, either: it comes without points.
+    image[:] = 255
+    g.until(lambda: found() and not np.ptp(np.frombuffer(drawn[-1].data, np.uint8)))

@@ -11,6 +11,7 @@ from helpers.graph import LATCHED, Graph
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # isort: skip
 from geometry_msgs.msg import PoseWithCovarianceStamped  # isort: skip
 from sensor_msgs.msg import PointCloud2  # isort: skip
+from visualization_msgs.msg import MarkerArray  # isort: skip
 
 from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.io.decoding import IMAGE_POINTS, read_pose, structured_array
@@ -52,6 +53,13 @@ def test_the_errors_of_the_map_are_in_the_pose_and_the_test_of_residuals(
     poses = g.hear(PoseWithCovarianceStamped, 'localizer/pose')
     results = g.hear(DiagnosticArray, 'localizer/result')
     g.start(Localizer)
+    shapes = g.hear(MarkerArray, 'localizer/tag_map', LATCHED)  # also for those who come later
+    g.until(lambda: shapes)
+    outlines, errors = shapes[0].markers
+    assert len(outlines.points) == 8 * COUNT and outlines.header.frame_id == 'map'
+    ends = np.array([[one.x, one.y, one.z] for one in errors.points]).reshape(COUNT, 3, 2, 3)
+    np.testing.assert_allclose(np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1), 4 * 0.005)
+    np.testing.assert_allclose(ends.mean(axis=2), np.tile(true.position[:, None], (1, 3, 1)))
     # A board that another node publishes is not this map.
     other = Landmarks(np.arange(4 * COUNT), np.random.default_rng(0).normal(size=(4 * COUNT, 3)))
     g.probe.create_publisher(PointCloud2, 'landmarks', LATCHED).publish(
