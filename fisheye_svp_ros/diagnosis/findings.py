@@ -221,6 +221,11 @@ class FlawKind(Enum):
         return self in (FlawKind.TARGET_TOO_LARGE, FlawKind.SHIFT_TOO_LARGE)
 
     @property
+    def is_of_table(self) -> bool:
+        """Whether the table or the image size is to be corrected, rather than more be taken."""
+        return self in (FlawKind.SIDES_DIFFER, FlawKind.NOISE_TOO_LARGE, FlawKind.OFF_CENTER)
+
+    @property
     def is_misfit(self) -> bool:
         """Whether lengths are in another unit, or residuals are left that no camera explains."""
         return self.value <= FlawKind.NO_FIT.value

@@ -506,7 +506,7 @@ def test_the_command_to_go_on_solves_the_same_problem(found: Diagnosis) -> None:
         offers_extended=False,
         evaluation=SimpleNamespace(problem=SimpleNamespace(plannable=True)),
         is_lens_off=False,
-        adequacy=SimpleNamespace(is_misfit=False),
+        adequacy=SimpleNamespace(is_misfit=False, flaws=()),
         candidates=[],
         file=SimpleNamespace(given_px=0.2),
         noise_px=0.2,

@@ -185,16 +185,17 @@ def _target_reasons(facts: TargetFacts) -> dict[TargetReason, str]:
         'poses on it',
         TargetReason.BELOW_NOISE: 'its errors are below the noise',
     }
-    return {reason: text + _bend_clause(facts) for reason, text in reasons.items()}
+    bend = frame_bend(facts)
+    return {reason: text + (bend and f'; {bend}') for reason, text in reasons.items()}
 
 
-def _bend_clause(facts: TargetFacts) -> str:
+def frame_bend(facts: LensFacts | TargetFacts | PhotographsFacts) -> str:
     """Return by how much the board bends from frame to frame, and the remedy; '' for nothing."""
-    if not facts.bend_m:
+    if not isinstance(facts, TargetFacts) or not facts.bend_m:
         return ''
     return (
-        f'; it bends from frame to frame by {1e3 * facts.bend_m:.2g} mm rms, '
-        f'{100 * facts.bend_share:.0f} % of what is left beside noise: mount it on a stiff plate'
+        f'the board bends from frame to frame by {1e3 * facts.bend_m:.2g} mm rms '
+        f'({100 * facts.bend_share:.0f} % of what is left beside noise): mount it on a stiff plate'
     )
 
 

@@ -117,6 +117,8 @@ def lens_words(d: Diagnosis) -> str:
 def _of_flawed_data(d: Diagnosis, words: str, lens: str) -> str:
     """Return what a lens is good for whose data reach or determine too little."""
     decision, kinds = d.decision['lens'], {flaw.kind for flaw in d.adequacy.flaws}
+    if decision.say == 'undecided' and d.adequacy.flaws[0].kind.is_of_table:
+        return f'Undecided about {lens} until that is corrected'
     if decision.say == 'use_extended':
         return f'{words} for now; take more photographs'
     if decision.say == 'undecided' and kinds == {FlawKind.LENS_UNKNOWN}:

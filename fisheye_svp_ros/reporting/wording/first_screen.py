@@ -50,6 +50,7 @@ from fisheye_svp_ros.reporting.wording.causes import (
 from fisheye_svp_ros.reporting.wording.decisions import (
     bound_location,
     decision_reason,
+    frame_bend,
     unconfirmed_effects,
 )
 from fisheye_svp_ros.reporting.wording.diagnosis import (
@@ -359,6 +360,8 @@ def photographs_words(d: Diagnosis) -> str:
         if kind is FlawKind.NO_FIT:
             return 'Check them'
         return 'Do not use them' + (' together' if kind is FlawKind.CAMERAS_MIXED else '')
+    if d.adequacy.flaws and d.adequacy.flaws[0].kind.is_of_table:
+        return 'Check them'
     return PHOTOGRAPHS[d.decision['photographs'].say]
 
 
@@ -477,6 +480,9 @@ def largest_cause(d: Diagnosis) -> str:
     ):
         which = 'Only the target' if d.verdict == 'adequate' else 'The target'
         return f'{which} is imperfect: {decision_reason(d.decision["target"])}'
+    bend = frame_bend(d.decision['target'].facts)
+    if bend:
+        return _capital(bend)
     if d.verdict == 'adequate':
         return (
             _capital(NO_CONFIRMED_ERROR)

@@ -35,7 +35,8 @@ def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
 
     In capitals: what the user has to make first, where these data are no use.
     """
-    if diagnosis.adequacy.is_misfit:
+    flaws = diagnosis.adequacy.flaws
+    if diagnosis.adequacy.is_misfit or (flaws and flaws[0].kind.is_of_table):
         return _command_for_other_data(diagnosis, inputs)
     d, files = diagnosis, follow_up_files(diagnosis, inputs)
     observations, lenses = (
