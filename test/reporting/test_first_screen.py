@@ -129,7 +129,7 @@ def test_a_confounded_set_without_a_size_says_what_is_open(found: Diagnosis) -> 
         'The sensor is tilted, 89 % sure, or the lens looks through a dome, away from its center '
         '(11 %): one of them is there (likely, more than 99 %), how large each is remains open'
     )
-    assert wrong(alike).startswith('The sensor is tilted; alternatives below; left-out frames ')
+    assert wrong(alike).startswith('The sensor is tilted; alternatives below; left-out error ')
 
 
 def test_an_impossible_shift_asks_for_the_unit_first(found: Diagnosis) -> None:
@@ -217,7 +217,9 @@ def test_an_undecided_lens_may_be_used_where_its_error_does_no_harm(found: Diagn
     assert 'rays of the lens as given' in said
     assert '; meanwhile use it only where that is good enough' in said
     high = found.ray_error_mrad()['given'][1]['high']
-    assert f'; until then it is good to {high:.2g} mrad at 1 m within ' in headline(undecided)
+    assert f'; until then it is good to {high:.2g} mrad at 1 m (95 % sure), out to ' in headline(
+        undecided
+    )
 
 
 def test_of_a_lens_that_is_not_fitted_no_error_is_said(
@@ -303,7 +305,7 @@ def test_what_is_wrong_counts_the_causes_that_it_does_not_name(
 ) -> None:
     tilt = _tilt(0.005, 0.002)
     more = [replace(tilt, form=name) for name in ('decentering', 'skew')]
-    assert '; 2 more causes below; ' in wrong(replace(found, causes=[tilt, *more]))
+    assert '; also decentering and 1 more below; ' in wrong(replace(found, causes=[tilt, *more]))
 
 
 def test_the_headline_says_that_the_target_is_imperfect_too(found: Diagnosis) -> None:
@@ -315,7 +317,7 @@ def test_the_headline_says_that_the_target_is_imperfect_too(found: Diagnosis) ->
     )
     assert wrong(again).startswith(
         'The sensor is tilted (x = 0.29 ± 0.11 deg), and landmarks are displaced '
-        '(0.38 px); left-out frames '
+        '(0.38 px); left-out error '
     )
     assert 'landmarks' not in wrong(_deciding(again, 'target', say='keep'))
 
@@ -513,7 +515,7 @@ def test_the_command_to_go_on_solves_the_same_problem(found: Diagnosis) -> None:
     )
     assert command_to_go_on(open_, inputs) == (
         "fisheye-svp diagnose 'a b.csv' --lens l.yaml --poses p.csv --free intrinsics --next 6 "
-        '-o next'
+        '-o next  # lists 6 views to photograph'
     )
     assert command_to_go_on(open_, inputs._replace(planned=True)).startswith(
         "fisheye-svp localize 'a b.csv' --lens l.yaml"

@@ -147,8 +147,8 @@ def test_every_reason_is_a_short_clause(
         (
             PhotographsReason.FRAMES_PREDICTED,
             PHOTOGRAPHS,
-            '26 frames, held-out error 10.0 times what noise and scatter between frames leave; '
-            'the target causes the rest',
+            '26 frames; the error on left-out ones is 10.0 times that of noise and scatter (1 is '
+            'ideal); the target causes the rest',
         ),
     ],
 )

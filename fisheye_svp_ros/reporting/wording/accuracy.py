@@ -40,12 +40,16 @@ class UsedRays(NamedTuple):
         return self.used['value'] / self.point_mrad
 
     @property
+    def bound(self) -> str:
+        """How good the lens is at a range."""
+        most = hypot(self.used['high'], self.frames_mrad)
+        how = 'known only' if most > 1e3 * MAX_RAY_ERROR else 'good'
+        return f'{how} to {most:.2g} mrad at {self.range_m:g} m'
+
+    @property
     def quality(self) -> str:
-        """How good the lens is."""
-        bound = hypot(self.used['high'], self.frames_mrad)
-        how = 'known only' if bound > 1e3 * MAX_RAY_ERROR else 'good'
-        where = f'at {self.range_m:g} m within {degrees(self.reached):.0f} deg'
-        return f'{how} to {bound:.2g} mrad {where} (95 %)'
+        """How good the lens is, how sure that is, and where."""
+        return f'{self.bound} (95 % sure), out to {degrees(self.reached):.0f} deg off the axis'
 
 
 def used_rays(d: Diagnosis) -> UsedRays | None:

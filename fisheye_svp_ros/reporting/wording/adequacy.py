@@ -115,6 +115,8 @@ def flaw_reason(flaws: Sequence[Flaw], about: str) -> str:
             return 'not judged before lengths are in m'
         if worst.is_misfit:
             return 'nothing is known of it while one lens does not fit the frames'
+        if worst.is_of_table:
+            return 'not judged before that is corrected'
         return 'such views do not tell its errors from those of the lens'
     return '; '.join(dict.fromkeys(flaw_remedy(flaw) for flaw in flaws))
 

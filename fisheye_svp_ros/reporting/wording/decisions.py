@@ -230,8 +230,8 @@ def _photographs_reasons(facts: PhotographsFacts) -> dict[PhotographsReason, str
         PhotographsReason.LENS_UNDECIDED: f'the lens is undecided; {remedy}',
         PhotographsReason.FRAMES_NOT_PREDICTED: f'{unlike} of {count} '
         f'{"are" if unlike > 1 else "is"} not predicted by the others',
-        PhotographsReason.FRAMES_PREDICTED: f'{count} {unit}s, held-out error '
-        f'{facts.ratio:.1f} times what noise and scatter between frames leave{rest}',
+        PhotographsReason.FRAMES_PREDICTED: f'{count} {unit}s; the error on left-out ones is '
+        f'{facts.ratio:.1f} times that of noise and scatter (1 is ideal){rest}',
     }
 
 

@@ -123,12 +123,16 @@ def _of_flawed_data(d: Diagnosis, words: str, lens: str) -> str:
         return f'{words} for now; take more photographs'
     if decision.say == 'undecided' and kinds == {FlawKind.LENS_UNKNOWN}:
         return f'Use {lens} only where that is good enough, or take more photographs'
-    # Where points are, nothing speaks against it.
-    if kinds == {FlawKind.ANGLE_SHORT} and decision.reason is LensReason.NO_CAUSE_CONFIRMED:
-        angle = math.degrees(min(flaw.size for flaw in d.adequacy.flaws))
-        it = f'{angle:.0f} deg; use {"them" if len(d.lenses) > 1 else "it"} only within'
-        return f'{words.partition(";")[0]} beyond {it}, or take more photographs'
+    if is_short_of_angle(d):
+        return f'Undecided about {lens} beyond'
     return words
+
+
+def is_short_of_angle(d: Diagnosis) -> bool:
+    """Whether nothing but the angle of the points limits the lens: where they are, it is sound."""
+    kinds = {flaw.kind for flaw in d.adequacy.flaws}
+    sound = d.decision['lens'].reason is LensReason.NO_CAUSE_CONFIRMED
+    return kinds == {FlawKind.ANGLE_SHORT} and sound
 
 
 def remaining_error(d: Diagnosis) -> RemainingError | None:

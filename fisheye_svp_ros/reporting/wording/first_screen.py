@@ -58,6 +58,7 @@ from fisheye_svp_ros.reporting.wording.diagnosis import (
     count_frames,
     frame_ranges,
     is_assumed,
+    is_short_of_angle,
     known_rows,
     lens_words,
     only_gross,
@@ -369,7 +370,8 @@ def headline(d: Diagnosis) -> str:
     """Return whether the lens may be used, how good it is and where, or what is wrong instead."""
     lens, rays = lens_words(d), used_rays(d)
     if d.adequacy.flaws:
-        return f'{flaw_headline(d.adequacy.flaws[0])}. {lens}.'
+        known = f'; within it is {rays.bound}' if rays and is_short_of_angle(d) else ''
+        return f'{flaw_headline(d.adequacy.flaws[0])}. {lens}{known}.'
     if d.decision['lens'].say != 'recalibrate' and rays:
         undecided = d.decision['lens'].say == 'undecided'
         lens += f'; until then it is {rays.quality}' if undecided else f': {rays.quality}'
@@ -391,24 +393,32 @@ def wrong(d: Diagnosis) -> str:
     if d.causes and d.open_lens is not None:
         parts.append(unconfirmed_effects(d.open_lens))
     gain = _gain(d)
-    ends = [f'{more} more cause{"s" * (more > 1)} below'] * (more > 0) + [gain] * bool(gain)
-    text = '; '.join([*parts, *ends])
+    others = [_other_causes(d, more)] if more > 0 else []
+    text = '; '.join([*parts, *others, *filter(None, [gain])])
     if len(text.split()) < MAX_WORDS or not d.causes:
         return text
-    first = _headline_causes(d)[0]
+    first, rest = _headline_causes(d)[0], len(d.causes) - 1
     likeliest = max(first.odds, key=lambda name: first.odds[name], default=first.effect)
     short = _statement(d, first) if likeliest == first.effect else _describe(likeliest)
-    rest = len(d.causes) - 1
-    others = ['alternatives below'] if first.indistinguishable_from else []
-    others += [f'{rest} more cause{"s" * (rest > 1)} below'] * (rest > 0)
-    return '; '.join([_capital(short), *others, *([gain] * bool(gain))])
+    parts = [_capital(short)] + ['alternatives below'] * bool(first.indistinguishable_from)
+    parts += [_other_causes(d, rest)] if rest else []
+    words = len(f'Wrong: {"; ".join([*parts, gain])}'.split())
+    return '; '.join([*parts, gain] if gain and words <= MAX_WORDS else parts)
 
 
 def _gain(d: Diagnosis) -> str:
     """Return what correcting the causes gains on frames left out: the one pair of figures."""
     base, named = (quality.heldout_rms_px for quality in (d.figures.base, d.figures.named))
     moving = any(cause.effect_class.stage != 'noise' for cause in d.causes)
-    return f'left-out frames {pixels(base)} → {pixels(named)} px' if moving else ''
+    figures = f'{pixels(base)} px, corrected {pixels(named)} px'
+    return f'left-out error {figures}' if moving else ''
+
+
+def _other_causes(d: Diagnosis, count: int) -> str:
+    """Return the next one of the causes that are not told in full, and how many there are."""
+    causes = sorted(d.causes, key=lambda cause: (-cause.share, cause.p_value))
+    name = causes[-count].effect.replace('_', ' ')
+    return f'also {name}' + (f' and {count - 1} more below' if count > 1 else ', see below')
 
 
 def verdict_words(d: Diagnosis) -> str:
@@ -442,10 +452,14 @@ def tone(d: Diagnosis) -> str:
 def target_words(d: Diagnosis) -> str:
     """Return what to do about the target."""
     say = d.decision['target'].say
+    if say == 'keep' and frame_bend(d.decision['target'].facts):
+        return 'Stiffen it before the next photographs; the lens stands without new ones'
     if say in ('keep', 'undecided'):
         return TARGET[say]
     by_file = d.offers_extended or say != 'correct'
     words = TARGET[say] if by_file else 'For better poses, correct the target: measure it'
+    if d.causes and _headline_causes(d)[0].effect == 'board_pose':
+        return f'{words}, or measure how its boards stand to each other'
     bent = any(cause.effect == 'target_shape' for cause in d.causes)
     words = f'{words}, or {"flatten or " if bent else ""}replace it'
     holds = ' (the lens in that file serves any scene, the correction this target only)'

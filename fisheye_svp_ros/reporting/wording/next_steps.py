@@ -53,7 +53,7 @@ def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
             observations,
             *lenses,
             shlex.join(inputs.settings),
-            '--next 6 -o next',
+            '--next 6 -o next  # lists 6 views to photograph',
         ]
         return ' '.join(filter(None, words))
     if d.is_lens_off and not d.offers_extended:
@@ -87,7 +87,8 @@ def _command_for_other_data(d: Diagnosis, inputs: ReportInputs) -> str:
         FlawKind.FOCAL_VARIES: 'NEW.csv',
         FlawKind.CENTER_VARIES: 'NEW.csv',
     }.get(kind, 'CORRECTED.csv')
-    return f'fisheye-svp calibrate {table} {_image_sizes(d)} -o new_lens' + (
+    sizes = '--image-size WIDTHxHEIGHT' if kind is FlawKind.OFF_CENTER else _image_sizes(d)
+    return f'fisheye-svp calibrate {table} {sizes} -o new_lens' + (
         '' if len(d.lenses) > 1 else '.yaml'
     )
 
