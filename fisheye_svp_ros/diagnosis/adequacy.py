@@ -171,12 +171,19 @@ def _misfits(
         if groups:
             yield Flaw(FlawKind.CAMERAS_MIXED, left, scatter, groups)
             return
-    if max(changes.focal_error, changes.center_error) > MAX_RAY_ERROR:
+    least = _least_share(len(changes.focal))
+    if least * max(changes.focal_error, changes.center_error) > MAX_RAY_ERROR:
         yield _changing_intrinsics(evaluation, changes)
     elif differ and not known:
         yield Flaw(FlawKind.FRAMES_DIFFER, left, scatter, _worst_frames(evaluation))
     elif is_no_fit(left, scatter):
         yield Flaw(FlawKind.NO_FIT, left, scatter)
+
+
+def _least_share(frames: int) -> float:
+    """Return what share of a standard deviation over some frames is sure (95 %), by chi-square."""
+    dof = max(frames - 1, 1)
+    return float(np.sqrt(dof / scipy.stats.chi2.ppf(0.95, dof)))
 
 
 def _camera_groups(evaluation: Evaluation, noise: float) -> tuple[tuple[int, ...], ...]:

@@ -52,6 +52,7 @@ from fisheye_svp_ros.solve.bundle_adjustment import gauss_newton
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
 _STEP_TOLERANCE = 3e-3  # of the noise: what a step moves predictions by
+_LINEARIZATIONS = 2
 _MIN_MODE, _MAX_MODES = 0.01, 12  # of all, what one way for landmarks to be off explains
 _PROBES = 24
 _PAIR_REACH = 80  # of the image: how near to each other points have the same place
@@ -329,8 +330,19 @@ def _without_motion(square: Array, motions: Array) -> Array:
 def refit(data: RigViews, state: RigState, free: Sequence[str], variances: Variances) -> RigState:
     """Fit poses, rig, free intrinsics and effects by Gauss-Newton with the null's covariance.
 
-    All steps are solved with the equations of the first: its columns change little.
+    All steps are solved with the equations of the first: its columns change little, or are made
+    anew where these steps do not converge, as beside boards that bend much.
     """
+    for _ in range(_LINEARIZATIONS):
+        state, converged = _gauss_newton(data, state, free, variances)
+        if converged:
+            break
+    return state
+
+
+def _gauss_newton(
+    data: RigViews, state: RigState, free: Sequence[str], variances: Variances
+) -> tuple[RigState, bool]:
     linear = Linearization(data, state, free)
     linear.check_images()
     fitted = FittedModel.of_state(linear, variances)

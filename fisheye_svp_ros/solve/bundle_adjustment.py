@@ -87,8 +87,10 @@ def gauss_newton(
     linear: Linearization,
     solve: Callable[[Array, RigState], tuple[Array, Array]],
     tolerance: float,
-) -> RigState:
+) -> tuple[RigState, bool]:
     """Fit as `adjust` does, under a covariance of the residuals that the caller knows.
+
+    Returns the state, and whether it has converged: far away, these columns may lead no further.
 
     solve: returns the step of poses (F, 6) and of what is shared (K,) from residuals (F, M) and
     their state, by the columns of this linearization, which change little.  tolerance: of what a
@@ -109,8 +111,8 @@ def gauss_newton(
             data, free, after, limit, partial(is_linear, residual, change)
         )
         if np.sqrt((change**2).mean()) < tolerance:
-            break
-    return state
+            return state, True
+    return state, False
 
 
 def shorten_step(

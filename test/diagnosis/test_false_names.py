@@ -206,7 +206,8 @@ def test_a_refit_beside_a_lens_that_is_far_off_leads_nowhere_worse():
     def misfit(state):
         return np.sqrt((Linearization(data, state, ()).residual ** 2).mean())
 
-    assert misfit(refit(data, shifted, (), variances)) < 1.3 * misfit(shifted)
+    # Without a limit it was five times as large; boards that bend need steps that raise it, too.
+    assert misfit(refit(data, shifted, (), variances)) < 2 * misfit(shifted)
 
 
 @pytest.mark.parametrize(('gain', 'named'), [(1.2, ['decentering']), (0.8, [])])

@@ -252,7 +252,8 @@ def test_gauss_newton_under_white_noise_is_the_adjustment():
         (block, common), _ = arrow_step(tuple(equations), np.zeros(1))
         return block[0], common[0]
 
-    fitted, whole = gauss_newton(linear, solve, 1e-9), adjust(data, state, FREE)
+    fitted, _ = gauss_newton(linear, solve, 1e-9)
+    whole = adjust(data, state, FREE)
     start, found, least = (
         float((Linearization(data, one, FREE).residual ** 2).sum())
         for one in (state, fitted, whole)
