@@ -29,6 +29,7 @@ from fisheye_svp_ros.solve.least_squares import (
 MIN_POINTS, FEW_POINTS = 4, 6
 _STARTING_STEPS = 4  # from rough poses to ones that a joint solution can begin with
 _MOTIONS = 3  # times that velocities and poses follow from each other
+_MIN_AREA = 0.1  # of the largest of the four triangles that four points of a plane have
 _MIN_SEPARATION = 0.01  # squared Mahalanobis distance of two minima
 _WEIGHINGS = 2  # steps from a pose by exact landmarks to one by their errors
 _VIEWS_AT_ONCE = 64  # whose noise is a full matrix
@@ -106,7 +107,8 @@ def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localiza
             reflected = _mirror_image(found.pose.take(flat), center, normal)
             _improve(model, views, found, flat, reflected.reshape(len(flat), 1))
     if anywhere:
-        few = np.setdiff1d(np.flatnonzero((views.weight > 0).sum(axis=1) < FEW_POINTS), flat)
+        few = np.flatnonzero((views.weight > 0).sum(axis=1) < FEW_POINTS)
+        few = np.setdiff1d(few, flat[_are_spread(views.take(flat))])
         if few.size:
             some = views.take(few)
             direction = model.back_project(some.uv).direction
@@ -118,6 +120,21 @@ def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localiza
         for first in range(0, len(rows), _VIEWS_AT_ONCE):
             _weigh(model, views, found, rows[first : first + _VIEWS_AT_ONCE])
     return found
+
+
+def _are_spread(views: Views) -> Mask:
+    """Say which views (S,) have four points or more that no three of them could replace.
+
+    Of four points of a plane, two beside each other leave the minima of three points.
+    """
+    used = views.weight > 0
+    order = np.argsort(~used, axis=1, kind='stable')[:, :4]
+    corners = np.take_along_axis(views.points, order[..., None], axis=1)
+    triangles = corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]]
+    sides = triangles[:, :, 1:] - triangles[:, :, :1]
+    areas = np.linalg.norm(np.cross(sides[:, :, 0], sides[:, :, 1]), axis=-1)
+    spread = areas.min(axis=1) > _MIN_AREA * areas.max(axis=1)
+    return np.asarray(spread | (used.sum(axis=1) > 4))
 
 
 def _weigh(model: ForwardModel, views: Views, localization: Localization, rows: Index) -> None:

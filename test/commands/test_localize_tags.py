@@ -76,8 +76,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def localized(folder: Path, out: Path, *options: str) -> list[list[float]]:
     command = ['localize', str(folder / 'photos'), '--lens', str(folder / 'lens.yaml')]
     assert cli.main([*command, '-o', str(out), *options]) == 0
+    names = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
     with (out / 'poses.csv').open() as stream:
-        return [[float(value) for value in row][1:] for row in [*csv.reader(stream)][1:]]
+        return [[float(row[name]) for name in names] for row in csv.DictReader(stream)]
 
 
 @pytest.mark.parametrize('board', ['tags:36h11', 'tags:36h11:160mm', 'tags:'])

@@ -490,7 +490,7 @@ def test_render_with_what_is_no_size(said, tmp_path: Path, capsys: pytest.Captur
         )
         == 2
     )
-    assert said[0] in capsys.readouterr().err
+    assert said[0].removeprefix('--') in capsys.readouterr().err
     assert not (tmp_path / 'a').exists()
 
 
