@@ -24,13 +24,16 @@ from fisheye_svp_ros.library.functions import simulate_scenario as simulate_scen
 from fisheye_svp_ros.library.functions import stereo_depth as stereo_depth
 from fisheye_svp_ros.library.functions import sweep as sweep
 from fisheye_svp_ros.library.functions import undistort_maps as undistort_maps
+from fisheye_svp_ros.library.lenses import compare as compare
 from fisheye_svp_ros.library.lenses import opencv_matrices as opencv_matrices
 from fisheye_svp_ros.library.lenses import resize_lens as resize_lens
 from fisheye_svp_ros.library.lenses import undistort_views as undistort_views
 from fisheye_svp_ros.library.plots import plot_budget as plot_budget
+from fisheye_svp_ros.library.plots import plot_comparison as plot_comparison
 from fisheye_svp_ros.library.plots import plot_lens as plot_lens
 from fisheye_svp_ros.library.plots import plot_residuals as plot_residuals
 from fisheye_svp_ros.library.results import Columns as Columns
+from fisheye_svp_ros.library.tag_maps import map as map
 from fisheye_svp_ros.optics.lens import Lens as Lens
 from fisheye_svp_ros.pose import Pose as Pose
 from fisheye_svp_ros.scene.observations import Observations as Observations

@@ -19,8 +19,8 @@ from fisheye_svp_ros.library.checks import (
     check_count,
     check_number,
     check_numbers,
-    check_pair,
     check_pose,
+    check_room,
     check_type,
     check_whole_numbers,
 )
@@ -133,11 +133,7 @@ def plan(
     from fisheye_svp_ros.planning.optimal_design import ViewLimits
     from fisheye_svp_ros.planning.plan import plan as choose
 
-    near, far = check_pair(room, 'room', '(nearest, furthest) in m')
-    if not 0 < near < far < np.inf:
-        raise ParameterError(
-            f'room is {room!r}; two distances above 0, m, are needed, the nearer first'
-        )
+    near, far = check_room(room)
     count = check_count(count, MAX_VIEWS, 'count')
     return choose(
         load_lens(lens),

@@ -96,6 +96,16 @@ def check_pair(values: Any, name: str, needed: str) -> tuple[float, float]:
     return float(numbers[0]), float(numbers[1])
 
 
+def check_room(room: Any) -> tuple[float, float]:
+    """Return two distances, m; raise ParameterError where they are none."""
+    near, far = check_pair(room, 'room', '(nearest, furthest) in m')
+    if not 0 < near < far < np.inf:
+        raise ParameterError(
+            f'room is {room!r}; two distances above 0, m, are needed, the nearer first'
+        )
+    return near, far
+
+
 def check_number(value: Any, name: str, needed: str) -> float:
     """Return a number; raise ParameterError, naming what is needed, for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):

@@ -22,17 +22,25 @@ from fisheye_svp_ros.io.columns import plain_columns
 from fisheye_svp_ros.io.csv_files import FramePoses
 from fisheye_svp_ros.io.files import as_read
 from fisheye_svp_ros.io.parameters import SWEEP, rows, with_values
-from fisheye_svp_ros.io.readers import check_size_given, check_sizes, read_observations, read_poses
+from fisheye_svp_ros.io.readers import (
+    check_size_given,
+    check_sizes,
+    read_observations,
+    read_poses,
+    sizes_beside,
+)
 from fisheye_svp_ros.io.rig_files import load_pair
 from fisheye_svp_ros.io.share import typed_lens_path
 from fisheye_svp_ros.library import calibration
 from fisheye_svp_ros.library.calibration import CalibratedCameras, LensOptions
 from fisheye_svp_ros.library.checks import (
+    check_count,
     check_list,
     check_number,
     check_numbers,
     check_parameters,
     check_pose,
+    check_room,
     check_size,
     check_type,
     is_at_most,
@@ -48,6 +56,7 @@ from fisheye_svp_ros.library.results import (
     Swept,
 )
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.planning import MAX_VIEWS
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.process import limit_threads
 from fisheye_svp_ros.rectify.cameras import camera_for
@@ -56,6 +65,7 @@ from fisheye_svp_ros.scene.observations import STEREO, Observations, stereo_view
 from fisheye_svp_ros.scene.rigs import BASELINE, rig
 from fisheye_svp_ros.scene.table_checks import check_sigma
 from fisheye_svp_ros.simulate import scenario as scenarios
+from fisheye_svp_ros.simulate.scenario import Scenario
 from fisheye_svp_ros.solve import stereo_calibration
 from fisheye_svp_ros.solve.measured_poses import localize_measured, rms_px, sigma_known
 from fisheye_svp_ros.solve.reliability import noise_sigma
@@ -76,7 +86,7 @@ _MAX_DISTANCE = 1e50  # m
 Progress = Callable[[str, float], None]
 
 
-def _silent(stage: str, done: float) -> None:
+def silent(stage: str, done: float) -> None:
     """Report no progress."""
 
 
@@ -98,7 +108,10 @@ def save_lens(lens: Lens, path: str | Path) -> None:
 
 
 def project(lens: AnyLens, points: Array) -> Image:
-    """Project points (..., 3), m, in the camera frame; NaN and not valid outside the domain."""
+    """Project points (..., 3), m, in the camera frame; return uv (..., 2), px, and valid (...).
+
+    Outside the domain of the lens uv is NaN.  Raises ParameterError for points of another shape.
+    """
     points = _check_last_axis(3, points, 'points')
     # Beyond, squares overflow; the image is that of the direction long before.
     largest = np.abs(points).max(axis=-1, keepdims=True)
@@ -107,7 +120,11 @@ def project(lens: AnyLens, points: Array) -> Image:
 
 
 def back_project(lens: AnyLens, uv: Array) -> Rays:
-    """Return the rays of image points (..., 2), px: origin (0, 0, s(theta)), unit direction."""
+    """Return the rays of image points (..., 2), px, in the camera frame.
+
+    origin (..., 3), m: (0, 0, s(theta)); direction (..., 3), of unit length; theta (...), rad;
+    valid (...).  Raises ParameterError for points of another shape.
+    """
     return forward.back_project_corrected(load_lens(lens), _check_last_axis(2, uv, 'uv'))
 
 
@@ -128,6 +145,8 @@ def localize(
 ) -> Localized:
     """Pose every frame of one camera that can be posed; no start values are needed.
 
+    Returns frame, pose, rms_px, reasons (F,), covariance (F, 6, 6), residual (N, 2), see
+    `Localized`.
     model_error: covariances with what the lens says of its own errors (`uncertainty`).
     Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed,
     LensError for a lens that does not know its errors.
@@ -158,21 +177,22 @@ def localize(
 @limit_threads
 def calibrate(
     observations: AnyObservations,
-    model: str,
-    image_size: tuple[int, int],
+    model: str = 'kannala_brandt',
+    image_size: tuple[int, int] | None = None,
     free: Sequence[str] | None = None,
     name: str = 'lens',
     *,
     poses: AnyPoses | None = None,
     plain: bool = False,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> Calibrated:
     """Fit a lens to image points of known targets, see `solve.lens_calibration.calibrate`.
 
     By generalized least squares, so that the lens does not bend to errors of the target; plain:
     by least squares.
 
-    image_size: width, height, px; free: names of what is fitted, all by default.
+    image_size: width, height, px; None: that which `detect` wrote beside a file; free: names of
+    what is fitted, all by default.
     Outliers are rejected, and standard errors are honest, as those of the command.
     poses: of the flange of a robot that carried the camera; `calibration` of the lens has
     `hand_eye` then, where the camera sits in it.
@@ -203,13 +223,13 @@ def calibrate(
 @limit_threads
 def calibrate_cameras(
     observations: AnyObservations,
-    image_size: tuple[int, int] | Mapping[str, tuple[int, int]],
+    image_size: tuple[int, int] | Mapping[str, tuple[int, int]] | None = None,
     model: str = 'kannala_brandt',
     free: Sequence[str] | None = None,
     *,
     poses: AnyPoses | None = None,
     plain: bool = False,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> CalibratedCameras:
     """Fit the lenses of all cameras of a table and, where frames hold them together, their rig.
 
@@ -224,7 +244,7 @@ def calibrate_cameras(
 def _calibrate(
     observations: AnyObservations,
     table: Observations,
-    image_size: tuple[int, int] | Mapping[str, tuple[int, int]],
+    image_size: tuple[int, int] | Mapping[str, tuple[int, int]] | None,
     name: str,
     progress: Progress,
     model: str,
@@ -233,8 +253,15 @@ def _calibrate(
     plain: bool,
 ) -> CalibratedCameras:
     """Call what the command calls, with checked arguments; name: of each lens, '': its camera."""
-    by_camera = image_size if isinstance(image_size, Mapping) else {'': image_size}
-    sizes = {camera: check_size(size, 'image_size') for camera, size in by_camera.items()}
+    if image_size is None:
+        sizes = {} if isinstance(observations, Observations) else sizes_beside(Path(observations))
+        if not sizes:
+            raise ParameterError(
+                f'{table.source}: the image size is unknown; give image_size=(width, height)'
+            )
+    else:
+        by_camera = image_size if isinstance(image_size, Mapping) else {'': image_size}
+        sizes = {camera: check_size(size, 'image_size') for camera, size in by_camera.items()}
     if missing := [camera for camera in table.cameras if not {camera, ''} & set(sizes)]:
         raise ParameterError(f'image_size has no size of camera {missing[0]!r}')
     if not isinstance(observations, Observations):
@@ -252,6 +279,7 @@ def calibrate_stereo(
 ) -> CalibratedRig:
     """Return the rig of the cameras `left` and `right` of a table, lenses known.
 
+    The result has rig, covariance (6, 6), m and rad, and pose (V,) of each frame (V,).
     Raises ObservationError for a missing camera, GeometryError where the views fix no rig.
     """
     table, models = _stereo_inputs(observations, left, right)
@@ -288,6 +316,7 @@ def stereo_depth(
 ) -> StereoDepth:
     """Measure every landmark that both cameras of a rig (left in right) see, with SVP or not.
 
+    Returns points (N, 3), m, in the right camera; frame, landmark, gap, epipolar_px (N,).
     model_error: covariances, too: of the noise (that of the lenses, or of the image points where
     that is more), and of what the lenses say of their own errors; the rig is taken as it is.
     Raises ObservationError for a missing camera, LensError for a lens that does not know its
@@ -324,36 +353,64 @@ def stereo_depth(
     )
 
 
-def simulate_scenario(**scenario: Any) -> Simulated:
-    """Return what the cameras of a scenario see; keywords: parameters of `Scenario`.
+def simulate_scenario(
+    *,
+    lens: AnyLens = Scenario.lens,
+    shift_scale: float = Scenario.shift_scale,
+    environment: str = Scenario.environment,
+    radius: float = Scenario.radius,
+    style: str = Scenario.style,
+    baseline: float = Scenario.baseline,
+    vergence: float = Scenario.vergence,
+    poses: Sequence[float] = Scenario.poses,
+    poses_file: str = Scenario.poses_file,
+    trajectory_steps: int = Scenario.trajectory_steps,
+    noise_px: float = Scenario.noise_px,
+    seed: int = Scenario.seed,
+    rig_file: str = Scenario.rig_file,
+) -> Simulated:
+    """Return what the cameras of a scenario see; keywords: parameters of the synthetic camera.
 
-    lens may be a `Lens`, too.
-    Raises ParameterError for an unknown parameter or a value that is not allowed, FisheyeSvpError
-    for a lens, landmarks or poses that cannot be used.
+    radius, baseline: m; vergence: rad; poses (7 F,): x, y, z, m, and qx, qy, qz, qw of F poses
+    one after the other; noise_px: standard deviation of u and of v.
+    Raises ParameterError for a value that is not allowed, FisheyeSvpError for a lens, landmarks
+    or poses that cannot be used.
     """
-    _check_names(sweeps.CAMERA, scenario)
-    lens = scenario.pop('lens', None)
-    named = {} if lens is None or isinstance(lens, Lens) else {'lens': str(lens)}
-    given = {**check_parameters(scenario, 'scenario'), **named}
+    given = dict(locals())  # all keywords, by name: the rows of Scenario
+    given['lens'] = Scenario.lens if isinstance(lens, Lens) else str(lens)
     seen = scenarios.simulate_scenario(
-        with_values(sweeps.TABLES[sweeps.CAMERA](), given),
+        with_values(Scenario(), check_parameters(given, 'scenario')),
         lens=lens if isinstance(lens, Lens) else None,
     )
     return Simulated(seen.lens, seen.observations, seen.poses[-1], seen.rig)
 
 
 @limit_threads
-def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swept:
+def sweep(
+    over: Mapping[str, Sequence[Any]],
+    *,
+    synthetic_camera: Mapping[str, Any] | None = None,
+    localizer: Mapping[str, Any] | None = None,
+    stereo_calibrator: Mapping[str, Any] | None = None,
+    stereo_depth: Mapping[str, Any] | None = None,
+) -> Swept:
     """Solve the Cartesian product of lists of scenario parameters, as `fisheye-svp sweep` does.
 
-    nodes: further parameters by node: synthetic_camera, localizer, stereo_calibrator,
-    stereo_depth.
+    over: lists by parameter; synthetic_camera, ...: further parameters of each node.  The result
+    has one row a scenario, pose and repetition, as the command's table.
     Raises ParameterError for an unknown parameter or a value that is not allowed.
     """
     swept = {
         f'{SWEEP}{name}': check_list(values, f'over[{name!r}]')
         for name, values in check_type(over, Mapping, 'over', 'a mapping of lists').items()
     }
+    given = {
+        'synthetic_camera': synthetic_camera,
+        'localizer': localizer,
+        'stereo_calibrator': stereo_calibrator,
+        'stereo_depth': stereo_depth,
+    }
+    nodes = {node: values for node, values in given.items() if values is not None}
     parameters = {node: check_parameters(values, node) for node, values in nodes.items()}
     parameters[sweeps.CAMERA] = {**parameters.get(sweeps.CAMERA, {}), **swept}
     for node, values in parameters.items():
@@ -375,7 +432,10 @@ def diagnose(
     poses: AnyPoses | None = None,
     with_: Sequence[str] = (),
     without: Sequence[str] = (),
-    progress: Progress = _silent,
+    next: int = 0,
+    number: str | None = None,
+    room: tuple[float, float] | None = None,
+    progress: Progress = silent,
 ) -> Diagnosed:
     """Find what a lens's simulation gets wrong about observations, and extend it.
 
@@ -384,14 +444,22 @@ def diagnose(
     same camera with another target or of another day, where causes of the lens must hold, too;
     poses: of the camera, or of the flange of a robot that carries it, which the data tell apart;
     with_, without: names of effects that are known to be there, or not to be;
+    next: how many photographs to take next are listed in `document['next']`, those that separate
+    the causes best; number, room: as in `plan`, by default what is unclear, and the distances of
+    the observations;
     progress: called with each stage and the share that is done.
     Raises GeometryError or ObservationError where the data cannot be solved at all,
-    ParameterError for an unknown effect, or one that is both.
+    ParameterError for an unknown effect, or one that is both; with next, GeometryError for a
+    target that is not one flat board.
     """
     from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose_against
     from fisheye_svp_ros.diagnosis import diagnose as find_causes
+    from fisheye_svp_ros.planning.optimal_design import ViewLimits
+    from fisheye_svp_ros.planning.plan import check_number as check_number_known
+    from fisheye_svp_ros.planning.plan import next_photographs
     from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
     from fisheye_svp_ros.solve.measured_poses import poses_by_frame, usable_observations
+    from fisheye_svp_ros.solve.rig_state import free_parameters
 
     included, left_out = (
         tuple(map(str, check_list(names, name)))
@@ -400,11 +468,15 @@ def diagnose(
     if both := [name for name in included if name in left_out]:
         raise ParameterError(f'{both[0]!r} is in with_ and in without; remove one of them')
     options = DiagnosisOptions(included, left_out)
+    count = check_count(next, MAX_VIEWS, 'next') if next else 0
+    limits = None if room is None else ViewLimits(*check_room(room))
     table, known = table_and_lens(observations, lens)
     table, test = usable_observations(table, known).observations, None
     if held_out is not None:
         test = usable_observations(*table_and_lens(held_out, known)).observations
     given = None if poses is None else poses_by_frame(table, _by_frame(poses), 'poses')
+    if count and number is not None:  # before the work
+        check_number_known(number, table, known, free_parameters({'': known}, free_intrinsics))
     settings: dict[str, Any] = {
         'free_intrinsics': free_intrinsics,
         'held_out': test,
@@ -417,7 +489,12 @@ def diagnose(
     else:
         other = usable_observations(*table_and_lens(against, known)).observations
         found = diagnose_against(table, other, known, **settings)
-    return Diagnosed(found.verdict, as_read(diagnosis_document(found)), found.lens)
+    document = diagnosis_document(found)
+    if count:
+        after = found.evaluation.fixed_model
+        wanted = next_photographs(after, found.causes, found.noise_px, count, number, limits)
+        document['next'] = wanted.to_list()
+    return Diagnosed(found.verdict, as_read(document), found.lens)
 
 
 @limit_threads
@@ -426,6 +503,7 @@ def budget(
 ) -> Budgeted:
     """Tabulate what SVP costs and what noise does, by spread and range of the landmarks.
 
+    Returns spreads (A,), rad, ranges (R,), m, and by quantity error and noise (A, R), SI and px.
     style, baseline (m): of the stereo rig.
     Raises LensError for a lens without a viewpoint shift, ParameterError for impossible noise.
     """
@@ -445,6 +523,7 @@ def undistort_maps(
 ) -> Rectification:
     """Return what maps photographs to an ideal camera: `maps` for cv2.remap, `k`, `p`, `remap`.
 
+    maps: u and v (H, W), px, of each pixel of the new image; k (3, 3), p (3, 4).
     projection: pinhole, cylindrical, equirectangular or fisheye (equidistant); size: width,
     height, px; field_of_view: over the width, rad; range_m: where the maps are exact, if the
     viewpoint of the lens moves.
@@ -494,10 +573,6 @@ def _check_view(
 
 
 def _check_names(node: str, values: Mapping[str, Any]) -> None:
-    if node not in sweeps.TABLES:
-        raise ParameterError(
-            f'{node!r} is not a node of a sweep; known are {", ".join(sweeps.TABLES)}'
-        )
     known = [row.name for row in rows(sweeps.TABLES[node])]
     for name in (given.removeprefix(SWEEP) for given in values):
         if name not in known:

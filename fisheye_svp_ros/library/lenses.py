@@ -19,7 +19,10 @@ from fisheye_svp_ros.library.checks import (
     check_whole_numbers,
 )
 from fisheye_svp_ros.library.functions import AnyLens, load_lens
+from fisheye_svp_ros.library.results import Compared
+from fisheye_svp_ros.optics.curves import Perspective
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.pinhole import RadialPinhole
 from fisheye_svp_ros.rectify.maps import RANGE, Rectification
 from fisheye_svp_ros.rectify.views import (
     cube_views,
@@ -27,6 +30,8 @@ from fisheye_svp_ros.rectify.views import (
     perspective_view,
     rectify_views,
 )
+from fisheye_svp_ros.solve.lens_comparison import compare_lenses
+from fisheye_svp_ros.solve.ray_errors import RANGES
 
 
 def resize_lens(
@@ -61,12 +66,28 @@ def resize_lens(
 
 
 def opencv_matrices(lens: AnyLens) -> tuple[Array, Array]:
-    """Return K (3, 3), px, and D (4,) for cv2.fisheye; a viewpoint shift stays behind.
+    """Return K (3, 3), px, and D of a lens for OpenCV; a viewpoint shift stays behind.
 
+    D (4,) is for cv2.fisheye; of a pinhole lens D (5,), (8,), (12,) or (14,) is for cv2 itself.
     Raises LensError for a curve that these do not hold to a hundredth of a pixel.
     """
-    near = models.nearest_kannala_brandt(load_lens(lens))
+    known = load_lens(lens)
+    if isinstance(known.image_height, RadialPinhole | Perspective):
+        return models.camera_matrix(known), np.array(models.opencv_coefficients(known))
+    near = models.nearest_kannala_brandt(known)
     return models.camera_matrix(near), np.array(models.coefficients(near))
+
+
+def compare(one: AnyLens, other: AnyLens) -> Compared:
+    """Compare what two lenses of one camera see at the same image points, 0.3, 1 and 5 m away.
+
+    Where a lens has its camera frame is a convention: the motion of it that fits best is taken
+    out.  `plot_comparison` draws the result.
+    Raises LensError for lenses of two image sizes (`resize_lens`), or without common rays.
+    """
+    lenses = load_lens(one), load_lens(other)
+    found = compare_lenses(*lenses)
+    return Compared(*lenses, np.array(RANGES), found.uv, found.theta, found.angle, found.motion)
 
 
 def undistort_views(

@@ -17,7 +17,7 @@ from fisheye_svp_ros.library.functions import (
     localize,
     table_and_lens,
 )
-from fisheye_svp_ros.library.results import Budgeted
+from fisheye_svp_ros.library.results import Budgeted, Compared
 from fisheye_svp_ros.reporting.budget_report import DISPLAY_UNITS
 from fisheye_svp_ros.reporting.diagnosis_plots import draw_arrows, draw_image_frame
 from fisheye_svp_ros.solve.measured_poses import rms_px
@@ -88,4 +88,26 @@ def plot_budget(budget: Budgeted, quantity: str = 'position') -> Figure:
         axis.loglog(budget.ranges, factor * noise, '--', color=line.get_color())
     axis.set(xlabel='range / m', ylabel=f'{quantity} error / {unit}')
     axis.legend(title='spread; dashed: noise', ncols=2)
+    return figure
+
+
+def plot_comparison(compared: Compared) -> Figure:
+    """Draw by what angle two lenses differ, mrad: over the incidence angle and over the image."""
+    check_type(compared, Compared, 'compared', 'the result of fsvp.compare')
+    figure = Figure(figsize=(11, 4), layout='constrained')
+    by_angle, image = figure.subplots(1, 2)
+    table = compared.table()
+    middle = np.degrees(np.add(table['from'], table['to']) / 2)
+    for range_m, rms in zip(compared.ranges, compared.rms, strict=True):
+        row = 1e3 * np.array(table[f'rms_{range_m:g}m'])
+        by_angle.plot(middle, row, 'o-', label=f'{range_m:g} m: {1e3 * rms:.3g} mrad rms')
+    by_angle.set(xlabel='incidence angle / degree', ylabel='difference / mrad')
+    by_angle.set_ylim(bottom=0)
+    by_angle.legend()
+    draw_image_frame(image, compared.one)
+    at = len(compared.ranges) // 2
+    shown = image.scatter(*compared.uv.T, c=1e3 * compared.angle[at], s=14, marker='s', zorder=0)
+    figure.colorbar(shown, ax=image, label=f'difference at {compared.ranges[at]:g} m / mrad')
+    image.set(xlabel='u / px', ylabel='v / px')
+    figure.suptitle(f'{compared.other.name} against {compared.one.name}')
     return figure

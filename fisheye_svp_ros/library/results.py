@@ -22,6 +22,7 @@ from fisheye_svp_ros.scene.observations import Observations
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+_BAND = np.radians(10.0)
 _BRIEF = 60  # characters of a value in a repr
 _KIND_KEY = 'result'
 
@@ -342,6 +343,50 @@ class Budgeted(Result):
                     f'{name}_{part}': np.ravel(values)
                     for part, by in self.own.items()
                     for name, values in by.items()
+                },
+            }
+        )
+
+
+@dataclass(frozen=True)
+class Compared(Result):
+    """How far two lenses disagree: angle (R, G), rad, between what they see at an image point.
+
+    ranges (R,), m; uv (G, 2), px, all over the image; theta (G,), rad, the incidence angle in the
+    first lens; rms, largest (R,), rad, over the image.  motion: the camera frame of the second
+    lens in that of the first, by which both fit best; it is taken out.
+    """
+
+    one: Lens
+    other: Lens
+    ranges: Array
+    uv: Array
+    theta: Array
+    angle: Array
+    motion: Pose
+
+    @property
+    def rms(self) -> Array:
+        """Root mean square (R,), rad, over the image."""
+        return np.asarray(np.sqrt((self.angle**2).mean(axis=1)))
+
+    @property
+    def largest(self) -> Array:
+        """The largest angle (R,), rad, over the image."""
+        return np.asarray(self.angle.max(axis=1))
+
+    def table(self) -> Columns:
+        """Return one row a band of 10 degrees: from, to, rad; points; rms at each range, rad."""
+        band = (self.theta / _BAND).astype(int)
+        there, points = np.unique(band, return_counts=True)
+        return Columns(
+            {
+                'from': _BAND * there,
+                'to': _BAND * (there + 1),
+                'points': points,
+                **{
+                    f'rms_{range_m:g}m': np.sqrt(np.bincount(band, angle**2)[there] / points)
+                    for range_m, angle in zip(self.ranges, self.angle, strict=True)
                 },
             }
         )

@@ -14,6 +14,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Mask, symmetric_root
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import cross_matrix
 
 RANGES = (0.3, 1.0, 5.0)  # m
 MAX_RAY_ERROR = 1e-3  # rad at 1 m: 1 mm, with which robots dock and grasp; more is worth a word
@@ -193,11 +194,15 @@ def ray_model(
 def points_on_rays(lens: Lens, uv: Array, ranges: Sequence[float] = RANGES) -> Array:
     """Return the points (R, G, 3), m, that image points (G, 2), px, see at ranges; NaN: none."""
     rays = ForwardModel(lens).back_project(uv[None]).reshape((len(uv),))
-    origin = np.where(rays.valid[:, None], rays.origin, np.nan)
-    along = (origin * rays.direction).sum(axis=-1)
+    return points_at(np.where(rays.valid[:, None], rays.origin, np.nan), rays.direction, ranges)
+
+
+def points_at(origin: Array, direction: Array, ranges: Sequence[float] = RANGES) -> Array:
+    """Return the points (R, G, 3), m, of rays, both (G, 3), at ranges from the camera frame."""
+    along = (origin * direction).sum(axis=-1)
     rest = (origin**2).sum(axis=-1) - along**2
     away = np.sqrt(np.array(ranges)[:, None] ** 2 - rest) - along
-    return np.asarray(origin + away[..., None] * rays.direction)
+    return np.asarray(origin + away[..., None] * direction)
 
 
 def without_motion(points: Array, change: Array) -> Array:
@@ -206,6 +211,15 @@ def without_motion(points: Array, change: Array) -> Array:
     Of the components across the rays: along them nothing is seen.  The motion is that of least
     squares over all ranges together, of the angles.
     """
+    return _split_motion(points, change)[1]
+
+
+def motion_of(points: Array, change: Array) -> Array:
+    """Return that motion (6, ...), m and rad: what `Pose.retract` does to the identity."""
+    return _split_motion(points, change)[0]
+
+
+def _split_motion(points: Array, change: Array) -> tuple[Array, Array]:
     distance = np.linalg.norm(points, axis=-1, keepdims=True)
     along = (points / distance)[..., None]
 
@@ -213,12 +227,9 @@ def without_motion(points: Array, change: Array) -> Array:
         angles = moves / distance[..., None]
         return np.asarray(angles - along * (along * angles).sum(axis=-2, keepdims=True))
 
-    x, y, z = np.moveaxis(points, -1, 0)
-    zero = np.zeros_like(x)
-    turns = np.stack([[zero, -z, y], [z, zero, -x], [-y, x, zero]])  # of unit rotations
-    turns = np.moveaxis(turns, (0, 1), (-1, -2))
     shifts = np.broadcast_to(np.eye(3), (*points.shape, 3))
-    motion = across_rays(np.concatenate([turns, shifts], axis=-1)).reshape(-1, 6)
+    motion = across_rays(np.concatenate([shifts, -cross_matrix(points)], axis=-1)).reshape(-1, 6)
     angles = across_rays(change.reshape(*points.shape, -1)).reshape(points.size, -1)
-    left = angles - motion @ np.linalg.lstsq(motion, angles, rcond=None)[0]
-    return np.asarray(left.reshape(change.shape))
+    found = np.asarray(np.linalg.lstsq(motion, angles, rcond=None)[0], dtype=float)
+    left = angles - motion @ found
+    return found.reshape(6, *change.shape[3:]), left.reshape(change.shape)

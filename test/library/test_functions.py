@@ -139,6 +139,7 @@ def _results(seen: Simulated, pair: Simulated) -> list[Result]:
         fsvp.sweep({'radius': [0.5, 2.0]}),
         fsvp.budget('fish180'),
         fsvp.diagnose(seen.observations, seen.lens),
+        fsvp.compare(seen.lens, svp),
     ]
 
 
@@ -192,11 +193,13 @@ def test_calibrate_writes_the_lens_of_the_command(seen: Simulated, tmp_path: Pat
 
 
 def test_an_unknown_parameter_is_refused() -> None:
-    with pytest.raises(ParameterError, match=r"'noise' is not a .*noise_px"):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'noise'"):
         fsvp.simulate_scenario(noise=0.1)
     with pytest.raises(ParameterError, match="'radii' is not a parameter"):
         fsvp.sweep({'radii': [1.0]})
-    with pytest.raises(ParameterError, match="'solver' is not a node"):
+    with pytest.raises(ParameterError, match="'lense' is not a parameter of localizer; known "):
+        fsvp.sweep({'radius': [1.0]}, localizer={'lense': 'fish180'})
+    with pytest.raises(TypeError, match="unexpected keyword argument 'solver'"):
         fsvp.sweep({'radius': [1.0]}, solver={})
 
 

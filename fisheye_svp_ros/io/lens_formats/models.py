@@ -41,6 +41,7 @@ _NAMES = {
 }
 # Of coefficients; with a thin prism 12, with a tilt 14
 _COUNTS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (4, 5, 8, 12, 14)}
+_LENGTHS = (5, 8, 12, 14)  # that OpenCV takes
 _RTABMAP_FISHEYE = 6  # coefficients
 _MODEL_OF = {name: model for model, names in _NAMES.items() for name in names.split()}
 STATED_MODELS = tuple(_NAMES)  # as sensor_msgs/CameraInfo calls them
@@ -436,3 +437,12 @@ def nearest_kannala_brandt(lens: Lens) -> Lens:
 def coefficients(lens: Lens) -> list[float]:
     """Return k1 to k4 of a Kannala-Brandt lens."""
     return list(lens.image_height.coefficients)
+
+
+def opencv_coefficients(lens: Lens) -> list[float]:
+    """Return those of a pinhole lens in OpenCV's order: 5, 8, with a prism 12, with a tilt 14."""
+    curve, sideways = lens.image_height, lens.tangential or TangentialDistortion()
+    radial = dict(zip(curve.coefficient_names, curve.coefficients, strict=True))
+    values = [{**radial, **sideways.values}.get(name, 0.0) for name in OPENCV]
+    needed = max((i + 1 for i, value in enumerate(values) if value), default=0)
+    return values[: next(count for count in _LENGTHS if count >= needed)]
