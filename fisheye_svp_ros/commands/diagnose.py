@@ -191,7 +191,7 @@ def run(args: argparse.Namespace) -> None:
                 diagnosis = diagnose(observations, lens, **settings)
             else:
                 diagnosis = diagnose_against(observations, other, lens, **settings)
-            progress('errors where the truth is known', 0.88)
+            progress('errors of poses and depth', 0.88)
             evaluation = diagnosis.evaluation
             fitted = evaluation.problem.free
             known = known_errors(evaluation.simulation, evaluation.fixed_model, fitted)

@@ -35,6 +35,7 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.table_checks import (
     check_cameras,
     check_distinct,
+    check_rigid,
     order_cameras,
     put_right_camera_first,
     quantization_step,
@@ -152,6 +153,7 @@ class Inputs:
         if poses is not None:
             observations = put_right_camera_first(observations)
         check_cameras(observations)
+        check_rigid(observations)
         lenses = rig_lenses(observations, lens)
         free = free_parameters(lenses, free_intrinsics)
         observations = on_boards(observations, next(iter(lenses.values())).target.get(LANDMARKS))

@@ -31,7 +31,7 @@ from fisheye_svp_ros.reporting.wording.calibration import (
 )
 from fisheye_svp_ros.reporting.wording.inputs import reader_limit
 from fisheye_svp_ros.scene.observations import Observations, join_tables, rig_cameras
-from fisheye_svp_ros.scene.table_checks import check_frames_differ, remove_copies
+from fisheye_svp_ros.scene.table_checks import check_frames_differ, check_rigid, remove_copies
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, rig_covariance
 from fisheye_svp_ros.solve.hand_eye import HandEye
 from fisheye_svp_ros.solve.lens_calibration import (
@@ -148,6 +148,7 @@ def calibrate_cameras(
     """
     check_frames_differ(observations)
     observations, copies = remove_copies(observations)
+    check_rigid(observations)
     fits: dict[str, _Fit] = {}
     for number, name in enumerate(observations.cameras):
         progress('fitting the lens', 0.3 * number / len(observations.cameras))

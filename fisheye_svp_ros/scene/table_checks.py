@@ -21,6 +21,12 @@ _PLACE_TOLERANCE = 1e-3  # of a target's extent: more than places that are writt
 MIN_ASPECT = 1.9  # width over height: of two square images 2, of one sensor 1.78 at most
 _MIN_VIEWS = 3  # on either side of the middle
 _CHANCE = 0.05  # of frames of one camera to stay away from the middle so far
+_MIN_RIGIDITY = 0.1  # a correlation: 20 random views have up to 0.03, the worst of boards 0.78
+_RIGID_LANDMARKS, _RIGID_PAIRS = (
+    60,
+    100,
+)  # to look at, the most often seen; fewer pairs say nothing
+_COINCIDENT = 1e-3  # px, of two image points
 _MANY_POINTS, _MIN_POINTS = 1500, 24  # of a thinned table, and of a view that stays whole
 
 
@@ -97,6 +103,50 @@ def check_frames_differ(observations: Observations) -> None:
             f'{observations.source}: {len(again)} frames repeat the image points of frame '
             f'{kept.frames[0]}; take photographs of the target from other sides'
         )
+
+
+def check_rigid(observations: Observations) -> None:
+    """Raise ObservationError where image points are not those of one rigid target.
+
+    Landmarks that lie close together in one view then do so in others too, wherever the table says
+    that they are and whatever the lens.  This needs no fit: of random image points none ends soon.
+    """
+    found = _rigidity(observations)
+    if found is not None and found < _MIN_RIGIDITY:
+        raise ObservationError(
+            f'{observations.source}: landmarks that are close in one frame are not in others '
+            f'(correlation {found:.2f}; of any rigid target at least {_MIN_RIGIDITY:g}); check '
+            'that image points and landmark numbers belong together, in every frame'
+        )
+
+
+def _rigidity(table: Observations) -> float | None:
+    """Return how far distances between image points agree with those in other views.
+
+    A correlation of logarithms, clipped, each view's mean taken out; None of too few pairs.
+    """
+    ids, place, count = np.unique(table.landmark, return_inverse=True, return_counts=True)
+    often = np.sort(np.argsort(-count, kind='stable')[:_RIGID_LANDMARKS])
+    slot = np.full(len(ids), -1)
+    slot[often] = np.arange(len(often))
+    slot = slot[place.reshape(-1)]
+    views, view = np.unique(np.stack([table.frame, table.camera]), axis=1, return_inverse=True)
+    some = slot >= 0
+    uv = np.full((views.shape[1], len(often), 2), np.nan)
+    uv[view.reshape(-1)[some], slot[some]] = table.uv[some]
+    one, other = np.triu_indices(len(often), 1)
+    length = np.log(np.maximum(np.linalg.norm(uv[:, one] - uv[:, other], axis=-1), _COINCIDENT))
+    known = np.isfinite(length)
+    length = np.where(known, length, 0.0)
+    length -= known * (length.sum(axis=1) / np.maximum(known.sum(axis=1), 1))[:, None]
+    length = np.clip(
+        length, -1.0, 1.0
+    )  # a few points that lie together, or far off, decide nothing
+    elsewhere = (length.sum(axis=0) - length) / np.maximum(known.sum(axis=0) - 1, 1)
+    shared = known & (known.sum(axis=0) > 1)
+    if shared.sum() < _RIGID_PAIRS or not np.ptp(elsewhere[shared]):
+        return None
+    return float(np.corrcoef(length[shared], elsewhere[shared])[0, 1])
 
 
 def is_another_target(observations: Observations, other: Observations) -> bool:

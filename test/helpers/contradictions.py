@@ -198,7 +198,9 @@ def _screen(document: Document, screen: str) -> Iterator[str]:
             yield f'{say}, and the screen {"has" if answer != say else "lacks"} {words!r}'
     if document['adequacy'] and ('Enough' in screen or '% sure' in screen):
         yield 'inadequate data, and the screen reassures'
-    causes = re.split('Against the truth:|Not confirmed:|Next:', screen.partition('Causes:')[2])[0]
+    causes = re.split(
+        'Against the (?:truth|target):|Not confirmed:|Next:', screen.partition('Causes:')[2]
+    )[0]
     misfit = any(FlawKind[one['flaw'].upper()].is_misfit for one in document['adequacy'])
     if misfit and causes:
         yield 'no cause can be trusted in such data, and the screen names some'

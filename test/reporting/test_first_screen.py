@@ -34,6 +34,7 @@ from fisheye_svp_ros.reporting.diagnosis_report import write_report
 from fisheye_svp_ros.reporting.wording.adequacy import frame_list
 from fisheye_svp_ros.reporting.wording.causes import percent, size
 from fisheye_svp_ros.reporting.wording.diagnosis import (
+    known_reference,
     lens_contents,
     refusal_reason,
     verdict_sentences,
@@ -623,3 +624,17 @@ def test_an_extended_lens_that_held_out_frames_refute_is_not_offered(found: Diag
     assert command_to_go_on(worse, inputs) == (
         f'fisheye-svp calibrate a.csv --image-size {size} -o recalibrated.yaml'
     )
+
+
+def test_the_truth_is_named_only_where_poses_are_given(found: Diagnosis) -> None:
+    """Depths of a stereo pair on a measured target were told as "Against the truth"."""
+    known = {'depth_error_m': Comparison(0.002, 0.002, -1e-9, 0.0, 0.0)}
+    lines = terminal_lines(first_screen(found, 'table', known), '')
+    assert any(line.startswith('Against the target: depth error') for line in lines)
+    assert not any('truth' in line for line in lines)
+    assert known_reference(found) == 'the target'
+    model = found.evaluation.fixed_model
+    held = SimpleNamespace(
+        fixed_model=SimpleNamespace(data=replace(model.data, poses=model.state.pose))
+    )
+    assert known_reference(Mock(evaluation=held)) == 'the truth'

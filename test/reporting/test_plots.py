@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.quiver import QuiverKey
 
+from fisheye_svp_ros import reporting
+from fisheye_svp_ros.reporting.diagnosis_plots import draw_arrows
 from fisheye_svp_ros.reporting.plots import drawing, legend_below
+
+TEMPLATES = Path(reporting.__file__).parent / 'templates'
 
 
 def draw(tight: bool, below: bool) -> Figure:
@@ -34,6 +40,37 @@ def test_nothing_is_cut_or_covered(tight: bool, below: bool) -> None:
         assert whole.y0 <= box.y0 and box.y1 <= whole.y1
     apart = [(one, other) for i, one in enumerate(boxes) for other in boxes[:i]]
     assert apart and not any(one.overlaps(other) for one, other in apart)
+
+
+@pytest.mark.parametrize('typical', [1e-4, 0.17, 123.0])
+def test_the_key_of_arrows_lies_whole_inside_the_picture(typical: float) -> None:
+    """Half of "0.2 px" was cut by the upper edge: arrows had no scale."""
+    with drawing(BytesIO(), 9.2, 3.6) as figure:
+        axis = figure.subplots(1, 2)[0]
+        uv = np.random.default_rng(1).uniform((0, 0), (640, 480), (50, 2))
+        draw_arrows(axis, uv, typical * np.ones((50, 2)), typical, 19.0, 'C0')
+        axis.set(xlim=(0, 640), ylim=(480, 0), aspect='equal')
+        axis.set_title('residuals', loc='left')
+    (key,) = axis.findobj(QuiverKey)
+    box = key.text.get_window_extent()
+    assert key.text.get_text().endswith(' px') and box.width > 0
+    assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
+    assert figure.bbox.y0 <= box.y0 and box.y1 <= figure.bbox.y1
+
+
+@pytest.mark.parametrize('name', ['diagnosis', 'calibration', 'blocks'])
+def test_on_a_telephone_tables_and_pictures_scroll(name: str) -> None:
+    """A column was one letter wide, and the text of pictures 3 px high."""
+    page = (TEMPLATES / f'{name}.html').read_text()
+    narrow = page.partition('@media (max-width: 600px)')[2].partition('\n')[0]
+    assert 'figure { overflow-x: auto; }' in narrow
+    assert 'figure img { max-width: none; width: 760px; }' in narrow
+    if 'table { display: block; overflow-x: auto; overflow-wrap: normal; }' in page:
+        assert 'td { min-width: 8em; }' in narrow
+    else:
+        assert '.wide { overflow-x: auto; }' in page
+        assert page.count('<table') == page.count('<div class="wide"><table')
+        assert 'overflow-wrap: anywhere' not in page.partition('body {')[2].partition('}')[0]
 
 
 def test_numbers_between_powers_of_ten_have_room_above_the_label() -> None:

@@ -473,6 +473,11 @@ def known_rows(
         yield label, before, after, less
 
 
+def known_reference(d: Diagnosis) -> str:
+    """Return what `known_rows` compare with: true poses, or else the target as stated."""
+    return 'the truth' if d.evaluation.fixed_model.data.poses is not None else 'the target'
+
+
 def compared_row(name: str, compared: Comparison) -> tuple[str, str, str, str]:
     """Return a mean error's name, its value before and after, and by how much it is less."""
     label, factor, unit = _MEASURES[name]

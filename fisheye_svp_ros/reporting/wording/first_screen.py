@@ -59,6 +59,7 @@ from fisheye_svp_ros.reporting.wording.diagnosis import (
     frame_ranges,
     is_assumed,
     is_short_of_angle,
+    known_reference,
     known_rows,
     lens_words,
     only_gross,
@@ -128,6 +129,7 @@ class Screen(NamedTuple):
     candidates: str
     bound: str
     truth: str
+    reference: str
     accuracy: str
     travel: str = ''
 
@@ -135,7 +137,7 @@ class Screen(NamedTuple):
 def first_screen(
     d: Diagnosis, source: str, known: Mapping[str, Comparison] | None = None
 ) -> Screen:
-    """Return the first screen; source: what was diagnosed; known: errors against the truth."""
+    """Return the first screen; source: what was diagnosed; known: of `known_rows`."""
     paths = _paths(d)
     kind = {'retake': RETAKE, 'more': UNLIKE}.get(d.decision['photographs'].say, '')
     about = frames_of(d.advice, kind) if kind and not d.adequacy.is_misfit else []
@@ -173,6 +175,7 @@ def first_screen(
             f'{name} {before}' + (f' → {after}' if after != '-' else '')
             for name, before, after, _ in known_rows(d, known or {})
         ),
+        known_reference(d),
         accuracy(d),
         '' if d.against is None else travel_sentence(d.against),
     )
@@ -215,7 +218,7 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
             first.append(do)
             details.append(f'{action.about}, why: {why}')
     details += [f'Causes: {screen.causes}'] if screen.causes else []
-    details += [f'Against the truth: {screen.truth}'] if screen.truth else []
+    details += [f'Against {screen.reference}: {screen.truth}'] if screen.truth else []
     details += [f'Not confirmed: {screen.candidates}'] if screen.candidates else []
     details += [f'Not excluded: {screen.bound}'] if screen.bound else []
     first += [f'Next: {command}'] if command else []
