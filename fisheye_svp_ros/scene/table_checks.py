@@ -21,11 +21,9 @@ _PLACE_TOLERANCE = 1e-3  # of a target's extent: more than places that are writt
 MIN_ASPECT = 1.9  # width over height: of two square images 2, of one sensor 1.78 at most
 _MIN_VIEWS = 3  # on either side of the middle
 _CHANCE = 0.05  # of frames of one camera to stay away from the middle so far
-_MIN_RIGIDITY = 0.1  # a correlation: 20 random views have up to 0.03, the worst of boards 0.78
-_RIGID_LANDMARKS, _RIGID_PAIRS = (
-    60,
-    100,
-)  # to look at, the most often seen; fewer pairs say nothing
+_MIN_RIGIDITY = 0.05  # random points leave 0.03 at most; a fifth of wild ones 0.2 and more
+_RIGID_LANDMARKS, _RIGID_PAIRS = 60, 100  # to look at, the most often seen; that say something
+_RIGID_VIEWS = 8  # of fewer, wild points are not told from random ones
 _COINCIDENT = 1e-3  # px, of two image points
 _MANY_POINTS, _MIN_POINTS = 1500, 24  # of a thinned table, and of a view that stays whole
 
@@ -123,7 +121,8 @@ def check_rigid(observations: Observations) -> None:
 def _rigidity(table: Observations) -> float | None:
     """Return how far distances between image points agree with those in other views.
 
-    A correlation of logarithms, clipped, each view's mean taken out; None of too few pairs.
+    A correlation of logarithms, clipped, each view's mean taken out; None of too few views or
+    pairs.
     """
     ids, place, count = np.unique(table.landmark, return_inverse=True, return_counts=True)
     often = np.sort(np.argsort(-count, kind='stable')[:_RIGID_LANDMARKS])
@@ -131,6 +130,8 @@ def _rigidity(table: Observations) -> float | None:
     slot[often] = np.arange(len(often))
     slot = slot[place.reshape(-1)]
     views, view = np.unique(np.stack([table.frame, table.camera]), axis=1, return_inverse=True)
+    if views.shape[1] < _RIGID_VIEWS:
+        return None
     some = slot >= 0
     uv = np.full((views.shape[1], len(often), 2), np.nan)
     uv[view.reshape(-1)[some], slot[some]] = table.uv[some]
@@ -139,9 +140,7 @@ def _rigidity(table: Observations) -> float | None:
     known = np.isfinite(length)
     length = np.where(known, length, 0.0)
     length -= known * (length.sum(axis=1) / np.maximum(known.sum(axis=1), 1))[:, None]
-    length = np.clip(
-        length, -1.0, 1.0
-    )  # a few points that lie together, or far off, decide nothing
+    length = np.clip(length, -1.0, 1.0)  # few points that coincide, or are far off, decide nothing
     elsewhere = (length.sum(axis=0) - length) / np.maximum(known.sum(axis=0) - 1, 1)
     shared = known & (known.sum(axis=0) > 1)
     if shared.sum() < _RIGID_PAIRS or not np.ptp(elsewhere[shared]):

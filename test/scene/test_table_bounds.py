@@ -78,8 +78,8 @@ def test_random_image_points_are_refused_before_anything_is_fitted():
 
 def test_a_target_is_rigid_though_many_landmarks_are_wrong_or_points_wild():
     rng = np.random.default_rng(4)
-    rows = table(4)
-    wild = rng.random(len(rows)) < 0.1
+    rows = table(12)
+    wild = rng.random(len(rows)) < 0.2
     check_rigid(replace(rows, xyz=rng.permutation(rows.xyz)))
     check_rigid(replace(rows, uv=np.where(wild[:, None], rng.uniform(0, SIZE), rows.uv)))
     check_rigid(rows.take(rows.frame == 0))
