@@ -237,7 +237,10 @@ class TestTarget:
         assert model.seeing(other[1]).is_lens_only and not model.seeing(SEEN[1]).is_lens_only
         assert model.terms_for(other[1]) == () and len(model.terms_for(SEEN[1])) == 1
         # One view of each: every view is judged by itself.
-        both = [np.concatenate([a[:1], b[:1]]) for a, b in zip(SEEN[1], other[1], strict=True)]
+        both = [
+            None if a is None else np.concatenate([a[:1], b[:1]])
+            for a, b in zip(SEEN[1], other[1], strict=True)
+        ]
         pose = type(SEEN[0])(
             *(np.concatenate([a[:1], b[:1]]) for a, b in zip(SEEN[0], other[0], strict=True))
         )

@@ -182,7 +182,7 @@ SIDE, IMAGE = fsvp.undistort_maps(LENS), np.zeros((400, 424), np.uint8)
             lambda: fsvp.sweep({'radius': [1.0]}, localizer=3),
             'localizer is of type int; a mapping of',
         ),
-        (lambda: fsvp.simulate_scenario(rate=-3), 'rate is -3.0; allowed is 0.001 to 10000'),
+        (lambda: fsvp.simulate_scenario(noise_px=-3), 'noise_px is -3.0; allowed is 0 to '),
         (
             lambda: fsvp.observations([1.0, 2], [2.0, 3], [0, 0], BOARD),
             'a landmark is twice in a fr',

@@ -490,7 +490,7 @@ def weak_pose(hour: Hour, pattern: str) -> None:
     hour.says(pattern, lambda: points.publish(image_points()))
 
 
-@tries('No base_pose: /tf_static lacks the camera')
+@tries('No base_pose: no transform of the camera')
 def no_mount(hour: Hour, pattern: str) -> None:
     need_tf2()
     _, points = framed_sets(hour, *SOLVING, 'base_frame:=base_link')
