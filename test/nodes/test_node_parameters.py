@@ -204,7 +204,9 @@ def test_a_node_says_which_lens_it_solves_with(
     node = start('localizer', *(word for one in arguments for word in ('-p', one)))
     assert node.settings.solves_svp is solves_svp
     if node.settings.lens:
-        points = SimpleNamespace(uv=np.full((1, 2), 500.0))
+        points = SimpleNamespace(
+            points=np.zeros((1, 3)), uv=np.full((1, 2), 500.0), landmark=np.zeros(1, int), tag=None
+        )
         shift = node.model(0, {'image_points': points}).lens.viewpoint_shift
         assert (shift is None) is solves_svp
     assert said in ' '.join(capfd.readouterr().err.split())

@@ -261,7 +261,7 @@ def test_a_chunk_that_became_a_footer_is_no_end(tmp_path: Path) -> None:
     assert data[chunk] == 6
     data[chunk] = 2
     file.write_bytes(data)
-    with pytest.raises(BagError, match=r'is empty, or no MCAP file'):
+    with pytest.raises(BagError, match=r'not a recording, or no part of it is intact'):
         list(Bag(tmp_path / 'bag').records(is_tabulated))
 
 
