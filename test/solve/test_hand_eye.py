@@ -120,7 +120,8 @@ def test_a_robot_holds_the_lens() -> None:
 @pytest.mark.parametrize(
     ('scale', 'said'),
     [
-        (0.9, ''),
+        (1.001, ''),
+        (0.9, 'lengths of the target are -10.0 % off those of the robot'),
         (2.5, 'a factor of 2.5; both'),
         (0.001, 'a factor of 1000: the poses may be in mm'),
         (1001.0, 'a factor of 1001: the target may be in mm; both are needed in m'),
