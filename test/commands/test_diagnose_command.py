@@ -745,5 +745,5 @@ def test_a_terminal_shows_a_provisional_answer(scene, capsys, monkeypatch):
     assert run('shift.csv', scene, '--quick') == 0
     printed = capsys.readouterr()
     words = 'Provisional: The viewpoint of the lens shifts with the angle'
-    assert shown[-1] == f'{words}\ndiagnosing: errors where the truth is known'
+    assert shown[-1] == f'{words}\ndiagnosing: errors of poses and depth'
     assert 'rovisional' not in printed.out + printed.err  # nothing has changed
