@@ -160,6 +160,6 @@ def test_the_figures_of_the_first_pages_are_those_of_the_results() -> None:
     page = measured.INDEX.read_text(encoding='utf-8').splitlines()
     assert [re.sub(r'\| [\d-]* \|$', '', line) for line in page] == undated
     text = measured.README.read_text(encoding='utf-8')
-    assert measured.readme(text) == text and len(text.splitlines()) <= 110
+    assert measured.readme(text) == text and len(text.splitlines()) <= 150
     pages = {path.stem for path in measured.RESULTS.glob('*.md')}
     assert {claim.page for claim in measured.CLAIMS} <= pages
