@@ -88,8 +88,8 @@ CLAIMS = (
         '{1} of 36 cells within 10 %, {2} within 5 %',
         'the published tables',
         'make paper',
-        "Of the 36 values of z and residual in tables 1 and 2 of Kita's paper, the package "
-        'reproduces **{1} within 10 %** and {2} within 5 %.',
+        "Tables 1 and 2 of Kita's paper hold 36 values of z and residual. The package reproduces "
+        '**{1} of them within 10 %** and {2} within 5 %.',
     ),
     Claim(
         'Transforms of a camera on a robot arm',
