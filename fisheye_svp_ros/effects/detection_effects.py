@@ -17,7 +17,6 @@ _RIM_SCALE = np.sqrt(3 / (2 + np.cos(2 * np.pi / _RIM)))  # gives the polygon th
 _PROBE = 0.02  # radius of the probing dot over its distance: small, yet far above rounding
 
 
-@dataclass(frozen=True)
 class DotCentroidEffect(Effect):
     """Bias of the centroid of a flat round dot, in proportion to its radius squared."""
 
@@ -115,7 +114,6 @@ class DetectorBiasEffect(Effect):
         return values if scale == 1 else None  # other pixels have other phases
 
 
-@dataclass(frozen=True)
 class WrongIdsEffect(NoiseEffect):
     """A part of the observations is swapped with others of the same view."""
 
@@ -136,7 +134,6 @@ class WrongIdsEffect(NoiseEffect):
         return swapped
 
 
-@dataclass(frozen=True)
 class QuantisationEffect(NoiseEffect):
     """u and v are whole multiples of a step."""
 
@@ -154,7 +151,6 @@ class QuantisationEffect(NoiseEffect):
         return np.asarray(np.round(uv / values[0]) * values[0])
 
 
-@dataclass(frozen=True)
 class NoiseVsAngleEffect(NoiseEffect):
     """sigma(theta) = sigma(0) exp(growth theta^2)."""
 

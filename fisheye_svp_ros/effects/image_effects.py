@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, PlaneEffect, Scene
 from fisheye_svp_ros.optics.lens import Lens
 
 
-@dataclass(frozen=True)
 class FocalLengthEffect(PlaneEffect):
     """A relative change of the focal length."""
 
@@ -34,7 +33,6 @@ class FocalLengthEffect(PlaneEffect):
         return values
 
 
-@dataclass(frozen=True)
 class PrincipalPointEffect(Effect):
     """A shift of the whole image."""
 
@@ -54,7 +52,6 @@ class PrincipalPointEffect(Effect):
         return replace(lens, cx=lens.cx + float(values[0]), cy=lens.cy + float(values[1]))
 
 
-@dataclass(frozen=True)
 class AspectEffect(PlaneEffect):
     """A relative difference between fx and fy, their mean kept."""
 
@@ -77,7 +74,6 @@ class AspectEffect(PlaneEffect):
         return values
 
 
-@dataclass(frozen=True)
 class SkewEffect(PlaneEffect):
     """A shear: u grows with v."""
 
@@ -97,7 +93,6 @@ class SkewEffect(PlaneEffect):
         return column
 
 
-@dataclass(frozen=True)
 class DecenteringEffect(PlaneEffect):
     """Brown and Conrady p1, p2, in image points over the focal length."""
 
@@ -119,7 +114,6 @@ class DecenteringEffect(PlaneEffect):
         return np.stack([p1, p2], axis=-1)
 
 
-@dataclass(frozen=True)
 class SensorTiltEffect(PlaneEffect):
     """Tilts about the image axes; first order, with the focal length as the image distance."""
 

@@ -11,7 +11,6 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, require_cameras, require_motion
 
 
-@dataclass(frozen=True)
 class RollingShutterEffect(Effect):
     """The read-out time from the first row to the last; motion from neighbors without a pause."""
 
@@ -44,7 +43,6 @@ class RollingShutterEffect(Effect):
         return values * rows
 
 
-@dataclass(frozen=True)
 class StereoTimeOffsetEffect(Effect):
     """A delay of every camera but the first; motion from the neighboring frames."""
 

@@ -64,7 +64,6 @@ class ViewpointShiftEffect(Effect):
         return lens.with_shift(Gennery(0.0, *map(float, values)))
 
 
-@dataclass(frozen=True)
 class PupilDecenteringEffect(PupilEffect):
     """The entrance pupil moves sideways: by e0_x, e0_y times the angle's part of a Gennery shift.
 
