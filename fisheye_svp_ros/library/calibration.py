@@ -219,7 +219,9 @@ def _camera(
 
     hand_eye = fit.hand_eye
     if options.poses and result is not fit.result:
-        result, hand_eye = calibrate_hand_eye(result, fit.rows, dict(options.poses), ())
+        result, hand_eye = calibrate_hand_eye(
+            result, fit.rows, dict(options.poses), trusted.covariance
+        )
     lens = with_covariance(result.adjusted.lens, trusted)
     return CalibratedCamera(lens, result, trusted, fit.rows, hand_eye, fit.outliers)
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.mixed_model import pseudo_inverse
 from fisheye_svp_ros.pose import (
     Pose,
     cross_matrix,
@@ -27,7 +28,7 @@ from fisheye_svp_ros.pose import (
     nearest_rotation,
     quaternion_from_rotation,
 )
-from fisheye_svp_ros.solve.bundle_adjustment import Adjustment
+from fisheye_svp_ros.solve.bundle_adjustment import Adjustment, adjust_poses
 from fisheye_svp_ros.solve.least_squares import (
     Arrays,
     ArrowEquations,
@@ -194,12 +195,18 @@ def turn_sizes(poses: Pose) -> Array:
 
 
 def fit_hand_eye(
-    data: RigViews, state: RigState, free: Sequence[str], flange: Pose, known: Mask
+    data: RigViews,
+    state: RigState,
+    free: Sequence[str],
+    flange: Pose,
+    known: Mask,
+    lens_covariance: Array | None = None,
 ) -> tuple[RigState, HandEye]:
     """Fit hand-eye transform, noise of the robot, poses, intrinsics and effects together.
 
     state: to start from, fitted to the images; flange (F,): in the base, of the frames where
-    `known` (F,), which have a pose of the robot.
+    `known` (F,), which have a pose of the robot; lens_covariance (K, K): of the free intrinsics
+    in the state, where more than the noise of the images makes their errors.
     Raises GeometryError where the poses do not determine the transform, or fit none.
     """
     linear = Linearization(data, state, free)
@@ -210,8 +217,11 @@ def fit_hand_eye(
     )
     start, robot, noise, odds = _likelier_arrangement(state.pose, flange, known, sigma)
     _check_noise(noise, state.pose.take(known), odds)
+    lens = None
+    if lens_covariance is not None:
+        lens = _LensKnowledge.instead_of_images(data, state, free, lens_covariance / sigma**2)
     for _ in range(_ROUNDS):
-        problem = _HandEyeAdjustment(data, state, free, robot, noise)
+        problem = _HandEyeAdjustment(data, state, free, robot, noise, lens)
         found = levenberg_marquardt(problem, problem.pack_all(state, start))
         state, start = problem.unpack(found.state), problem.transforms(found.state, 0)
         before, noise = noise, problem.estimate_noise(state, start)
@@ -331,14 +341,55 @@ def _inverse_derivative(pose: Pose) -> Array:
     return change
 
 
+class _LensKnowledge(NamedTuple):
+    """What is to be added to the images' rows, so that they say of a lens what is known of it.
+
+    An image counts each point as noise of its own.  A target or an image field that is off moves
+    many points alike: generalized least squares knows less of the lens, and has it elsewhere.
+    values (K,): the lens; information (K, K), gradient (K,): known minus the images' own.
+    """
+
+    values: Array
+    information: Array
+    gradient: Array
+
+    @classmethod
+    def instead_of_images(
+        cls, data: RigViews, state: RigState, free: Sequence[str], covariance: Array
+    ) -> _LensKnowledge:
+        """Return it for a state that is known with a covariance (K, K), in squares of a row."""
+        state = adjust_poses(data, state)
+        images = Adjustment(data, state, free)
+        normal = images.linearize(images.pack([state]), np.zeros(1, dtype=int))[1]
+        return cls(
+            state.shared_values(free),
+            pseudo_inverse(covariance, 1e-13) - arrow_information(normal)[0],
+            -ArrowEquations(*normal).shared_gradient[0],  # of the poses there is none left
+        )
+
+    def add(self, state: RigState, free: Sequence[str], shared: Array, gradient: Array) -> float:
+        """Add to the normal equations of a state, in place; return what the cost is more."""
+        count = len(self.values)
+        change = state.shared_values(free)[:count] - self.values
+        shared[:count, :count] += self.information
+        gradient[:count] += self.information @ change + self.gradient
+        return float(change @ self.information @ change + 2 * self.gradient @ change)
+
+
 class _HandEyeAdjustment(Adjustment):
     """A bundle adjustment with the robot's poses: their rows, and 13 more shared parameters."""
 
     def __init__(
-        self, data: RigViews, template: RigState, free: Sequence[str], robot: _Robot, noise: Array
+        self,
+        data: RigViews,
+        template: RigState,
+        free: Sequence[str],
+        robot: _Robot,
+        noise: Array,
+        lens: _LensKnowledge | None = None,
     ) -> None:
         super().__init__(data, template, free)
-        self._robot = robot
+        self._robot, self._lens = robot, lens
         self._weight = robot.sigma / np.repeat(noise, 3)
 
     def pack_all(self, state: RigState, transforms: Transforms) -> Arrays:
@@ -418,7 +469,10 @@ class _HandEyeAdjustment(Adjustment):
             np.concatenate([shared_gradient, np.einsum('fmk,fm->k', own, off)]),
         )
         added.shared[-PARAMETERS:, -PARAMETERS:] += np.einsum('fmk,fml->kl', own, own)
-        return cost + (off**2).sum(), tuple(part[None] for part in added)
+        cost = cost + (off**2).sum()
+        if self._lens:
+            cost = cost + self._lens.add(state, self._free, added.shared, added.shared_gradient)
+        return cost, tuple(part[None] for part in added)
 
 
 def flange_poses(data: RigViews, poses: dict[int, Pose]) -> tuple[Pose, Mask]:

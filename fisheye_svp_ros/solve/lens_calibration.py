@@ -126,20 +126,21 @@ def calibrate_hand_eye(
     calibration: Calibration,
     observations: Observations,
     poses: dict[int, Pose],
-    free: Sequence[str] | None = None,
+    covariance: Array | None = None,
 ) -> tuple[Calibration, HandEye]:
     """Fit a calibrated lens anew, together with the robot that carried the camera, or the target.
 
     calibration: of the observations without poses; poses: of the flange, by frame; a
-    frame may have none; free: parameters of the lens to fit, those of the calibration by default.
+    frame may have none; covariance (K, K): of the parameters of the calibration, where these are
+    not those of least squares.
     Raises ObservationError where these do not determine the hand-eye transform, or fit none.
     """
     adjusted, views = calibration.adjusted, calibration.views
     data = replace(RigViews.of_one_camera(views), table=observations)
     state = RigState(adjusted.pose, identity(1), adjusted.lens, (), corrected=True)
-    names = adjusted.names if free is None else tuple(free)
+    names = adjusted.names
     try:
-        state, hand_eye = fit_hand_eye(data, state, names, *flange_poses(data, poses))
+        state, hand_eye = fit_hand_eye(data, state, names, *flange_poses(data, poses), covariance)
     except GeometryError as cause:
         raise ObservationError(
             f'{observations.source}: the given poses are not those of a flange '

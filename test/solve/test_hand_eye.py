@@ -10,9 +10,11 @@ from helpers.differences import jacobian
 from helpers.robot import LENS, TRUTH, robot
 
 from fisheye_svp_ros.errors import GeometryError, ObservationError
+from fisheye_svp_ros.library.calibration import LensOptions, calibrate_cameras
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.reporting.calibrated_camera import hand_eye_rows
 from fisheye_svp_ros.reporting.wording.calibration import hand_eye_sentence, hand_eye_warnings
+from fisheye_svp_ros.solve.bundle_adjustment import Adjustment, adjust
 from fisheye_svp_ros.solve.hand_eye import (
     MAX_ODDS,
     HandEye,
@@ -23,8 +25,10 @@ from fisheye_svp_ros.solve.hand_eye import (
     flange_poses,
     solve_hand_eye,
 )
+from fisheye_svp_ros.solve.least_squares import arrow_information
 from fisheye_svp_ros.solve.lens_calibration import calibrate, calibrate_hand_eye
-from fisheye_svp_ros.solve.rig_state import RigState, group_by_frame
+from fisheye_svp_ros.solve.reliability import noise_sigma
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, group_by_frame
 
 pytestmark = pytest.mark.usefixtures('undrawn')
 
@@ -198,3 +202,49 @@ def test_noise_that_no_robot_has_is_refused(fixed_camera: bool) -> None:
 def test_poses_that_show_no_arrangement_are_refused() -> None:
     with pytest.raises(GeometryError, match='whether camera or target is on the flange'):
         _check_noise(np.array([1e-3, 1e-3]), robot(1)[1], 3.0)
+
+
+def hand_eye_of(free: tuple[str, ...], covariance: np.ndarray | None) -> HandEye:
+    """Fit from what least squares makes of the images alone; the lens known by a covariance."""
+    table, camera, poses = robot(8, noise=(1e-4, 2e-4))
+    data = group_by_frame(table)
+    state = adjust(data, RigState(camera, identity(1), LENS, ()), ('f', 'cx', 'cy'))
+    return fit_hand_eye(data, state, free, *flange_poses(data, poses), covariance)[1]
+
+
+def assert_same(one: HandEye, other: HandEye, rtol: float) -> None:
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=rtol, atol=1e-13)
+    assert (np.abs(one.camera.difference(other.camera)) < 0.01 * one.stderr[:6]).all()
+
+
+def test_a_lens_known_as_the_images_know_it_changes_nothing() -> None:
+    free = ('f', 'cx', 'cy')
+    table, camera, _ = robot(8, noise=(1e-4, 2e-4))
+    data = group_by_frame(table)
+    state = adjust(data, RigState(camera, identity(1), LENS, ()), free)
+    problem = Adjustment(data, state, free)
+    normal = problem.linearize(problem.pack([state]), np.zeros(1, dtype=int))[1]
+    sigma = noise_sigma(
+        Linearization(data, state, ()).sum_of_squares,
+        2 * len(table),
+        6 * data.frames + len(free),
+    )
+    covariance = sigma**2 * np.linalg.inv(arrow_information(normal)[0])
+    assert_same(hand_eye_of(free, covariance), hand_eye_of(free, None), 1e-3)
+    # Known exactly, it is held; known less, the transforms are known less.
+    assert_same(hand_eye_of(free, 1e-8 * covariance), hand_eye_of((), None), 0.02)
+    loose, plain = hand_eye_of(free, 25 * covariance), hand_eye_of(free, None)
+    assert (loose.stderr > plain.stderr).all() and loose.stderr[3] > 1.1 * plain.stderr[3]
+
+
+def test_transforms_of_a_robot_before_a_bent_board_hold_their_errors() -> None:
+    """The lens is known less well than noise alone says, and so are the transforms."""
+    z = []
+    for seed in range(6):
+        table, _, poses = robot(seed, frames=12, noise=(2e-4, 5e-4))
+        across = 2 * (table.xyz[:, 0] - table.xyz[:, 0].mean()) / np.ptp(table.xyz[:, 0])
+        said = table.xyz + (5e-4 * (across**2 - 1 / 3))[:, None] * [0.0, 0.0, 1.0]
+        options = LensOptions(poses=poses)
+        found = calibrate_cameras(replace(table, xyz=said), {'': (1280, 960)}, options)
+        z.append(errors(found.cameras[''].hand_eye) / found.cameras[''].hand_eye.stderr)
+    assert np.sqrt(np.square(z).mean()) < 1.4
