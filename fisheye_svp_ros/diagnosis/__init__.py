@@ -58,6 +58,7 @@ from fisheye_svp_ros.diagnosis.findings import (
     status_of,
 )
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
+from fisheye_svp_ros.diagnosis.lens_evidence import map_lens_rays
 from fisheye_svp_ros.diagnosis.model_errors import (
     ErrorParts,
     LensErrors,
@@ -122,6 +123,7 @@ __all__ = [
     'diagnose',
     'diagnose_against',
     'frames_of',
+    'map_lens_rays',
     'noise_px',
     'pose_maps',
     'pose_summary',

@@ -35,7 +35,9 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.ray_errors import (
     RANGES,
     RayError,
+    RayMap,
     RayModel,
+    map_rays,
     points_on_rays,
     ray_model,
     typical_points,
@@ -241,6 +243,39 @@ def find_lens_rays(
     return errors, least_likely_offset(offsets)
 
 
+def map_lens_rays(evaluation: Evaluation) -> dict[str, RayMap]:
+    """Return how well the rays of each lens that is written are known, over its image.
+
+    Of those lenses of which something is fitted.
+    """
+    if evaluation.medium is not None:
+        return {}
+    quick = evaluation.problem.options.quick
+    known = LensCovariance.from_model(
+        evaluation.null, evaluation.averaged_model, None if quick else evaluation.other_models
+    )
+    if not lens_columns(known.linear).any():
+        return {}
+    views, lenses = known.linear.data.views, evaluation.problem.inputs.lenses
+    maps = {}
+    for number, (name, lens) in enumerate(lenses.items()):
+
+        def rays_of(
+            uv: Array,
+            ranges: tuple[float, ...],
+            datum: int,
+            number: int = number,
+            name: str = name,
+        ) -> tuple[RayModel, Mask]:
+            return _written_rays(evaluation, known, number, name, uv, ranges, datum)
+
+        mine = views.used & ((views.camera == number) | (len(lenses) == 1))[:, None]
+        found = map_rays(rays_of, views.uv[mine], (lens.width, lens.height))
+        if np.nanmax(found.sd, initial=0.0) > 0:
+            maps[name] = found
+    return maps
+
+
 def _generalized_state(null: NullModel) -> RigState:
     """Return the state that generalized least squares finds: nearly what `calibrate` writes."""
     own, linear = null.included_columns, null.linear
@@ -272,6 +307,7 @@ def _written_rays(
     name: str,
     uv: Array,
     ranges: tuple[float, ...] = RANGES,
+    datum: int | None = None,
 ) -> tuple[RayModel, Mask]:
     """Return the rays of the lens of a camera that is written, and which points (G,) have some."""
     linear, written = known.linear, evaluation.written_field
@@ -285,7 +321,7 @@ def _written_rays(
 
     covariance = known.covariance[np.ix_(of_lens, of_lens)]
     model, there = ray_model(
-        extend_lens, covariance, uv, ranges, known.others[of_lens], known.freedom
+        extend_lens, covariance, uv, ranges, known.others[of_lens], known.freedom, datum
     )
     field = None if written is None else written.fields.get(camera)
     if field is None:

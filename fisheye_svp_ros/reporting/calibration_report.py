@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.reporting.blocks import page, png_uri
 from fisheye_svp_ros.reporting.calibrated_camera import CalibratedCamera
 from fisheye_svp_ros.reporting.diagnosis_plots import draw_arrows
-from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, drawing
+from fisheye_svp_ros.reporting.plots import NARROW, OURS, PUBLISHED, drawing, panels
+from fisheye_svp_ros.reporting.ray_plots import draw_ray_map
 from fisheye_svp_ros.reporting.terminal import draw_or_note
 from fisheye_svp_ros.reporting.wording.calibration import (
     ANY_TARGET,
@@ -25,7 +26,14 @@ from fisheye_svp_ros.reporting.wording.calibration import (
     estimate_sentence,
 )
 from fisheye_svp_ros.scene.observations import frame_name
-from fisheye_svp_ros.solve.ray_errors import RANGES, RayModel, ray_model, typical_points
+from fisheye_svp_ros.solve.ray_errors import (
+    RANGES,
+    RayMap,
+    RayModel,
+    map_rays,
+    ray_model,
+    typical_points,
+)
 
 _WIDTH = 9.2  # in
 _ARROWS, _TICKS = 2500, 60
@@ -53,7 +61,7 @@ def write_calibration_report(
 
 
 def _camera(name: str, camera: CalibratedCamera) -> dict[str, Any]:
-    rays = _rays(camera)
+    rays, ray_map = _rays(camera)
     figures = camera.lens.calibration or {}
     return {
         'name': name,
@@ -71,38 +79,50 @@ def _camera(name: str, camera: CalibratedCamera) -> dict[str, Any]:
         'reached': float(np.degrees(camera.result.reached)),
         'errors': [
             (f'{e.range_m:g}', f'{1e3 * e.value:.2g}', f'{1e3 * e.low:.2g}', f'{1e3 * e.high:.2g}')
-            for e in rays[1].errors()
+            for e in rays.errors()
         ],
-        'coverage': _drawn('coverage', _coverage, camera),
-        'residuals': _drawn('residuals', _residuals, camera),
-        'frames_picture': _drawn('residuals by frame', _frames, camera),
-        'uncertainty': _drawn('uncertainty', _uncertainty, camera, *rays),
+        'coverage': _drawn('coverage', 2, _coverage, camera),
+        'residuals': _drawn('residuals', 2, _residuals, camera),
+        'frames_picture': _drawn('residuals by frame', 1, _frames, camera),
+        'uncertainty': _drawn('uncertainty', 2, _uncertainty, ray_map),
     }
 
 
-def _rays(camera: CalibratedCamera) -> tuple[Array, RayModel]:
-    """Return image points (G, 2) and how the fitted parameters move their rays."""
+def _rays(camera: CalibratedCamera) -> tuple[RayModel, RayMap]:
+    """Return how the fitted parameters move the rays of image points, and of the whole image."""
     names = camera.result.adjusted.names
     values = parameter_values(camera.lens, names)
 
     def perturb_lens(step: Array) -> Lens:
         return camera.lens.with_parameters(names, [*np.add(values, step).tolist()])
 
+    def rays_of(
+        uv: Array, ranges: tuple[float, ...] = RANGES, datum: int | None = None
+    ) -> tuple[RayModel, Mask]:
+        return ray_model(perturb_lens, camera.trust.covariance, uv, ranges, datum=datum)
+
     views = camera.result.views
-    uv = typical_points(views.uv[views.used])
-    model, there = ray_model(perturb_lens, camera.trust.covariance, uv)
-    return uv[there], model
+    uv = views.uv[views.used]
+    model, _ = rays_of(typical_points(uv))
+    return model, map_rays(rays_of, uv, (camera.lens.width, camera.lens.height))
 
 
-def _drawn(name: str, draw: Any, *arguments: Any) -> str:
-    """Return a picture as part of the page, '' where it cannot be drawn."""
-    drawn = BytesIO()
+def _drawn(name: str, count: int, draw: Any, *arguments: Any) -> tuple[str, str]:
+    """Return a picture as part of the page, wide and narrow; '' where it cannot be drawn.
 
-    def draw_figure(_: Path) -> None:
-        with drawing(drawn, _WIDTH, 3.6) as figure:
-            draw(figure, *arguments)
+    count: of its panels; draw: takes a figure, the arguments, and whether the figure is narrow.
+    """
+    wide, narrow = BytesIO(), BytesIO()
 
-    return png_uri(drawn.getvalue()) if draw_or_note(Path(name), draw_figure) else ''
+    def draw_figures(_: Path) -> None:
+        with drawing(wide, _WIDTH, 3.6) as figure:
+            draw(figure, *arguments, False)
+        with drawing(narrow, NARROW, 3.3 * count) as figure:
+            draw(figure, *arguments, True)
+
+    if not draw_or_note(Path(name), draw_figures):
+        return '', ''
+    return png_uri(wide.getvalue()), png_uri(narrow.getvalue())
 
 
 def _image(axis: Any, lens: Lens) -> None:
@@ -115,8 +135,8 @@ def _image(axis: Any, lens: Lens) -> None:
     )
 
 
-def _coverage(figure: Any, camera: CalibratedCamera) -> None:
-    image, field = figure.subplots(1, 2)
+def _coverage(figure: Any, camera: CalibratedCamera, narrow: bool) -> None:
+    image, field = panels(figure, 1, narrow)[0]
     views = camera.result.views
     image.plot(*views.uv[views.used].T, '.', color=OURS, ms=2)
     _image(image, camera.lens)
@@ -134,8 +154,8 @@ def _coverage(figure: Any, camera: CalibratedCamera) -> None:
     )
 
 
-def _residuals(figure: Any, camera: CalibratedCamera) -> None:
-    image, angles = figure.subplots(1, 2)
+def _residuals(figure: Any, camera: CalibratedCamera, narrow: bool) -> None:
+    image, angles = panels(figure, 1, narrow)[0]
     views, lens = camera.result.views, camera.lens
     uv, residual = views.uv[views.used], camera.result.adjusted.residual[views.used]
     step = max(1, len(uv) // _ARROWS)
@@ -143,7 +163,7 @@ def _residuals(figure: Any, camera: CalibratedCamera) -> None:
     typical = max(float(np.quantile(size, 0.9)), 1e-9)
     draw_arrows(image, uv[::step], residual[::step], typical, _ARROW_LENGTH * lens.width, OURS)
     _image(image, lens)
-    image.set_title('residuals', loc='left')  # and room for the key to their scale
+    image.set_title('residuals')
     arm = uv - (lens.cx, lens.cy)
     radial = (residual * arm).sum(axis=1) / np.maximum(np.linalg.norm(arm, axis=1), 1e-9)
     points = camera.result.adjusted.pose.into_body(views.points)[views.used]
@@ -162,33 +182,27 @@ def _residuals(figure: Any, camera: CalibratedCamera) -> None:
     angles.legend(loc='upper right')
 
 
-def _frames(figure: Any, camera: CalibratedCamera) -> None:
+def _frames(figure: Any, camera: CalibratedCamera, narrow: bool) -> None:
     axis, views = figure.subplots(), camera.result.views
     squares = np.where(views.used, (camera.result.adjusted.residual**2).sum(axis=-1), 0.0)
     rms = np.sqrt(squares.sum(axis=1) / views.used.sum(axis=1))
     place = np.arange(len(rms))
     axis.bar(place, rms, color=OURS)
     axis.axhline(float(np.median(rms)), color=PUBLISHED, lw=1, label='median')
-    step = -(-len(rms) // _TICKS)
+    step = -(-len(rms) // (_TICKS // 2 if narrow else _TICKS))
     names = [
         frame_name(camera.table, frame).removeprefix('frame ')
         for frame in views.frame[::step].tolist()
     ]
     axis.set_xticks(place[::step], names, rotation=90, fontsize=7)
-    axis.set(ylabel='rms residual / px', xlabel='' if camera.table.photographs else 'frame')
+    highest = 1.15 * float(rms.max())  # room for the legend
+    axis.set(
+        ylabel='rms residual / px',
+        xlabel='' if camera.table.photographs else 'frame',
+        ylim=(0, highest or None),
+    )
     axis.legend(loc='upper right')
 
 
-def _uncertainty(figure: Any, camera: CalibratedCamera, uv: Array, rays: RayModel) -> None:
-    image, angles = figure.subplots(1, 2)
-    shown = image.scatter(*uv.T, c=1e3 * rays.sd[-1], s=9, cmap='viridis')
-    figure.colorbar(shown, ax=image, label=f'standard error at {RANGES[-1]:g} m / mrad')
-    _image(image, camera.lens)
-    axis = rays.points[-1] / np.linalg.norm(rays.points[-1], axis=-1, keepdims=True)
-    theta = np.degrees(np.arccos(np.clip(axis[:, 2], -1, 1)))
-    for sd, range_m, color in zip(rays.sd, RANGES, (PUBLISHED, FAINT, OURS), strict=True):
-        angles.plot(theta, 1e3 * sd, '.', ms=3, color=color, label=f'at {range_m:g} m')
-    angles.set(
-        xlabel='incidence angle / deg', ylabel='standard error of a ray / mrad', ylim=(0, None)
-    )
-    angles.legend()
+def _uncertainty(figure: Any, rays: RayMap, narrow: bool) -> None:
+    draw_ray_map(figure, panels(figure, 1, narrow)[0], rays)

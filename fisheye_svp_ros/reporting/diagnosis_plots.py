@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from scipy import special
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis import Evaluation
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.reporting.plots import picture, round_number
+from fisheye_svp_ros.reporting.plots import NARROW, panels, picture, round_number
 from fisheye_svp_ros.scene.observations import Observations, frame_name
 from fisheye_svp_ros.solve.measured_poses import rms_px
 
@@ -27,8 +28,10 @@ _ARROWS = 2500
 _TICKS = 60  # names along an axis
 _LEGEND = 0.25  # in, height
 _CELLS = 18  # of the mean field, along the image
+_KEY = (0.72, 0.905, 0.27, 0.085)  # of arrows, inside the axes: left, bottom, width, height
 
 
+File = Path | BytesIO
 Picture = tuple[str, Callable[..., None], tuple[Any, ...]]
 
 
@@ -103,17 +106,19 @@ class PlotData(NamedTuple):
         return PointResiduals._make(array[mine] for array in self.points)
 
 
-def draw_field(path: Path, shown: PlotData) -> None:
+def draw_field(file: File, shown: PlotData, narrow: bool = False) -> None:
     """Residual vectors over the image: of single points, and means over cells of the image."""
     lenses = list(shown.lenses.items())
     sides = [lens.height / lens.width for _, lens in lenses for _ in range(2)]
-    with picture(path, _WIDTH, 1.1 * len(lenses) + (_WIDTH - 1) / 2 * sum(sides)) as figure:
-        axes = figure.subplots(len(sides), 2, squeeze=False, height_ratios=sides)
+    width, columns = (NARROW, 1) if narrow else (_WIDTH, 2)
+    height = (width - 1) / columns * sum(sides) * (2 / columns) + 0.55 * len(sides) * 2 / columns
+    with picture(file, width, height) as figure:
+        axes = panels(figure, len(sides), narrow, sides)
         for camera, (name, lens) in enumerate(lenses):
-            _draw_field(axes[2 * camera :][:2], shown.of_camera(camera), name, lens)
+            _draw_field(axes[2 * camera :][:2], shown.of_camera(camera), name, lens, narrow)
 
 
-def _draw_field(axes: Any, points: PointResiduals, name: str, lens: Lens) -> None:
+def _draw_field(axes: Any, points: PointResiduals, name: str, lens: Lens, narrow: bool) -> None:
     """Draw what one camera saw: single points above, means below, before and after."""
     cell, step = lens.width / _CELLS, max(1, len(points.uv) // _ARROWS)
     fields = [
@@ -125,35 +130,40 @@ def _draw_field(axes: Any, points: PointResiduals, name: str, lens: Lens) -> Non
         for axis, field, (_, color) in zip(row, fields, _SIDES, strict=True):
             draw_image_frame(axis, lens)
             draw_arrows(axis, *field[kind], typical, cell, color)
-            axis.label_outer()
+            if not narrow:
+                axis.label_outer()
     for axis, (side, color) in zip(axes[0], _SIDES, strict=True):
         rms = rms_px(getattr(points, side))
         axis.set_title(f'{name} {side}: {rms:.3f} px rms'.strip(), color=color)
-    axes[0, 0].set_ylabel('single points\nv / px')
-    axes[1, 0].set_ylabel(f'means over {cell:.0f} px\nv / px')
-    for axis in axes[1]:
+    for row, what in zip(axes, ('single points', f'means over {cell:.0f} px'), strict=True):
+        for axis in row if narrow else row[:1]:
+            axis.set_ylabel(f'{what}\nv / px')
+    for axis in axes[1, 1:] if narrow else axes[1]:
         axis.tick_params(labelbottom=True)
         axis.set_xlabel('u / px')
 
 
-def draw_against(path: Path, shown: PlotData, x: Array, label: str, log: bool = False) -> None:
+def draw_against(
+    file: File, shown: PlotData, x: Array, label: str, log: bool = False, narrow: bool = False
+) -> None:
     """Radial and tangential residuals against a variable (K,), with binned means."""
     rows = [('radial / px', 0), ('tangential / px', 1)]
     polar = {side: _polar(shown, getattr(shown.points, side)) for side, _ in _SIDES}
     _grid(
-        path,
+        file,
         shown,
         [(name, x, {side: values[:, i] for side, values in polar.items()}) for name, i in rows],
         label,
         log,
+        narrow,
     )
 
 
-def draw_phase(path: Path, shown: PlotData) -> None:
+def draw_phase(file: File, shown: PlotData, narrow: bool = False) -> None:
     """Residuals of u and v against the place of u and v within its pixel."""
     phase = np.mod(shown.points.uv + 0.5, 1.0) - 0.5
     _grid(
-        path,
+        file,
         shown,
         [
             (
@@ -165,48 +175,55 @@ def draw_phase(path: Path, shown: PlotData) -> None:
         ],
         'fractional part of u (above) and v (below) / px',
         False,
+        narrow,
     )
 
 
-def draw_histogram(path: Path, shown: PlotData) -> None:
+def draw_histogram(file: File, shown: PlotData, narrow: bool = False) -> None:
     """Residuals of both coordinates over the noise, beside the normal distribution."""
     bins = np.linspace(-6, 6, 73)
     middle = (bins[:-1] + bins[1:]) / 2
-    with picture(path, _WIDTH, 3.0, tight=True) as figure:
-        axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    size = (NARROW, 5.0) if narrow else (_WIDTH, 3.0)
+    with picture(file, *size, tight=True) as figure:
+        axes = panels(figure, 1, narrow)[0]
         for axis, (side, color) in zip(axes, _SIDES, strict=True):
             z = getattr(shown.points, side).ravel() / shown.noise
             expected = z.size * np.diff(bins)[0] * np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi)
             axis.hist(np.clip(z, -6, 6), bins, color=color, alpha=0.55, label='u and v')
             axis.plot(middle, expected, color=INK, lw=1.4, label='noise alone')
-            axis.set(yscale='log', ylim=(0.5, None), xlabel='residual / noise')
+            axis.set(yscale='log', xlabel='residual / noise', ylabel='image coordinates')
             axis.set_title(side, color=color)
             axis.minorticks_off()
             axis.legend(loc='upper right')
-        axes[0].set_ylabel('image coordinates')
+        highest = max(axis.get_ylim()[1] for axis in axes)
+        for axis in axes:
+            axis.set_ylim(0.5, highest)
+            axis.label_outer()
 
 
 def _grid(
-    path: Path,
+    file: File,
     shown: PlotData,
     rows: list[tuple[str, Array, dict[str, Array]]],
     label: str,
     log: bool,
+    narrow: bool,
 ) -> None:
-    with picture(path, _WIDTH, 4.4, tight=True) as figure:
-        axes = figure.subplots(2, 2, sharex=True, sharey='row')
-        for row, (name, x, values) in zip(axes, rows, strict=True):
+    size = (NARROW, 8.0) if narrow else (_WIDTH, 4.4)
+    with picture(file, *size, tight=True) as figure:
+        axes = panels(figure, 2, narrow)
+        for number, (row, (name, x, values)) in enumerate(zip(axes, rows, strict=True)):
             highest = 2.2 * shown.noise
             for axis, (side, color) in zip(row, _SIDES, strict=True):
                 highest = max(highest, _plot_bins(axis, x, values[side], shown.noise, color))
-            row[0].set(ylabel=name, ylim=(-1.2 * highest, 1.2 * highest))
-        for axis, (side, color) in zip(axes[0], _SIDES, strict=True):
-            axis.set_title(side, color=color)
-        for axis in axes[1]:
-            axis.set_xlabel(label)
-            if log:
-                axis.set_xscale('log')
-        _legend(figure, axes[0, 1])
+            for axis, (side, color) in zip(row, _SIDES, strict=True):
+                axis.set(ylabel=name, xlabel=label, ylim=(-1.2 * highest, 1.2 * highest))
+                if log:
+                    axis.set_xscale('log')
+                if narrow or number == 0:
+                    axis.set_title(side, color=color)
+                axis.label_outer()
+        _legend(figure, axes[0, 1], narrow)
 
 
 def _plot_bins(axis: Axes, x: Array, y: Array, noise: float, color: str) -> float:
@@ -257,21 +274,23 @@ def _plot_bins(axis: Axes, x: Array, y: Array, noise: float, color: str) -> floa
     return float((np.abs(mean) + error).max())
 
 
-def _legend(figure: Figure, axis: Axes) -> None:
+def _legend(figure: Figure, axis: Axes, narrow: bool) -> None:
     """Put the legend of an axis above all of them."""
-    layout: Any = figure.get_layout_engine()
-    layout.set(above=_LEGEND)
     handles, labels = axis.get_legend_handles_labels()
-    figure.legend(handles, labels, loc='upper right', ncols=len(labels), fontsize=8)
+    layout: Any = figure.get_layout_engine()
+    layout.set(above=_LEGEND * (len(labels) if narrow else 1))
+    columns = 1 if narrow else len(labels)
+    figure.legend(handles, labels, loc='upper right', ncols=columns, fontsize=8)
 
 
 def draw_groups(
-    path: Path,
+    file: File,
     shown: PlotData,
     group: Index,
     x: Array | None,
     label: str,
     ticks: Sequence[str] = (),
+    narrow: bool = False,
 ) -> None:
     """Rms of the residuals of each group (K,), or over a variable (K,); ticks: their names."""
     names, label_of, count = np.unique(group, return_inverse=True, return_counts=True)
@@ -280,7 +299,8 @@ def draw_groups(
     low, high = (
         np.sqrt(special.chdtri(2 * count, 1 - p) / count) * shown.noise for p in (0.025, 0.975)
     )
-    with picture(path, _WIDTH, 3.6 if ticks else 2.8, tight=True) as figure:
+    width = NARROW if narrow else _WIDTH
+    with picture(file, width, 3.6 if ticks or narrow else 2.8, tight=True) as figure:
         axis = figure.subplots()
         axis.fill_between(
             place[order],
@@ -306,9 +326,11 @@ def draw_groups(
             )
         axis.set(xlabel=label, ylabel='rms residual / px', ylim=(0, None))
         if ticks:
-            step = -(-len(ticks) // _TICKS)
+            step = -(-len(ticks) // int(_TICKS * width / _WIDTH))
             axis.set_xticks(range(0, len(ticks), step), ticks[::step], rotation=90, fontsize=7)
-        _legend(figure, axis)
+        elif x is None:
+            axis.xaxis.get_major_locator().set_params(integer=True)
+        _legend(figure, axis, narrow)
 
 
 def draw_image_frame(axis: Axes, lens: Lens) -> None:
@@ -332,7 +354,7 @@ def draw_arrows(
     axis: Axes, uv: Array, residual: Array, typical: float, cell: float, color: str
 ) -> None:
     """Draw residuals, the typical one (px) as long as a cell, and the key to their scale."""
-    key = axis.quiver(
+    arrows = axis.quiver(
         *uv.T,
         *residual.T,
         angles='xy',
@@ -343,7 +365,20 @@ def draw_arrows(
         width=0.0018,
     )
     length = round_number(typical)
-    axis.quiverkey(key, 0.85, 1.03, length, f'{length:g} px', labelpos='E', color=INK)
+    x, y, width, height = _KEY
+    axis.add_patch(
+        Rectangle((x, y), width, height, transform=axis.transAxes, color='white', zorder=4)
+    )
+    axis.quiverkey(
+        arrows,
+        x + 0.25 * width,
+        y + 0.5 * height,
+        length,
+        f'{length:g} px',
+        labelpos='E',
+        color=INK,
+        zorder=5,
+    )
 
 
 def _cell_means(uv: Array, residual: Array, cell: float) -> tuple[Array, Array]:

@@ -4,18 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from fisheye_svp_ros.diagnosis import NAMED_P, Comparison, Diagnosis, Finding, stage_shares
+from fisheye_svp_ros.diagnosis import (
+    NAMED_P,
+    Comparison,
+    Diagnosis,
+    Finding,
+    map_lens_rays,
+    stage_shares,
+)
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.planning.plan import NextViews
-from fisheye_svp_ros.reporting.blocks import data_uri, page
+from fisheye_svp_ros.reporting.blocks import data_uri, page, png_uri
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
-from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
+from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target
+from fisheye_svp_ros.reporting.ray_plots import draw_uncertainty
 from fisheye_svp_ros.reporting.shot_plots import draw_shots
 from fisheye_svp_ros.reporting.terminal import draw_or_note
 from fisheye_svp_ros.reporting.wording import shots
@@ -74,6 +83,7 @@ _PICTURE_OF = {
 _QUICK_PICTURES = ('field', 'theta', 'range')  # beside those of what remains
 _BAR = 220  # px of a share of 1
 _ROWS = 24
+_STRIPE = 5e-4  # of the variance: what is less is not drawn
 
 
 def write_report(
@@ -87,11 +97,12 @@ def write_report(
     wanted: the photographs to take next, if they were asked for.
     Raises OutputError where one cannot be written.
     """
-    pictures = [
-        inputs.folder / f'{name}.png'
-        for name, draw, arguments in _drawings(diagnosis, wanted)
-        if draw_or_note(inputs.folder / f'{name}.png', draw, *arguments)
-    ]
+    pictures, narrow = [], {}
+    for name, draw, arguments in _drawings(diagnosis, wanted):
+        path, below = inputs.folder / f'{name}.png', BytesIO()
+        if draw_or_note(path, _draw_both, below, draw, arguments):
+            pictures.append(path)
+            narrow[name] = png_uri(below.getvalue())
     drawn = {p.stem: data_uri(p) for p in pictures}
     report = inputs.folder / 'report.html'
     write_text(
@@ -110,6 +121,7 @@ def write_report(
             tone=tone(diagnosis),
             sentences=verdict_sentences(diagnosis, known),
             pictures={**dict.fromkeys(('target', 'evidence', 'next', 'uncertainty')), **drawn},
+            narrow=narrow,
             shown=[(name, text) for name, text in CAPTIONS.items() if name in drawn],
             **_causes(diagnosis),
             **_budget(diagnosis),
@@ -136,6 +148,14 @@ def write_report(
     return [report, *pictures]
 
 
+def _draw_both(
+    path: Path, below: BytesIO, draw: Callable[..., None], arguments: Sequence[Any]
+) -> None:
+    """Draw a picture into a file, and its panels one below the other for a narrow window."""
+    draw(path, *arguments)
+    draw(below, *arguments, narrow=True)
+
+
 def _drawings(
     diagnosis: Diagnosis, wanted: NextViews | None
 ) -> Iterator[tuple[str, Callable[..., None], Sequence[Any]]]:
@@ -150,7 +170,8 @@ def _drawings(
     maps = [] if quick else list(_target_maps(diagnosis))
     if maps:
         yield 'target', draw_target, (maps,)
-    yield 'uncertainty', draw_uncertainty, (diagnosis,)
+    if rays := map_lens_rays(diagnosis.evaluation):
+        yield 'uncertainty', draw_uncertainty, (rays,)
     if wanted is not None:
         state = diagnosis.evaluation.fixed_model.state
         yield 'next', draw_shots, (ForwardModel(state.lens, state.terms), wanted)
@@ -247,6 +268,13 @@ def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
             (stage, STAGE_WORDS[stage], 100 * (share - named), 100 * named, names[stage])
             for stage, (share, named) in shares.items()
         ],
+        'striped': join_names(
+            [
+                cause.effect
+                for cause in diagnosis.causes
+                if shares.get(cause.stage, (0.0, 0.0))[1] > _STRIPE
+            ]
+        ),
         'total_px2': f'{total:.3g}',
         'budget_rows': list(budget_rows(diagnosis)),
         'intrinsics': list(intrinsic_rows(diagnosis)),

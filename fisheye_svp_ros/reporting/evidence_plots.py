@@ -1,37 +1,31 @@
-"""Pictures of the evidence for each cause, of the target, and of how far the lens is trusted."""
+"""Pictures of the evidence for each cause, and of the target."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import Diagnosis
 from fisheye_svp_ros.effects.target_map import BoardMap
-from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK
-from fisheye_svp_ros.reporting.plots import legend_below, picture, round_number
+from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK, File
+from fisheye_svp_ros.reporting.plots import NARROW, legend_below, panels, picture, round_number
 
 _REJECTED_COLOR = '#cbd5e1'
 _OVER_LINES = {'facecolor': 'white', 'edgecolor': 'none', 'pad': 1}  # behind a number
-_CELLS = 24  # over the longer side of the image
-_TITLES = {
-    'noise': 'noise of a point',
-    'parameters': 'parameters of the lens',
-    'misfit': 'unexplained model error',
-}
 
 
-def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
+def draw_evidence(file: File, diagnosis: Diagnosis, narrow: bool = False) -> None:
     """What each step of the search explains, and how well held-out data are predicted after it."""
     steps = [step for step in diagnosis.trace if step.statistic > 0]
     count = max(len(steps), len(diagnosis.causes) + 2)
-    with picture(path, 9.2, 1.6 + 0.3 * count, tight=True) as figure:
-        left, right = figure.subplots(1, 2)
+    height = 1.6 + 0.3 * count
+    size = (NARROW, 2 * height) if narrow else (9.2, height)
+    with picture(file, *size, tight=True) as figure:
+        left, right = panels(figure, 1, narrow)[0]
         left.barh(
             [step.form[:40] for step in steps],
             [step.statistic for step in steps],
@@ -75,11 +69,11 @@ def _plot_heldout_rms(axis: Axes, diagnosis: Diagnosis) -> None:
     axis.margins(x=0.12)
 
 
-def draw_target(path: Path, maps: list[tuple[str, BoardMap]]) -> None:
+def draw_target(file: File, maps: list[tuple[str, BoardMap]], narrow: bool = False) -> None:
     """Height maps of boards with their titles, and the landmarks' slides along them."""
-    columns = min(len(maps), 2)
+    columns = 1 if narrow else min(len(maps), 2)
     rows = math.ceil(len(maps) / columns)
-    with picture(path, 4.8 * columns, 4.3 * rows) as figure:
+    with picture(file, 4.8 * columns, 4.3 * rows) as figure:
         axes = np.ravel(figure.subplots(rows, columns, squeeze=False))
         for axis in axes[len(maps) :]:
             axis.remove()
@@ -119,47 +113,3 @@ def _height_map(figure: Figure, axis: Axes, board: BoardMap) -> None:
     axis.set_aspect('equal')
     axis.grid(visible=False)
     axis.set(xlabel=label, ylabel='y / mm')
-
-
-def draw_uncertainty(path: Path, diagnosis: Diagnosis) -> None:
-    """Draw the standard deviation of a coordinate by noise, parameters and remaining misfit."""
-    linear = diagnosis.evaluation.written_model
-    data, state = linear.data, linear.state
-    parts = diagnosis.evaluation.model_errors.of_points(linear)._asdict()
-    uv = data.blocks(data.views.uv).reshape(-1, 2)
-    through = np.broadcast_to(data.camera_of[:, None, None].astype(float), data.views.uv.shape)
-    camera = data.blocks(through).reshape(-1, 2)[:, 0] * (len(state.lenses) > 1)
-    rows = len(state.lenses)
-    with picture(path, 12.0, 3.6 * rows) as figure:
-        axes = figure.subplots(rows, len(parts), squeeze=False)
-        for i, (label, lens) in enumerate(zip(state.labels, state.lenses, strict=True)):
-            for axis, (name, part) in zip(axes[i], parts.items(), strict=True):
-                square = np.where(camera == i, part.reshape(-1, 2).mean(axis=-1), np.nan)
-                image = np.sqrt(_cells(uv, square, (lens.width, lens.height)))
-                shown = axis.imshow(
-                    image,
-                    extent=(-0.5, lens.width - 0.5, lens.height - 0.5, -0.5),
-                    cmap='Blues',
-                    vmin=0.0,
-                    vmax=np.nanmax(image) or 1.0,
-                )
-                figure.colorbar(shown, ax=axis, label='px', shrink=0.8)
-                rms = np.sqrt(np.nanmean(square))
-                title = f'{label} {_TITLES[name]}: {rms:.3g} px'.strip()
-                axis.set_title(title, fontsize=9.5)
-                axis.set(xticks=[], yticks=[])
-                axis.grid(visible=False)
-
-
-def _cells(uv: Array, values: Array, size: tuple[int, int]) -> Array:
-    """Return means of values over square cells of the image; NaN where there are none."""
-    pitch = max(size) / _CELLS
-    known = np.isfinite(values)
-    shape = tuple(int(np.ceil(side / pitch)) for side in reversed(size))
-    row, column = (
-        np.clip((uv[known, i] / pitch).astype(int), 0, shape[1 - i] - 1) for i in (1, 0)
-    )
-    count, total = np.zeros(shape), np.zeros(shape)
-    np.add.at(count, (row, column), 1.0)
-    np.add.at(total, (row, column), values[known])
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

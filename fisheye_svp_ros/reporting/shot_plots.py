@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -32,15 +33,18 @@ _BAND, _LETTER = 0.034, 0.00075  # height of a line over the width of the pictur
 _FRACTION_BITS = 4  # binary places of a pixel that OpenCV draws to
 
 
-def draw_shots(path: Path, model: ForwardModel, wanted: NextViews) -> None:
+def draw_shots(
+    file: Path | BytesIO, model: ForwardModel, wanted: NextViews, narrow: bool = False
+) -> None:
     """Draw each wanted view through the present lens: PNG, or PDF to be printed."""
     board, shots = wanted.board, wanted.shots
     count, first = len(shots.distance), int(np.argmin(board.landmark))
     views = blank_views(board.landmark, board.points, count, board=board.board)
     uv = model.predict(shots.camera, views).uv
-    lines = -(-count // _COLUMNS)
-    with picture(path, _COLUMNS * _PANEL, lines * _PANEL + 0.3) as figure:
-        axes = np.ravel(figure.subplots(lines, _COLUMNS, squeeze=False))
+    columns = 1 if narrow else _COLUMNS
+    lines = -(-count // columns)
+    with picture(file, columns * _PANEL, lines * _PANEL + 0.3) as figure:
+        axes = np.ravel(figure.subplots(lines, columns, squeeze=False))
         for axis in axes[count:]:
             axis.axis('off')
         for i, axis in enumerate(axes[:count]):

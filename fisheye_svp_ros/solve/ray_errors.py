@@ -22,6 +22,7 @@ _STEP = 1e-3  # of a standard error
 SAMPLES = 1000
 _POINTS = 300  # image points that stand for all
 _STEP_PX = 0.01
+_CELLS = 48  # of a map, along the longer side of the image
 
 
 class RayError(NamedTuple):
@@ -57,7 +58,8 @@ class RayModel(NamedTuple):
     parameter moves them by over the range, rad, without what a motion of the camera frame does;
     covariance (K, K) of the parameters; ranges (R,), m; others (K, SAMPLES): by what they may be
     off beside that, drawn, where this is not normal; freedom: degrees of freedom of what the
-    covariance was estimated from (Student's t).
+    covariance was estimated from (Student's t); datum: how many of the points, the first ones,
+    the camera frame is fitted to, None: all.
     """
 
     points: Array
@@ -66,6 +68,7 @@ class RayModel(NamedTuple):
     ranges: tuple[float, ...] = RANGES
     others: Array | None = None
     freedom: float = inf
+    datum: int | None = None
 
     @property
     def sd(self) -> Array:
@@ -124,7 +127,9 @@ class RayModel(NamedTuple):
             axis=-1,
         )
         moves = (slope[..., None, :] * bumps[:, None, :, None]).reshape(*self.points.shape, -1)
-        columns = np.concatenate([self.columns, without_motion(self.points, moves)], axis=-1)
+        columns = np.concatenate(
+            [self.columns, without_motion(self.points, moves, self.datum)], axis=-1
+        )
         return self._replace(
             columns=columns, covariance=np.block([[self.covariance, cross], [cross.T, covariance]])
         )
@@ -159,11 +164,12 @@ def ray_model(
     ranges: tuple[float, ...] = RANGES,
     others: Array | None = None,
     freedom: float = inf,
+    datum: int | None = None,
 ) -> tuple[RayModel, Mask]:
     """Return how parameters move the rays of image points, and which points (G,) have rays.
 
     lens_of: makes a lens of changes (K,) of its parameters; covariance (K, K) of these; uv (G, 2),
-    px; ranges: m; others, freedom: as in `RayModel`.
+    px; ranges: m; others, freedom: as in `RayModel`; datum: of all points (G,), as there.
     """
     count = len(covariance)
     base = points_on_rays(lens_of(np.zeros(count)), uv, ranges)
@@ -187,8 +193,47 @@ def ray_model(
         if sides
         else (np.zeros((*points.shape, 0)))
     )
-    model = RayModel(points, without_motion(points, moves), covariance, ranges, others, freedom)
+    first = None if datum is None else int(there[:datum].sum())
+    columns = without_motion(points, moves, first)
+    model = RayModel(points, columns, covariance, ranges, others, freedom, first)
     return model, np.asarray(there)
+
+
+class RayMap(NamedTuple):
+    """What is known of the rays of a whole image.
+
+    u (C,), v (R,), px: of a grid; sd (N, R, C), rad: rms of what the ray of a pixel may be off at
+    N ranges, NaN where there is none; ranges (N,), m; uv (G, 2), px: image points.
+    """
+
+    u: Array
+    v: Array
+    sd: Array
+    ranges: tuple[float, ...]
+    uv: Array
+
+
+def map_rays(
+    rays_of: Callable[[Array, tuple[float, ...], int], tuple[RayModel, Mask]],
+    uv: Array,
+    size: tuple[int, int],
+) -> RayMap:
+    """Return how well the rays of an image are known, near and far.
+
+    rays_of: makes the model of points, at ranges, with the first ones as `datum`; uv (G, 2), px:
+    the image points, which hold the camera frame; size: width and height, px.
+    """
+    pitch = max(size) / _CELLS
+    u, v = (np.linspace(0.0, side - 1.0, round(side / pitch) + 1) for side in size)
+    grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    typical, ranges = typical_points(uv), (RANGES[0], RANGES[-1])
+    model, there = rays_of(np.concatenate([typical, grid]), ranges, len(typical))
+    of_grid = np.flatnonzero(there[len(typical) :])
+    sd = np.full((len(ranges), len(grid)), np.nan)
+    for at in range(len(ranges)):
+        drawn = model.sample(at)[int(there[: len(typical)].sum()) :]
+        sd[at, of_grid] = np.sqrt((drawn**2).sum(axis=1).mean(axis=-1))
+    return RayMap(u, v, sd.reshape(len(ranges), len(v), len(u)), ranges, uv)
 
 
 def points_on_rays(lens: Lens, uv: Array, ranges: Sequence[float] = RANGES) -> Array:
@@ -205,13 +250,13 @@ def points_at(origin: Array, direction: Array, ranges: Sequence[float] = RANGES)
     return np.asarray(origin + away[..., None] * direction)
 
 
-def without_motion(points: Array, change: Array) -> Array:
+def without_motion(points: Array, change: Array, datum: int | None = None) -> Array:
     """Return changes (R, G, 3, ...), m, of points over their range, rad, without a rigid motion.
 
     Of the components across the rays: along them nothing is seen.  The motion is that of least
-    squares over all ranges together, of the angles.
+    squares over all ranges together, of the angles; datum: as in `RayModel`.
     """
-    return _split_motion(points, change)[1]
+    return _split_motion(points, change, datum)[1]
 
 
 def motion_of(points: Array, change: Array) -> Array:
@@ -219,7 +264,7 @@ def motion_of(points: Array, change: Array) -> Array:
     return _split_motion(points, change)[0]
 
 
-def _split_motion(points: Array, change: Array) -> tuple[Array, Array]:
+def _split_motion(points: Array, change: Array, datum: int | None = None) -> tuple[Array, Array]:
     distance = np.linalg.norm(points, axis=-1, keepdims=True)
     along = (points / distance)[..., None]
 
@@ -228,8 +273,10 @@ def _split_motion(points: Array, change: Array) -> tuple[Array, Array]:
         return np.asarray(angles - along * (along * angles).sum(axis=-2, keepdims=True))
 
     shifts = np.broadcast_to(np.eye(3), (*points.shape, 3))
-    motion = across_rays(np.concatenate([shifts, -cross_matrix(points)], axis=-1)).reshape(-1, 6)
-    angles = across_rays(change.reshape(*points.shape, -1)).reshape(points.size, -1)
-    found = np.asarray(np.linalg.lstsq(motion, angles, rcond=None)[0], dtype=float)
+    motion = across_rays(np.concatenate([shifts, -cross_matrix(points)], axis=-1))
+    angles = across_rays(change.reshape(*points.shape, -1))
+    rows = points[:, :datum].size
+    fixed, moved = (one[:, :datum].reshape(rows, one.shape[-1]) for one in (motion, angles))
+    found = np.asarray(np.linalg.lstsq(fixed, moved, rcond=None)[0], dtype=float)
     left = angles - motion @ found
     return found.reshape(6, *change.shape[3:]), left.reshape(change.shape)

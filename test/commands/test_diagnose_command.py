@@ -39,7 +39,7 @@ from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.reporting import diagnosis_plots, evidence_plots
+from fisheye_svp_ros.reporting import diagnosis_plots, ray_plots
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
 from fisheye_svp_ros.reporting.wording.causes import cause_rows, intrinsic_rows
 from fisheye_svp_ros.reporting.wording.diagnosis import advice_text, verdict_sentences
@@ -48,6 +48,7 @@ from fisheye_svp_ros.reporting.wording.first_screen import wrong as what_is_wron
 from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
+from fisheye_svp_ros.solve.ray_errors import RayMap
 from fisheye_svp_ros.solve.rig_state import Linearization, with_effect
 from fisheye_svp_ros.study.trust import known_errors
 
@@ -641,7 +642,7 @@ def test_each_camera_of_a_rig_has_pictures_of_its_own_image(tmp_path, monkeypatc
         figures.append(Figure((width, height)))
         yield figures[-1]
 
-    for module in (diagnosis_plots, evidence_plots):
+    for module in (diagnosis_plots, ray_plots):
         monkeypatch.setattr(module, 'picture', kept)
     table, _ = seen({})
     step = np.array([LENS.width, 100.0])  # the other image lies beside the first
@@ -675,11 +676,15 @@ def test_each_camera_of_a_rig_has_pictures_of_its_own_image(tmp_path, monkeypatc
         shown, shown.points.uv - (shown.points.camera == 1)[:, None] * step - [LENS.cx, LENS.cy]
     ).T
     assert np.abs(across).max() < 1e-9 and radial.min() > 0
-    evidence_plots.draw_uncertainty(tmp_path / 'uncertainty.png', found)
-    images = [axis.images[0] for axis in figures[-1].axes if axis.images]
-    assert [image.get_extent()[1] for image in images] == (
-        3 * [LENS.width - 0.5] + 3 * [larger.width - 0.5]
-    )
+    maps = {}
+    for name, lens in (('left', LENS), ('right', larger)):
+        u, v = np.linspace(0, lens.width - 1, 9), np.linspace(0, lens.height - 1, 7)
+        maps[name] = RayMap(u, v, np.full((2, 7, 9), 1e-3), (0.3, 5.0), table.uv)
+    ray_plots.draw_uncertainty(tmp_path / 'uncertainty.png', maps)
+    titled = {axis.get_title(): axis.get_xlim()[1] for axis in figures[-1].axes}
+    for name, lens in (('left', LENS), ('right', larger)):
+        for range_m in (0.3, 5):
+            assert titled[f'{name} at {range_m:g} m'] == lens.width - 1
 
 
 def test_the_bow_of_a_board_is_measured_between_its_extremes():

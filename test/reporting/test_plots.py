@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import QuiverKey
 
 from fisheye_svp_ros import reporting
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.reporting.diagnosis_plots import draw_arrows
-from fisheye_svp_ros.reporting.plots import drawing, legend_below
+from fisheye_svp_ros.reporting.plots import NARROW, drawing, legend_below, panels
+from fisheye_svp_ros.reporting.ray_plots import draw_ray_map
+from fisheye_svp_ros.solve.ray_errors import RayMap
 
 TEMPLATES = Path(reporting.__file__).parent / 'templates'
 
@@ -59,18 +63,53 @@ def test_the_key_of_arrows_lies_whole_inside_the_picture(typical: float) -> None
 
 
 @pytest.mark.parametrize('name', ['diagnosis', 'calibration', 'blocks'])
-def test_on_a_telephone_tables_and_pictures_scroll(name: str) -> None:
+def test_on_a_telephone_tables_scroll_and_pictures_are_as_wide_as_it(name: str) -> None:
     """A column was one letter wide, and the text of pictures 3 px high."""
     page = (TEMPLATES / f'{name}.html').read_text()
     narrow = page.partition('@media (max-width: 600px)')[2].partition('\n')[0]
-    assert 'figure { overflow-x: auto; }' in narrow
-    assert 'figure img { max-width: none; width: 760px; }' in narrow
+    if name == 'blocks':  # its pictures have no narrow form
+        assert 'figure { overflow-x: auto; }' in narrow
+        assert 'figure img { max-width: none; width: 760px; }' in narrow
+    else:
+        assert page.count('<img') - page.count('<img alt="{{ photo.name }}"') == page.count(
+            '<source media="(max-width: 600px)"'
+        )
     if 'table { display: block; overflow-x: auto; overflow-wrap: normal; }' in page:
-        assert 'td { min-width: 8em; }' in narrow
+        assert 'td { min-width: 8em; }' in narrow and 'th.n { white-space: normal;' in narrow
     else:
         assert '.wide { overflow-x: auto; }' in page
         assert page.count('<table') == page.count('<div class="wide"><table')
         assert 'overflow-wrap: anywhere' not in page.partition('body {')[2].partition('}')[0]
+
+
+def test_the_two_panels_of_a_row_lie_below_each_other_in_a_narrow_picture() -> None:
+    with drawing(BytesIO(), NARROW, 6.0) as figure:
+        axes = panels(figure, 2, narrow=True, heights=[1.0, 3.0])
+    boxes = [axis.bbox for axis in axes.ravel()]
+    assert axes.shape == (2, 2) and len({round(box.x0) for box in boxes}) == 1
+    assert all(upper.y0 > lower.y1 for upper, lower in pairwise(boxes))
+    assert boxes[3].height == pytest.approx(3 * boxes[0].height, rel=0.1)
+
+
+def uncertain_rays(sd: Array) -> RayMap:
+    u, v = np.linspace(0, 639, 33), np.linspace(0, 479, 25)
+    return RayMap(u, v, sd, (0.3, 5.0), np.random.default_rng(1).uniform(100, 300, (40, 2)))
+
+
+@pytest.mark.parametrize(('low', 'high'), [(1e-5, 1e-5), (2e-4, 0.3), (1e-9, 1.0)])
+def test_a_map_of_rays_shows_the_whole_image_and_its_points(low: float, high: float) -> None:
+    sd = np.geomspace(low, high, 2 * 25 * 33).reshape(2, 25, 33)
+    sd[:, 0, 0] = np.nan  # a corner without rays
+    with drawing(BytesIO(), NARROW, 6.6) as figure:
+        draw_ray_map(figure, panels(figure, 1, narrow=True)[0], uncertain_rays(sd), 'left')
+    near, far, bar = figure.axes
+    for axis, title in ((near, 'left at 0.3 m'), (far, 'left at 5 m')):
+        assert axis.get_title() == title
+        assert axis.get_xlim() == (0, 639) and axis.get_ylim() == (479, 0)
+        assert len(axis.lines[0].get_xdata()) == 40
+    levels = [float(tick.get_text().replace('\u2212', '-')) for tick in bar.get_yticklabels()]
+    assert 2 <= len(levels) <= 9 and levels[0] <= max(1e3 * low, 1e-6)
+    assert all(1.9 < b / a < 2.6 for a, b in pairwise(levels))
 
 
 def test_numbers_between_powers_of_ten_have_room_above_the_label() -> None:

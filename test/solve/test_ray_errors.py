@@ -7,12 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.optics.curves import Equidistant, Gennery
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import rotation_from_vector
 from fisheye_svp_ros.solve.ray_errors import (
     RANGES,
     SAMPLES,
+    RayModel,
+    map_rays,
     points_on_rays,
     ray_model,
     without_motion,
@@ -75,6 +78,34 @@ def test_a_focal_length_off_by_one_percent_costs_a_radial_angle() -> None:
     both = model.errors(off)[-1]
     # Of two standard deviations and a normal deviate: the mean of |2 + z| over that of |z|.
     assert both.value == pytest.approx(2.017 * np.sqrt(np.pi / 2) * error.value, rel=0.07)
+
+
+def test_a_map_shows_the_whole_image_and_holds_the_frame_by_the_image_points() -> None:
+    """A frame held by extrapolated corners would have them good and the middle bad."""
+    near_axis = UV[np.linalg.norm(UV - (640, 480), axis=1) < 250]
+
+    def rays_of(
+        uv: Array, ranges: tuple[float, ...] = RANGES, datum: int | None = None
+    ) -> tuple[RayModel, Mask]:
+        return ray_model(focal, np.array([[16.0]]), uv, ranges, datum=datum)
+
+    found = map_rays(rays_of, near_axis, (1280, 960))
+    assert found.sd.shape == (2, len(found.v), len(found.u)) and found.ranges == (0.3, 5.0)
+    assert (found.u[[0, -1]] == (0, 1279)).all() and (found.v[[0, -1]] == (0, 959)).all()
+    theta = np.hypot(*np.meshgrid(found.u - 640, found.v - 480)) / 400
+    np.testing.assert_array_equal(
+        np.isnan(found.sd), np.broadcast_to(theta > 1.5, (2, *theta.shape))
+    )
+    seen = theta < 1.4
+    np.testing.assert_allclose(found.sd[1][seen], 0.01 * theta[seen], rtol=0.15, atol=3e-4)
+    model, _ = rays_of(near_axis, found.ranges)  # where the points are, as they alone have it
+    column, row = (
+        np.abs(places - near_axis[:, i, None]).argmin(axis=1)
+        for i, places in enumerate((found.u, found.v))
+    )
+    np.testing.assert_allclose(
+        found.sd[:, row, column].max(axis=1), model.sd.max(axis=1), rtol=0.2
+    )
 
 
 def test_what_another_model_says_is_far_off_in_its_share_of_the_draws() -> None:

@@ -1,0 +1,72 @@
+"""Maps of how well the rays of a lens are known, over the whole image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm
+from matplotlib.figure import Figure
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.reporting.diagnosis_plots import INK, File
+from fisheye_svp_ros.reporting.plots import NARROW, panels, picture
+from fisheye_svp_ros.solve.ray_errors import RayMap
+
+_POINTS = 1500  # drawn, at most
+_LEVELS = 9  # of a map, at most
+_COLORS = 'YlGnBu'
+
+
+def draw_uncertainty(file: File, maps: Mapping[str, RayMap], narrow: bool = False) -> None:
+    """Draw the standard error of the rays of each camera (its name, '' for one), near and far."""
+    sides = [len(each.v) / len(each.u) for each in maps.values()]
+    width, columns = (NARROW, 1) if narrow else (9.2, 2)
+    height = (width - 1.0) / columns * sum(sides) * 2 / columns + 0.5 * len(sides) * 2 / columns
+    with picture(file, width, height) as figure:
+        axes = panels(figure, len(maps), narrow, sides)
+        for row, (name, each) in zip(axes, maps.items(), strict=True):
+            draw_ray_map(figure, row, each, name)
+
+
+def draw_ray_map(figure: Figure, axes: Any, rays: RayMap, name: str = '') -> None:
+    """Draw the maps of one camera into an axis for each range, with one scale of colors."""
+    sd = 1e3 * rays.sd
+    levels = _levels(sd)
+    norm = BoundaryNorm(levels, 256, extend='both')
+    for axis, each, range_m in zip(axes, sd, rays.ranges, strict=True):
+        shown = axis.contourf(rays.u, rays.v, each, levels, cmap=_COLORS, norm=norm, extend='both')
+        axis.plot(*_some(rays.uv).T, '.', color=INK, ms=1.0, alpha=0.4)
+        axis.set_title(f'{name} at {range_m:g} m'.strip())
+        _frame(axis, rays)
+    figure.colorbar(
+        shown, ax=[*axes], label='standard error of a ray / mrad', ticks=levels, format='{x:g}'
+    ).ax.minorticks_off()
+
+
+def _some(uv: Array) -> Array:
+    return uv[:: max(1, len(uv) // _POINTS)]
+
+
+def _levels(sd: Array) -> list[float]:
+    """Return 1, 2, 5, 10 ... from what is least on, mrad; what lies beyond them has one color."""
+    low, high = np.nanquantile(sd, (0.02, 0.98))
+    first = np.floor(np.log10(max(low, 1e-6)))
+    steps = [m * 10.0 ** (first + power) for power in range(12) for m in (1, 2, 5)]
+    start = max(i for i, step in enumerate(steps) if step <= max(low, steps[0]))
+    stop = next(i for i, step in enumerate(steps) if step >= high)
+    return steps[start : max(stop, start + 1) + 1][:_LEVELS]
+
+
+def _frame(axis: Axes, rays: RayMap) -> None:
+    """Show the whole image."""
+    axis.set(
+        xlim=(rays.u[0], rays.u[-1]),
+        ylim=(rays.v[-1], rays.v[0]),
+        aspect='equal',
+        xlabel='u / px',
+        ylabel='v / px',
+    )
+    axis.grid(visible=False)
