@@ -18,23 +18,32 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import ExitStack, contextmanager
-from typing import NamedTuple, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.errors import SweepError
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 T = TypeVar('T')
 R = TypeVar('R')
 
 _TASKS_PER_WORKER = 3  # tasks under way for each worker: none waits for the next
-_PATIENCE, _WORKER_PATIENCE = 10, 60  # s for a scheduler to answer, and for its first worker
+_PATIENCE, _WORKER_PATIENCE = 10, 60  # s for a scheduler to answer, and for a worker to come
+_CHECK_INTERVAL = 10  # s without a result after which somebody must still be at work
 
 
 class Workers(NamedTuple):
-    """An executor, and how many tasks to hand to it at once."""
+    """An executor, how many tasks to hand to it at once, and what fails if nobody works on them.
+
+    check_alive: raises SweepError; called where no result has come for some seconds.
+    """
 
     executor: Executor
     ahead: int
+    check_alive: Callable[[], object] = lambda: None
 
 
 def completed_tasks(
@@ -44,7 +53,9 @@ def completed_tasks(
     under_way: dict[Future[R], T] = {}
 
     def results_so_far() -> Iterator[tuple[T, R]]:
-        for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+        while not (done := wait(under_way, _CHECK_INTERVAL, FIRST_COMPLETED).done):
+            workers.check_alive()
+        for future in done:
             yield under_way.pop(future), future.result()
 
     for task in tasks:
@@ -101,23 +112,38 @@ def dask(address: str) -> Iterator[Workers]:
             raise SweepError(f'{address}: no Dask scheduler answers there ({cause})') from cause
         stack.enter_context(_no_logging())  # what it tells of a scheduler that died, one line says
         stack.enter_context(client)
+        count = _wait_for_workers(client, address)
         try:
-            if not client.nthreads():
-                say(f'{address}: no worker yet; waiting up to {_WORKER_PATIENCE} s for one')
-            client.wait_for_workers(1, timeout=_WORKER_PATIENCE)
-            ahead = _TASKS_PER_WORKER * sum(client.nthreads().values())
-        except (OSError, CancelledError) as cause:
-            raise SweepError(
-                f'{address}: no worker came to the Dask cluster in {_WORKER_PATIENCE} s; start one'
-            ) from cause
-        try:
-            yield Workers(client.get_executor(pure=False), ahead)
+            yield Workers(
+                client.get_executor(pure=False),
+                _TASKS_PER_WORKER * count,
+                partial(_wait_for_workers, client, address),
+            )
         except (distributed.KilledWorker, CommClosedError, CancelledError) as cause:
             reason = str(cause) or 'its scheduler is gone'
             raise SweepError(
                 f'{address}: the Dask cluster gave up ({reason}); finished parts are kept; '
                 'continue with --resume'
             ) from cause
+
+
+def _wait_for_workers(client: Client, address: str) -> int:
+    """Return the number of threads of the workers of a cluster, once there are any.
+
+    Raises SweepError where none comes in time: tasks would wait for one without end.
+    """
+    try:
+        if not client.nthreads():
+            say(
+                f'{address}: the cluster has no worker; waiting up to {_WORKER_PATIENCE} s for one'
+            )
+            client.wait_for_workers(1, timeout=_WORKER_PATIENCE)
+        return sum(client.nthreads().values())
+    except (OSError, CancelledError) as cause:
+        raise SweepError(
+            f'{address}: no worker came to the Dask cluster in {_WORKER_PATIENCE} s; '
+            'start one, then continue with --resume'
+        ) from cause
 
 
 @contextmanager

@@ -147,7 +147,7 @@ def _claim(parts: TableParts, mine: str, resume: bool, points: int) -> str:
     Return the engine for all of the sweep: the one that it was begun with.
     """
     mark = parts.folder / _MARK
-    if not mark.exists():
+    if not mark.exists() or not (resume or parts.numbers()):  # of a run that solved nothing
         engine = engines.settle(points)
         write_text(mark, f'{mine} {engine}')
         return engine

@@ -9,7 +9,8 @@ import subprocess
 import sys
 import time
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -482,6 +483,36 @@ def read_address(place: Path) -> str:
     return str(json.loads(place.read_text())['address'])
 
 
+@contextmanager
+def scheduler_and_worker(
+    folder: Path,
+) -> Iterator[tuple[str, subprocess.Popen[bytes], subprocess.Popen[bytes]]]:
+    """Yield the address of a Dask scheduler, and the processes of it and of its one worker."""
+    pytest.importorskip('distributed', reason='needs the extra `dask`')
+    place = folder / 'scheduler.json'
+    begun: list[subprocess.Popen[bytes]] = []
+    try:
+        for name, more in (
+            ('scheduler', ['--port', '0']),
+            ('worker', ['--nthreads', '1', '--no-nanny']),
+        ):
+            command = [sys.executable, '-m', f'distributed.cli.dask_{name}', '--no-dashboard']
+            begun.append(
+                subprocess.Popen(
+                    [*command, *more, '--scheduler-file', str(place)],
+                    env={**os.environ, 'PYTHONPATH': str(ROOT)},
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                )
+            )
+        until(lambda: place.exists() and place.read_text().strip().endswith('}'))
+        yield read_address(place), begun[0], begun[1]
+    finally:
+        for one in reversed(begun):
+            one.terminate()
+            one.wait(60)
+
+
 class TestDask:
     @pytest.fixture
     def cluster(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
@@ -517,32 +548,61 @@ class TestDask:
     def test_a_scheduler_that_dies_is_one_line(
         self, number: signal.Signals, write: Callable[[str], Path], tmp_path: Path
     ) -> None:
-        pytest.importorskip('distributed', reason='dask.distributed is not installed')
-        place, out = tmp_path / 'scheduler.json', tmp_path / 'out'
-        begun: list[subprocess.Popen[bytes]] = []
-        try:
-            for name, more in (('scheduler', ['--port', '0']), ('worker', ['--nthreads', '1'])):
-                command = [sys.executable, '-m', f'distributed.cli.dask_{name}', '--no-dashboard']
-                begun.append(
-                    subprocess.Popen(
-                        [*command, *more, '--scheduler-file', str(place)],
-                        env={**os.environ, 'PYTHONPATH': str(ROOT)},
-                        stdout=subprocess.DEVNULL,
-                        stderr=subprocess.DEVNULL,
-                    )
-                )
-            until(lambda: place.exists() and place.read_text().strip().endswith('}'))
-            process = start(write(LONG), '-o', out, '--dask', read_address(place))
+        out = tmp_path / 'out'
+        with scheduler_and_worker(tmp_path) as (address, scheduler, _):
+            process = start(write(LONG), '-o', out, '--dask', address)
             until(lambda: parts_in(out) >= 1)
-            begun[0].send_signal(number)
+            scheduler.send_signal(number)
             _, err = process.communicate(timeout=60)
-        finally:
-            for one in reversed(begun):
-                one.terminate()
-                one.wait(60)
         lines = [line for line in err.splitlines() if not line.endswith('%)')]
         assert process.returncode == 2 and len(lines) == 1
         assert 'continue with --resume' in lines[0] and parts_in(out) >= 1
+
+    @pytest.mark.slow
+    def test_a_last_worker_that_dies_is_one_line(
+        self, write: Callable[[str], Path], tmp_path: Path
+    ) -> None:
+        """The tasks of a worker go to the others; without others they waited without end."""
+        code = (
+            'import sys; from fisheye_svp_ros.commands import executors as e; '
+            'from fisheye_svp_ros.cli import main; '
+            'e._CHECK_INTERVAL, e._WORKER_PATIENCE = 0.5, 1; sys.exit(main(sys.argv[1:]))'
+        )
+        out = tmp_path / 'out'
+        with scheduler_and_worker(tmp_path) as (address, _, worker):
+            process = subprocess.Popen(
+                [sys.executable, '-c', code, 'sweep', write(LONG), '-o', out, '--dask', address],
+                env={**os.environ, 'PYTHONPATH': str(ROOT)},
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+            until(lambda: parts_in(out) >= 1)
+            worker.kill()
+            _, err = process.communicate(timeout=60)
+        assert process.returncode == 2 and parts_in(out) >= 1
+        assert 'no worker came' in err and 'continue with --resume' in err
+
+    def test_a_worker_is_awaited_with_a_word_and_up_to_a_limit(
+        self,
+        write: Callable[[str], Path],
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        distributed = pytest.importorskip('distributed', reason='needs the extra `dask`')
+        monkeypatch.setattr('fisheye_svp_ros.commands.executors._WORKER_PATIENCE', 0.5)
+        arguments = ['sweep', str(write(SMALL)), '-o', str(tmp_path / 'out')]
+        with distributed.LocalCluster(
+            n_workers=0,
+            host='127.0.0.1',
+            dashboard_address=None,
+            local_directory=str(tmp_path / 'dask'),
+        ) as cluster:
+            assert main([*arguments, '--dask', cluster.scheduler_address]) == 2
+        note, refusal = capsys.readouterr().err.splitlines()
+        assert 'has no worker; waiting up to 0.5 s' in note
+        assert 'no worker came to the Dask cluster in 0.5 s' in refusal
+        assert main(arguments) == 0  # nothing was solved that would have to be resumed
 
     def test_no_scheduler_is_one_line(
         self,
