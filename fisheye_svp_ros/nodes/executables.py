@@ -25,14 +25,20 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.io.parameters import Row
     from fisheye_svp_ros.nodes.base import BaseNode
 
+# Packages that rclpy does not bring along.
+_MESSAGES = ('diagnostic_msgs', 'geometry_msgs', 'sensor_msgs', 'std_srvs', 'visualization_msgs')
+
 set_thread_count()  # other nodes use the other cores
 draw_to_files()
 
 
 def missing_rclpy() -> str:
-    """Return why rclpy cannot be imported; empty where it can."""
+    """Return why rclpy, or messages of the nodes, cannot be imported; empty where they can."""
     try:
         import rclpy.node  # noqa: F401 - it loads the C library, too
+
+        for package in _MESSAGES:
+            import_module(package)
     except ImportError as error:
         # Of a C library that was built for another Python, the first line says enough.
         return str(error).partition('\n')[0]
@@ -40,7 +46,7 @@ def missing_rclpy() -> str:
 
 
 def ros_needed(reason: str) -> str:
-    """Return how to get what nodes need; reason: why rclpy cannot be imported."""
+    """Return how to get what nodes need; reason: why it cannot be imported."""
     version = '.'.join(map(str, sys.version_info[:2]))
     return (
         f'nodes need ROS 2, which Python {version} does not have ({reason}); source ROS 2 Jazzy '

@@ -59,6 +59,23 @@ def test_a_ros_of_another_python_is_none(tmp_path: Path) -> None:
     assert 'localizer: nodes need ROS 2' in done.stderr and 'the extra `ros`' in done.stderr
 
 
+def test_rclpy_without_the_messages_of_nodes_is_one_line(tmp_path: Path) -> None:
+    need_ros()
+    (tmp_path / 'visualization_msgs').mkdir()
+    (tmp_path / 'visualization_msgs' / '__init__.py').write_text(
+        "raise ModuleNotFoundError('No module named visualization_msgs')"
+    )
+    env = os.environ | {'PYTHONPATH': f'{tmp_path}{os.pathsep}{ROOT}'}
+    script = 'import sys; from fisheye_svp_ros.nodes import executables as e; sys.exit(e.{}())'
+    for command in (
+        ['-c', script.format('localizer')],
+        ['-m', 'fisheye_svp_ros.cli', 'run', 'localizer'],
+    ):
+        done = subprocess.run([sys.executable, *command], env=env, capture_output=True, text=True)
+        assert done.returncode == 2 and done.stderr.count('\n') == 1
+        assert 'nodes need ROS 2' in done.stderr and 'visualization_msgs' in done.stderr
+
+
 @pytest.mark.parametrize(
     ('given', 'taken'),
     [
