@@ -18,18 +18,33 @@ import cv2
 import pytest
 from helpers.data import DATA, NO_DATA
 from helpers.nodes import ROOT, need_ros
+from helpers.pages import differing_lines, shown_output
 
 from fisheye_svp_ros import cli
 
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 _BLOCK = re.compile(r'<!-- a test runs this -->\n```(?:ba)?sh\n(.*?)```', re.DOTALL)
 _ON_MEASURED_DATA = re.compile(_BLOCK.pattern.replace('this', 'this on measured data'), re.DOTALL)
+_NEXT_CODE = re.compile(r'^```(?!text|$)', re.MULTILINE)
 _COMMAND = re.compile(r'^ *fisheye-svp (.*?)(?:  +#.*| [|&>;].*)?$', re.MULTILINE)
 _ALL = {
     f'{page.name} {number}': block
     for page in PAGES
     for number, block in enumerate(_BLOCK.findall(page.read_text()))
 }
+
+
+def _shown(block: str) -> list[str]:
+    """Return the lines that pages show as printed by a block, or by one that it begins with."""
+    found = []
+    for page in PAGES:
+        parts = _BLOCK.split(page.read_text())[1:]
+        for start, rest in zip(parts[::2], parts[1::2], strict=True):
+            if block.startswith(start):
+                found += shown_output(_NEXT_CODE.split(rest)[0])
+    return found
+
+
 # A block that another one begins with runs there.
 BLOCKS = [
     pytest.param(block, id=name, marks=pytest.mark.slow)
@@ -51,7 +66,8 @@ def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int)
         need_ros()
     if 'tags:36h11' in block and not hasattr(cv2, 'aruco'):
         pytest.skip('this OpenCV has no markers')
-    run(block, tmp_path)
+    printed = run(block, tmp_path)
+    assert differing_lines(_shown(block), printed) == [], printed
 
 
 # Where a page that clones public repositories has what is here in DATA.
@@ -76,8 +92,8 @@ def test_commands_on_measured_data_run_as_they_stand(block: str, tmp_path: Path)
     run(block, tmp_path)
 
 
-def run(block: str, tmp_path: Path) -> None:
-    """Run a block of a page in a folder; fail where it fails."""
+def run(block: str, tmp_path: Path) -> str:
+    """Run a block of a page in a folder; fail where it fails. Return what it printed."""
     tools = tmp_path / 'bin'
     tools.mkdir()
     (tmp_path / 'examples').symlink_to(ROOT / 'examples')
@@ -110,6 +126,7 @@ def run(block: str, tmp_path: Path) -> None:
     assert status == 0 and ']: dropped:' not in text, text
     # Dask logs tracebacks of its own when workers and scheduler end at the same time.
     assert 'dask' in block or 'Traceback' not in text, text
+    return text
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
