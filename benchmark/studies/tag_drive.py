@@ -23,6 +23,7 @@ import numpy as np
 from benchmark import study
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.tag_maps import CORNERS, TagMap, map_of_size
 from fisheye_svp_ros.optics.curves import KannalaBrandt
@@ -30,9 +31,10 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, carried_pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Views, views_of
 from fisheye_svp_ros.scene.pose_priors import PlanarPrior
+from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.solve.pose_gate import GatedPose, GateLimits, OdometryGate, weakness
 from fisheye_svp_ros.solve.weak_geometry import CHI2_999
-from fisheye_svp_ros.study.solutions import localize_sets
+from fisheye_svp_ros.study.solutions import SetSolutions, localize_sets
 
 IMAGES, SIGMA = 300, 0.2  # a drive; px
 TAGS, HALF = 16, (3.5, 2.5)  # m, half the sides of the room
@@ -156,9 +158,9 @@ def drive(number: int, planar: bool = False) -> Drive:
         if planar:
             prior = PlanarPrior(mount.inverse().take(None), np.zeros(1), _PLANE)
             views = views._replace(prior=prior)
-        solved = localize_sets(MODEL, views, examined=True, tags=True)
+        solved = _localize(views)
         counts[kind, 'images'] += 1
-        if not solved.solved[0]:
+        if solved is None or not solved.solved[0]:
             counts[kind, 'no pose'] += 1
             continue
         pose, covariance = carried_pose(
@@ -171,10 +173,18 @@ def drive(number: int, planar: bool = False) -> Drive:
             covariance,
             bool(solved.metrics['ambiguous'][0]),
             float(solved.sigmas[0]),
-            frozenset(views.board[0].tolist()),
+            solved.suspects[0],
         )
         _count(counts, kind, solved.reasons[0], gated, wrong, (gate, limits, odom[image]))
     return Drive(counts)
+
+
+def _localize(views: Views) -> SetSolutions[Localization] | None:
+    """Return the pose of an image, None where its points fix none."""
+    try:
+        return localize_sets(MODEL, views, examined=True, tags=True)
+    except GeometryError:  # three corners in the field of view of the lens
+        return None
 
 
 def _count(

@@ -156,14 +156,13 @@ class Localizer(SolverNode):
         self._pose.publish(
             messages.pose_with_covariance_message(pose, covariance[0], stamp, world)
         )
-        tags = frozenset() if points.tag is None else frozenset(points.tag.tolist())
         doubt = self._base.publish(
             GatedPose(
                 pose,
                 covariance[0],
                 bool(solved.metrics['ambiguous'][0]),
                 float(solved.sigmas[0]),
-                tags,
+                solved.suspects[0] if solved.suspects else {},
             ),
             stamp,
             world,

@@ -10,6 +10,8 @@ out all that follow.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -17,11 +19,10 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.pose import Pose, carried_pose, vector_from_rotation
 from fisheye_svp_ros.solve.localization import squared_distances
-from fisheye_svp_ros.solve.weak_geometry import CHI2_999
+from fisheye_svp_ros.solve.weak_geometry import MIN_ODDS, share_outside
 
 MAX_MISFIT = 3.0  # times sigma: residuals of a wrong lens, image or map
 _HISTORY = 15  # poses that the next one is held against
-_FEW_TAGS = 2  # of a pose: where one of them moved, no residual may show it
 
 
 class GateLimits(NamedTuple):
@@ -41,15 +42,15 @@ class GateLimits(NamedTuple):
 class GatedPose(NamedTuple):
     """The pose of a base in its world, covariance (6, 6), m and rad, and what speaks against it.
 
-    ambiguous: a second pose fits; misfit: residuals over sigma; tags: that it was solved from,
-    empty where it was from other landmarks.
+    ambiguous: a second pose fits; misfit: residuals over sigma; suspects: tags that may have moved
+    and make it wrong, with the probability that they did, see `tag_units.suspect_tags`.
     """
 
     base: Pose
     covariance: Array
     ambiguous: bool = False
     misfit: float = 1.0
-    tags: frozenset[int] = frozenset()
+    suspects: Mapping[int, float] = MappingProxyType({})
 
 
 def weakness(pose: GatedPose, limits: GateLimits) -> str:
@@ -105,41 +106,49 @@ class OdometryGate:
             turn = vector_from_rotation(odometry.rotation @ last.odometry.rotation.T)
             way = last.way + float(np.linalg.norm(odometry.position - last.odometry.position))
             angle = last.angle + float(np.linalg.norm(turn))
-        self._history.append(_Known(pose, odometry, way, angle))
-        if not known or not limits.max_innovation:
+        now = _Known(pose, odometry, way, angle)
+        self._history.append(now)
+        if not limits.max_innovation:
             return Verdict()
-        off, own = np.array([self._innovation(one, self._history[-1]) for one in known]).T
+        carried = [self._carry(one, now) for one in known]
+        off = np.array([_sigmas(pose, *one) for one in carried])
         agree = off <= limits.max_innovation
-        if 2 * np.count_nonzero(agree) <= len(agree):
+        if known and 2 * np.count_nonzero(agree) <= len(agree):
             return Verdict(
                 f'{np.median(off):.3g} sigmas off where odometry has it (max_innovation '
                 f'{limits.max_innovation:g})'
             )
-        inside = np.flatnonzero(own**2 < CHI2_999)
-        if 0 < len(pose.tags) <= _FEW_TAGS and not any(
-            _confirms(known[i].pose, pose) for i in inside
-        ):
-            names = ' and '.join(map(str, sorted(pose.tags)))
+        wrong = np.array([_wrong_beside(pose, *one) for one in carried])
+        unconfirmed = [
+            tag
+            for tag, odds in sorted(pose.suspects.items())
+            if not any(
+                odds * share <= MIN_ODDS and tag not in one.pose.suspects
+                for one, share in zip(known, wrong, strict=True)
+            )
+        ]
+        if unconfirmed:
+            names = ' and '.join(map(str, unconfirmed))
             return Verdict('', f'no other tag confirms the pose by tag {names}')
         return Verdict()
 
-    def _innovation(self, before: _Known, now: _Known) -> tuple[float, float]:
-        """Return how far a pose is off where odometry carries another, in sigmas.
-
-        Of both and the odometry; and in its own alone.
-        """
+    def _carry(self, before: _Known, now: _Known) -> tuple[Pose, Array]:
+        """Return where odometry carries a pose, and the covariance (6, 6) of that."""
         moved = before.odometry.inverse().compose(now.odometry)
         there, covariance = carried_pose(before.pose.base, before.pose.covariance, moved)
         drift = np.repeat([now.way - before.way, now.angle - before.angle], 3)
-        drift = (self._limits.odom_error * drift) ** 2
-        own = now.pose.covariance
-        both = np.stack([covariance + own + np.diag(drift), own])
-        change = now.pose.base.difference(there)
-        squares = squared_distances(np.broadcast_to(change, (2, 1, 6)), both)[:, 0]
-        return float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
+        return there, covariance + np.diag((self._limits.odom_error * drift) ** 2)
 
 
-def _confirms(before: GatedPose, pose: GatedPose) -> bool:
-    """Say whether a tag that moved would have had another effect on a pose before."""
-    others = before.tags - pose.tags
-    return len(others) >= _FEW_TAGS or (bool(others) and others == before.tags)
+def _sigmas(pose: GatedPose, there: Pose, covariance: Array) -> float:
+    """Return how far a pose is off another with a covariance (6, 6), in sigmas of both."""
+    change = pose.base.difference(there)
+    squares = squared_distances(change[None, None], (covariance + pose.covariance)[None])
+    return float(np.sqrt(squares[0, 0]))
+
+
+def _wrong_beside(pose: GatedPose, there: Pose, covariance: Array) -> float:
+    """Return how probably a pose is outside its ellipsoid, of what another pose alone says."""
+    change = pose.base.difference(there)
+    spread = covariance + np.outer(change, change)
+    return float(share_outside(np.trace(np.linalg.solve(pose.covariance, spread))))

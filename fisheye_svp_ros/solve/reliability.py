@@ -35,6 +35,7 @@ from fisheye_svp_ros.solve.tag_units import (
     choose_tags,
     cover_choices,
     holds_tags,
+    suspect_tags,
     tags_agree,
 )
 from fisheye_svp_ros.solve.weak_geometry import hold_weak_geometry
@@ -62,7 +63,8 @@ class Examination(NamedTuple):
     observations left out as outliers; reasons (S,): why a pose should not be relied on as it
     is, '' for a reliable one; sigma: noise of u and of v, px, estimated from the
     views that pass, None where weights are known; excess (S,): factor by which residuals are more
-    than that, where the covariance is scaled by its square; choices: of tags, by view.
+    than that, where the covariance is scaled by its square; choices: of tags, by view; suspects
+    (S,): tags that may have moved, see `suspect_tags`, where boards are tags.
     """
 
     result: Localization
@@ -71,6 +73,7 @@ class Examination(NamedTuple):
     sigma: float | None
     excess: Array
     choices: Mapping[int, TagChoices] = MappingProxyType({})
+    suspects: tuple[Mapping[int, float], ...] = ()
 
 
 def examine(
@@ -91,7 +94,8 @@ def examine(
     model = model.seeing(views)
     if sigma_known:
         checked = _examine(model, views, localization, 1.0, 1.0, searched, tags)
-        return _hold_covariances(model, views, checked, 1.0)
+        checked = _hold_covariances(model, views, checked, 1.0)
+        return _with_suspects(model, views, checked) if tags else checked
     freedom = np.maximum(2 * (views.weight > 0).sum(axis=1) - 6, 1)
     usual = float(np.sqrt(np.median(localization.cost / freedom)))
     if len(freedom) < _OTHERS:
@@ -110,6 +114,16 @@ def examine(
         )
         reasons = tuple(_join_reasons(noisy, reason) for reason in reasons)
     return _hold_covariances(model, views, checked._replace(reasons=reasons, sigma=sigma), sigma)
+
+
+def _with_suspects(model: ForwardModel, views: Views, checked: Examination) -> Examination:
+    """Return also which tags, of those that were not left out, may have moved."""
+    inliers = views._replace(weight=np.where(checked.gross, 0.0, views.weight))
+    suspects = tuple(
+        suspect_tags(model, inliers.take([i]), checked.result.take([i]))
+        for i in range(len(checked.reasons))
+    )
+    return checked._replace(suspects=suspects)
 
 
 def _hold_covariances(

@@ -93,6 +93,16 @@ def is_ambiguous(localization: Localization) -> Mask:
     return apart
 
 
+def share_outside(square: Array | float) -> Array:
+    """Return how probably poses are outside their 99.9 % ellipsoids.
+
+    square: the mean of the Mahalanobis square, in place of DOF.
+    """
+    from scipy.special import chdtrc  # takes a third of the time that `--help` may take
+
+    return np.asarray(chdtrc(DOF, CHI2_999 * DOF / square))
+
+
 def _weak_views(views: Views, localization: Localization) -> tuple[Index, Array]:
     """Return the views (W,) whose linearized covariance does not hold, and their curvature."""
     turn = np.trace(localization.covariance[:, 3:, 3:], axis1=1, axis2=2)

@@ -7,6 +7,7 @@ truth is absent without it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -73,7 +74,8 @@ class SetSolutions(NamedTuple, Generic[T]):
 
     solved (S,); unsolved: why the others have no solution; reasons (S,): why a solution should
     not be relied on, '' for a reliable one, all of them where that was not examined; sigmas (S,):
-    root mean square of the residuals, whitened, by degrees of freedom.
+    root mean square of the residuals, whitened, by degrees of freedom; suspects (S,): tags that
+    may have moved, see `solve.tag_units`, where these were examined.
     """
 
     solution: T
@@ -82,6 +84,7 @@ class SetSolutions(NamedTuple, Generic[T]):
     unsolved: str
     reasons: tuple[str, ...] = ('',)
     sigmas: Array = np.zeros(1)
+    suspects: tuple[Mapping[int, float], ...] = ()
 
     def require(self, gate: float = 0.0) -> SetSolutions[T]:
         """Return it as it is; raise GeometryError where a set has no solution.
@@ -116,9 +119,10 @@ def localize_sets(
     """
     localization = localize(model, views, start)
     residual, reasons = localization.residual, ('',) * len(localization.cost)
+    suspects: tuple[Mapping[int, float], ...] = ()
     if examined:
         checked = examine(model, views, localization, searched=searched, tags=tags)
-        localization, reasons = checked.result, checked.reasons
+        localization, reasons, suspects = checked.result, checked.reasons, checked.suspects
         residual = np.where(checked.gross[..., None], np.nan, localization.residual)
     else:
         localization = hold_weak_geometry(model, views, localization)
@@ -128,7 +132,9 @@ def localize_sets(
         'ambiguous': is_ambiguous(localization).astype(float),
     }
     sigmas = _residual_sigmas(localization.cost, 2 * metrics['points'] - 6)
-    return SetSolutions(localization, metrics, localization.converged, _NO_POSE, reasons, sigmas)
+    return SetSolutions(
+        localization, metrics, localization.converged, _NO_POSE, reasons, sigmas, suspects
+    )
 
 
 def residual_points(model: ForwardModel, views: Views, solution: Localization) -> Points:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,6 +14,7 @@ from fisheye_svp_ros.solve.pose_gate import GatedPose, GateLimits, OdometryGate,
 
 SMALL = np.diag([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
 LIMITS = GateLimits()
+NONE: Mapping[int, float] = MappingProxyType({})
 
 
 @pytest.mark.parametrize(
@@ -42,14 +47,16 @@ def drive(step: int) -> Pose:
 START = Pose(rotation_from_vector(np.array([0.0, 0.0, 2.0])), np.array([5.0, -3.0, 0.0]))
 
 
-def pose_of(step: int, shift: float = 0.0, tags: tuple[int, ...] = ()) -> GatedPose:
+def pose_of(
+    step: int, shift: float = 0.0, suspects: Mapping[int, float] = NONE, scale: float = 1.0
+) -> GatedPose:
     true = drive(step)
     moved = Pose(true.rotation, true.position + np.array([0.0, shift, 0.0]))
-    return GatedPose(moved, SMALL, tags=frozenset(tags))
+    return GatedPose(moved, scale**2 * SMALL, suspects=suspects)
 
 
-def judge(gate: OdometryGate, step: int, shift: float = 0.0, tags: tuple[int, ...] = ()) -> tuple:
-    return tuple(gate.judge(pose_of(step, shift, tags), START.compose(drive(step))))
+def judge(gate: OdometryGate, step: int, *pose: Any) -> tuple:
+    return tuple(gate.judge(pose_of(step, *pose), START.compose(drive(step))))
 
 
 def test_a_pose_that_odometry_contradicts_is_refused() -> None:
@@ -76,14 +83,22 @@ def test_a_wrong_first_pose_does_not_keep_out_the_others() -> None:
     assert not passed[0] and all(passed[3:])
 
 
-def test_few_tags_are_confirmed_by_others() -> None:
-    gate = OdometryGate(LIMITS)
+def test_a_doubtful_tag_is_confirmed_by_poses_without_it() -> None:
+    gate, third, both = OdometryGate(LIMITS), {3: 0.05}, {3: 0.05, 5: 0.05}
     alone = ('', 'no other tag confirms the pose by tag 3')
-    assert judge(gate, 0, tags=(3,)) == ('', '')
-    assert judge(gate, 1, tags=(3,)) == alone
-    assert judge(gate, 2, tags=(3, 5)) == ('', f'{alone[1]} and 5')
-    assert judge(gate, 3, tags=(3,)) == alone, 'tag 3 weighs in the pose by 3 and 5'
-    assert judge(gate, 4, tags=(3, 5, 7)) == ('', '')
-    assert judge(gate, 5, tags=(3,)) == ('', ''), 'two other tags agree'
-    assert judge(gate, 5, 0.07, tags=(3,)) == alone, 'not as closely as it states'
-    assert judge(gate, 6, tags=(9,)) == ('', ''), 'a pose by other tags alone agrees'
+    assert judge(gate, 0, 0.0, third) == alone, 'nothing before the first'
+    assert judge(OdometryGate(LIMITS), 0, 0.0, both) == ('', f'{alone[1]} and 5')
+    assert judge(gate, 1, 0.0, both) == alone, 'the pose before is not by tag 5'
+    assert judge(gate, 2, 0.0, third) == alone, 'tag 3 is suspect in the poses before, too'
+    assert judge(gate, 3) == ('', '')
+    assert judge(gate, 4, 0.0, third) == ('', '')
+    assert judge(gate, 5, 0.05, third) == alone, 'not as closely as it states'
+    assert judge(gate, 6, 0.0, {3: 0.6}) == alone, 'it probably moved'
+    assert judge(gate, 7, 0.0, {9: 0.05}) == ('', ''), 'poses of which tag 9 is no doubt agree'
+
+
+def test_a_pose_known_less_well_confirms_nothing() -> None:
+    for scale, confirms in ((0.5, True), (3.0, False)):
+        gate = OdometryGate(LIMITS)
+        judge(gate, 0, 0.0, NONE, scale)
+        assert (judge(gate, 1, 0.0, {3: 0.05})[1] == '') == confirms

@@ -8,6 +8,7 @@ from helpers.tag_room import LENS, TagRoom, oval
 
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.solve import localization
+from fisheye_svp_ros.solve.tag_units import MOVED
 from fisheye_svp_ros.solve.weak_geometry import CHI2_999, is_ambiguous
 from fisheye_svp_ros.study.solutions import localize_sets
 
@@ -69,3 +70,29 @@ def test_of_tags_where_the_map_has_them_none_is_rejected(count):
     rng = np.random.default_rng(count)
     solved = [solve(None, count, rng, place) for place in np.linspace(0, 1, 40)]
     assert sum(bool(one.reasons[0]) for one, _, _ in solved) <= 1
+
+
+def test_a_tag_that_alone_fixes_a_pose_is_doubtful():
+    rng = np.random.default_rng(5)
+    for place in np.linspace(0, 1, 10):
+        solved, _, (tag,) = solve(None, 1, rng, place)
+        assert list(solved.suspects[0]) == [tag]
+        assert solved.suspects[0][tag] == pytest.approx(MOVED / (1 + MOVED), rel=1e-3)
+
+
+def test_tags_of_which_many_agree_are_not_doubtful():
+    rng = np.random.default_rng(6)
+    suspect = [len(solve(None, 9, rng, place)[0].suspects[0]) for place in np.linspace(0, 1, 30)]
+    assert sum(map(bool, suspect)) <= 3
+
+
+def test_a_tag_that_moved_less_than_residuals_show_is_doubtful():
+    """Where all that is shown is allowed by the test of the residuals, and the pose is wrong."""
+    rng, wrong = np.random.default_rng(7), 0
+    for place in np.linspace(0, 1, 60):
+        for count in (2, 3, 5):
+            solved, off, seen = solve(rng.normal(0, 0.05, 3), count, rng, place)
+            if off > 2 * CHI2_999 and not solved.reasons[0]:
+                wrong += 1
+                assert seen[0] in solved.suspects[0], (place, count)
+    assert wrong > 5
