@@ -29,6 +29,7 @@ from fisheye_svp_ros.commands.notes import (
     note_huge,
     note_left_out,
     note_unconnected,
+    note_upwards,
     note_wrong_landmarks,
 )
 from fisheye_svp_ros.commands.outputs import add_output_folder
@@ -285,6 +286,7 @@ def _read(
     usable = usable_observations(table, lens)
     note_left_out(table, usable.not_posable)
     note_copies(table, usable.copies)
+    note_upwards(usable.observations, lenses)
     return usable.observations, lens
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,7 +20,7 @@ from fisheye_svp_ros.reporting.wording.poses import wrong_landmark_notes
 from fisheye_svp_ros.scene.observations import frame_name, list_frames
 from fisheye_svp_ros.scene.table_checks import MAX_TARGET_SIZE, target_size
 from fisheye_svp_ros.solve.lens_checks import extrapolated_points
-from fisheye_svp_ros.solve.mirrored_points import find_mirror
+from fisheye_svp_ros.solve.mirrored_points import Mirror, find_mirror
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.arrays import Array
@@ -54,6 +54,14 @@ def note_mirrored(what: str, lens: Lens, table: Observations) -> None:
     """Say it where the table of one camera is a mirror image of what it saw."""
     if mirror := find_mirror(table, lens):
         say(points_mirrored(what, mirror))
+
+
+def note_upwards(table: Observations, lenses: Mapping[str, Lens]) -> None:
+    """Say it where y of a board points up: other mirror images are flaws of a diagnosis."""
+    for camera, (name, lens) in enumerate(lenses.items()):
+        mine = table.take(table.camera == camera) if len(lenses) > 1 else table
+        if find_mirror(mine, lens) == Mirror.Y_UPWARDS:
+            say(points_mirrored(name or 'image points', Mirror.Y_UPWARDS))
 
 
 def count_text(count: int, noun: str) -> str:

@@ -24,7 +24,7 @@ from fisheye_svp_ros.scene.observations import frame_names
 from fisheye_svp_ros.scene.table_checks import MAX_TARGET_SIZE, target_size
 from fisheye_svp_ros.solve.frame_groups import MIN_GROUP, find_frame_groups
 from fisheye_svp_ros.solve.lens_checks import image_coverage, is_no_fit
-from fisheye_svp_ros.solve.mirrored_points import find_mirror
+from fisheye_svp_ros.solve.mirrored_points import Mirror, find_mirror
 from fisheye_svp_ros.solve.ray_errors import MAX_RAY_ERROR, RANGES, RayError
 
 _MAX_SPREAD = 0.05  # of the variance between frames: more within groups, and they are none
@@ -115,7 +115,8 @@ def _mirrors(evaluation: Evaluation) -> Iterator[Flaw]:
     table, state = evaluation.problem.observations, evaluation.simulation.state
     for camera in np.unique(table.camera).tolist():  # some of a table's may have seen nothing
         lens = state.lenses[camera if len(state.lenses) > 1 else 0]
-        if mirror := find_mirror(table.take(table.camera == camera), lens):
+        mirror = find_mirror(table.take(table.camera == camera), lens)
+        if mirror and mirror != Mirror.Y_UPWARDS:
             name = table.cameras[camera]
             yield Flaw(FlawKind.MIRRORED, 0.0, 0.0, camera=name, mirror=mirror)
 

@@ -35,6 +35,7 @@ class Mirror(Enum):
     UV_EXCHANGED = 2
     IMAGE = 3  # one of both
     Y_REVERSED = 4
+    Y_UPWARDS = 5  # y up, z out of the board: a right-handed convention, and the lens is right
 
 
 def find_mirror(table: Observations, lens: Lens) -> Mirror | None:
@@ -112,7 +113,7 @@ def _mirror_by_numbers(table: Observations, lens: Lens) -> Mirror | None:
     downwards = np.cov(landmarks.ids, y)[0, 1] > 0
     if downwards:
         return _mirror_of_image(table.uv, lens)
-    return Mirror.Y_REVERSED if y.max() <= 0 else None
+    return Mirror.Y_REVERSED if y.max() <= 0 else Mirror.Y_UPWARDS
 
 
 def _is_even(places: Array) -> bool:

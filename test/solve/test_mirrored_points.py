@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.flawed_sets import Camera, board, draw_views, observe
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.commands.notes import note_upwards
+from fisheye_svp_ros.diagnosis import Flaw, adequacy
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations, group_views
 from fisheye_svp_ros.solve.lens_calibration import calibrate
@@ -67,13 +71,40 @@ def floor(points: Array) -> Array:
     return np.asarray(20 * points * [1, -1, 1])
 
 
-@pytest.mark.parametrize('of', [np.array, upwards, tags, floor])
-def test_a_board_whose_y_points_up_is_sound(of: Callable[[Array], Array]) -> None:
+@pytest.mark.parametrize(
+    ('of', 'mirror'),
+    [(np.array, None), (upwards, Mirror.Y_UPWARDS), (tags, None), (floor, None)],
+)
+def test_a_board_whose_y_points_up_is_no_mirror_image(
+    of: Callable[[Array], Array], mirror: Mirror | None
+) -> None:
+    """A chessboard with z towards the camera is told, since y may have been reversed."""
     rng, points = np.random.default_rng(3), board()
     table = observe(rng, [CAMERA] * 10, draw_views(rng, points, 10), points)
     other = of(points)
     table = replace(table, xyz=other[table.landmark])
-    assert find_mirror(table, LENS) is None
+    assert find_mirror(table, LENS) == mirror
+
+
+def test_of_mirror_images_only_a_board_whose_y_points_up_leaves_a_diagnosis_sound(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    table = sound()
+
+    def flaws(points: Array) -> list[Flaw]:
+        evaluation: Any = SimpleNamespace(
+            problem=SimpleNamespace(observations=replace(table, xyz=points)),
+            simulation=SimpleNamespace(state=SimpleNamespace(lenses=(LENS,))),
+        )
+        return list(adequacy._mirrors(evaluation))
+
+    (flaw,) = flaws(table.xyz * [1, -1, 1])
+    assert flaw.mirror == Mirror.Y_REVERSED
+    assert not flaws(upwards(table.xyz))
+    note_upwards(replace(table, xyz=upwards(table.xyz)), {'': LENS})
+    note_upwards(table, {'': LENS})
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'its y points up' in line and 'count y downwards' in line
 
 
 def test_a_view_alone_or_seen_edge_on_has_no_side() -> None:

@@ -168,6 +168,11 @@ MIRROR_REMEDY = 'write u to the right, v down, x, y, z right-handed with z into 
 
 def points_mirrored(what: str, mirror: Mirror) -> str:
     """Tell of points that are a mirror image of what was seen."""
+    if mirror == Mirror.Y_UPWARDS:
+        return (
+            f'{what}: every frame shows the board from behind: its y points up and its z out of '
+            'it; poses refer to that frame; for z into the board, count y downwards'
+        )
     return (
         f'{what}: every frame shows the board from behind: {MIRROR_WORDS[mirror]}; {MIRROR_REMEDY}'
     )
