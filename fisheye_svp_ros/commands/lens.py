@@ -16,6 +16,7 @@ from fisheye_svp_ros.commands.outputs import output_file
 from fisheye_svp_ros.effects.extension import LANDMARKS
 from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.effects.resizing import ImageChange
+from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file, save_lens
 from fisheye_svp_ros.io.lens_formats import (
@@ -193,6 +194,8 @@ def _convert(lenses: Sequence[Lens], steps: Sequence[Pose], args: argparse.Names
 def _at_range(lens: Lens, args: argparse.Namespace) -> tuple[Lens, tuple[float, ...]]:
     """Return the lens, or the SVP lens nearest at the range that is asked for, and ranges, m."""
     given, ranges = lens, _RANGES
+    if args.range_m is not None and not args.range_m > 0:
+        raise ParameterError(f'--range {args.range_m:g}: a distance in m, above 0, is needed')
     if args.range_m is not None and lens.is_svp:
         say(f'--range {args.range_m:g} changes nothing: lens {lens.name!r} has a single viewpoint')
     elif args.range_m is not None:

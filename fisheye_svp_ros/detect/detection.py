@@ -215,8 +215,8 @@ def detect(
         reasons = Counter(photo.reason.partition(';')[0] for photo in searched).most_common(2)
         said = ', '.join(f'{reason} ({count})' for reason, count in reasons)
         raise ObservationError(
-            f'{source}: no {pattern.spec} in {len(searched)} photographs: '
-            f'{said}; {check_of_board(pattern)}'
+            f'{source}: no {pattern.spec} in {len(searched)} '
+            f'photograph{"s" * (len(searched) > 1)}: {said}; {check_of_board(pattern)}'
         )
     return _table(*_moments(searched, sync), pattern, source)
 

@@ -166,7 +166,8 @@ class CsvTable:
     def _numbers(self, name: str) -> Array:
         cells = self._columns[name]
         try:
-            if any('_' in cell for cell in cells):  # Python reads 1_00 as 100
+            # Python reads 1_00 as 100, and digits of all scripts.
+            if any('_' in cell or not cell.isascii() for cell in cells):
                 raise ValueError
             values = np.array(cells, dtype=float)
         except ValueError:

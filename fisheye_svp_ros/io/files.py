@@ -325,7 +325,7 @@ def dump_yaml(document: Any, **style: Any) -> str:
 
 def parse_number(text: str) -> float:
     """Return the number that a word of a data file is; raise ValueError for any other word."""
-    if '_' in text:  # Python alone reads 1_00 as 100
+    if '_' in text or not text.isascii():  # Python alone reads 1_00, and digits of all scripts
         raise ValueError(f'could not convert to a number: {text!r}')
     return float(text)
 

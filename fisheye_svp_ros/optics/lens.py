@@ -20,6 +20,7 @@ PORT = 'port'  # before the names of a port's coefficients, among those of a len
 IMAGE_FIELD = 'image_field'
 TANGENTIAL = 'tangential'
 _RANGE_MARGIN = 1 - 1e-6  # of the monotone range: at its very end the curve cannot be inverted
+_MIN_FOCAL = 1e-3  # px: less than any lens has, and far from where squares overflow
 
 
 @dataclass(frozen=True)
@@ -196,6 +197,11 @@ class Lens:
         for name in ('fx', 'fy', 'width', 'height'):
             if getattr(self, name) <= 0:
                 return f'{name} is {getattr(self, name)}; it must be above 0'
+        for name in ('fx', 'fy'):
+            if getattr(self, name) < _MIN_FOCAL:
+                return (
+                    f'{name} is {getattr(self, name):g} px; at least {_MIN_FOCAL:g} px is needed'
+                )
         parts = (self.image_height, self.viewpoint_shift, self.port, self.tangential)
         wrong = next((wrong for part in parts if part is not None and (wrong := part.check())), '')
         if wrong or self.image_field is None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.commands import refused
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
@@ -90,3 +91,15 @@ def test_lengths_and_noise_of_a_robot(values: dict[str, Any], told: list[str]) -
     warnings = hand_eye_warnings(robot)
     assert len(warnings) == len(told)
     assert all(re.search(one.replace('+', r'\+'), warnings[0]) for one in told)
+
+
+@pytest.mark.parametrize('number', ['nan', '0', '-1'])
+def test_a_range_that_is_none_is_refused_of_any_lens(
+    number: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a lens with a single viewpoint, it "changes nothing"."""
+    save_lens(LENS, tmp_path / 'a.yaml')
+    wanted = ('-o', tmp_path / 'b.yaml', '--format', 'ros', f'--range={number}')
+    assert f'--range {number}: a distance in m, above 0' in refused(
+        capsys, 'lens', tmp_path / 'a.yaml', *wanted
+    )

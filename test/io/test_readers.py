@@ -196,7 +196,7 @@ class TestObservationsCsv:
             ('camera', 'c' * 300, "camera is 'ccc"),
             *(
                 ('sigma', cell, f'sigma is {cell!r}; a number')
-                for cell in ('1_00.0', '_1', '1__0', '1_0e2')
+                for cell in ('1_00.0', '_1', '1__0', '1_0e2', '١٢', '１')
             ),
             ('camera', '', "camera is ''; a name, as '1' elsewhere, is needed"),
             ('sigma', '0', "sigma is '0'; a number above 0"),

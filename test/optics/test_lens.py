@@ -200,6 +200,7 @@ def test_a_field_that_is_left_out_ends_at_the_curve_or_the_farthest_corner(model
         ('projection.fx', None, 'projection: fx is None; a number is needed'),
         ('projection.fx', True, 'projection: fx is True; a number is needed'),
         ('projection.fx', -1.0, 'fx is -1.0; it must be above 0'),
+        ('projection.fx', 1e-300, 'fx is 1e-300 px; at least 0.001 px is needed'),
         ('projection.fy', float('inf'), 'fy is inf; a finite number is needed'),
         ('projection.cx', float('nan'), 'cx is nan; a finite number is needed'),
         ('projection.f', 400.0, 'projection has both f and fx or fy; keep one of them'),
