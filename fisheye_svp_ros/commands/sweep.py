@@ -7,12 +7,14 @@ import fcntl
 import os
 import shutil
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.commands.executors import completed_tasks, dask, process_pool
 from fisheye_svp_ros.commands.node_sweeps import read_sweep
 from fisheye_svp_ros.commands.notes import count_text, note_formats, say
@@ -29,7 +31,7 @@ from fisheye_svp_ros.io.files import (
 from fisheye_svp_ros.io.share import sweep_path
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.reporting.terminal import print_table, progress
-from fisheye_svp_ros.study.summary import StoredMetric, Summary
+from fisheye_svp_ros.study.summary import Summary, summarize
 from fisheye_svp_ros.study.sweep import (
     Plan,
     column_types,
@@ -208,25 +210,18 @@ def _written(
 def _join(path: Path, plan: Plan, parts: TableParts) -> dict[str, Summary]:
     """Write the parts as one table; return the summary of each metric.
 
-    Raises OutputError where the disk is full, and as `TableParts.join` does.
+    Raises OutputError as `TableParts.join` does.
     """
-    names = [name for name, kind in column_types(plan).items() if kind is float and '.' in name]
-    try:
-        with ExitStack() as stack:
-            # Beside the parts, on a disk: the folder for temporary files may be memory.
-            files = [stack.enter_context(TemporaryFile(dir=parts.folder)) for _ in names]
-            metrics = {name: StoredMetric(file) for name, file in zip(names, files, strict=True)}
+    metrics: dict[str, list[Array]] = {
+        name: [] for name, kind in column_types(plan).items() if kind is float and '.' in name
+    }
 
-            def take(part: DataFrame) -> None:
-                for name, metric in metrics.items():
-                    metric.add(part[name].to_numpy())
+    def take(part: DataFrame) -> None:
+        for name, values in metrics.items():
+            values.append(part[name].to_numpy())
 
-            parts.join(path, part_check(plan), take)
-            return {name: metric.summarize() for name, metric in metrics.items()}
-    except OSError as cause:  # a file may tell only at its end
-        raise OutputError(
-            f'{parts.folder}: cannot be written ({cause.strerror or cause})'
-        ) from cause
+    parts.join(path, part_check(plan), take)
+    return {name: summarize(np.concatenate(values)) for name, values in metrics.items()}
 
 
 def _report(
