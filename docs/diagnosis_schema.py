@@ -15,7 +15,6 @@ from enum import Enum
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import (
-    Annotated,
     Any,
     Literal,
     NotRequired,
@@ -23,23 +22,29 @@ from typing import (
     get_args,
     get_origin,
     get_type_hints,
-    is_typeddict,
 )
 
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent))
 
-from fisheye_svp_ros.diagnosis import FileFigure  # noqa: E402
+from fisheye_svp_ros.diagnosis import (  # noqa: E402
+    Advice,
+    Cause,
+    EffectBound,
+    Figure,
+    FileFigure,
+    Finding,
+)
 from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame  # noqa: E402
 from fisheye_svp_ros.diagnosis.evaluation import FitQuality, Intrinsic  # noqa: E402
 from fisheye_svp_ros.diagnosis.variance_budget import Component, Structure  # noqa: E402
 from fisheye_svp_ros.diagnosis.written_lens import AveragedShift  # noqa: E402
 from fisheye_svp_ros.reporting.diagnosis_document import (  # noqa: E402
-    AdviceEntry,
-    CandidateEntry,
-    CauseEntry,
-    DecisionEntry,
-    StepEntry,
+    ADVICE,
+    CANDIDATE,
+    CAUSE,
+    STEP,
+    Keys,
 )
 
 SCHEMA = DOCS / 'reference' / 'diagnosis.schema.json'
@@ -52,6 +57,29 @@ class Optional(Fields):
     """Keys of an object that may be absent."""
 
 
+def _entry(kind: type, keys: Keys) -> Fields:
+    """Return the types of an entry's keys: of a record's attributes, or of what computes them."""
+    attributes = get_type_hints(kind)
+    fields: Fields = {}
+    for key, source in keys.items():
+        if isinstance(source, str):
+            known = attributes.get(source)
+            fields[key] = known or get_type_hints(getattr(kind, source).fget)['return']
+        else:
+            fields[key] = get_type_hints(source)['return']
+    if 'parameters' in fields:
+        fields['parameters'] = dict[str, PARAMETER]  # type: ignore[valid-type]
+    return fields
+
+
+PARAMETER: Fields = {'value': float, 'stderr': float, 'unit': str}
+DECISION: Fields = {
+    'say': str,
+    'why': str,
+    'figure': Figure,
+    'confidence': float | None,
+    'bound': NotRequired[list[EffectBound]],
+}
 FIELDS: Fields = {
     'verdict': Verdict,
     'noise_px': float,
@@ -59,7 +87,7 @@ FIELDS: Fields = {
     'observations': int,
     'base': FitQuality,
     'components': list[Component],
-    'causes': list[CauseEntry],
+    'causes': [_entry(Cause, CAUSE)],
     'named': FitQuality,
     'lens': {
         'rms_px': float,
@@ -70,8 +98,8 @@ FIELDS: Fields = {
     },
     'extended': FitQuality,
     'file': FileFigure,
-    'candidates': list[CandidateEntry],
-    'decision': dict[str, DecisionEntry],
+    'candidates': [_entry(Finding, CANDIDATE)],
+    'decision': dict[str, DECISION],  # type: ignore[valid-type]
     'adequacy': [
         {
             'flaw': str,
@@ -87,13 +115,13 @@ FIELDS: Fields = {
     'reached_deg': float,
     'photographs': list[dict],
     'gross': list[dict],
-    'advice': list[AdviceEntry],
+    'advice': [_entry(Advice, ADVICE)],
     'remaining': {'structure': list[Structure]},
     'untestable': [{'effect': str, 'why': str}],
     'gain': {'value': float, 'low': float, 'high': float},
     'intrinsics': dict[str, Intrinsic],
     'uncertainty': dict,
-    'trace': list[StepEntry],
+    'trace': [_entry(Finding, STEP)],
     'travel': Optional(given_px=float, extended_px=float),
     'external': NotRequired[dict],
     'turned': list[TurnedFrame],
@@ -156,8 +184,6 @@ def _may_be_absent(kind: Any) -> bool:
 def _node(kind: Any, path: str, meanings: Mapping[str, str], used: set[str]) -> dict[str, Any]:
     """Return the schema of a type; a number that is not known is null."""
     origin, inside = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return _node(inside[1], path, meanings, used)
     if origin is NotRequired:
         return _node(inside[0], path, meanings, used)
     if origin is Literal:
@@ -176,11 +202,11 @@ def _node(kind: Any, path: str, meanings: Mapping[str, str], used: set[str]) -> 
         return {'type': 'array', 'items': _node(inside[0], path, meanings, used)}
     if origin in (list, Sequence):
         return {'type': 'array', 'items': _node(inside[0], path, meanings, used)}
-    if origin is dict:
+    if origin in (dict, Mapping):
         item = _node(inside[1], f'{path}.NAME', meanings, used)
         return {'type': 'object', 'additionalProperties': item}
-    if is_typeddict(kind) or is_dataclass(kind) or hasattr(kind, '_fields'):
-        fields = get_type_hints(kind, include_extras=True)
+    if is_dataclass(kind) or hasattr(kind, '_fields'):
+        fields = get_type_hints(kind)
         return _record(fields, path, meanings, used)
     if kind is float:
         return {'type': ['number', 'null']}

@@ -1,108 +1,54 @@
 """diagnosis.json: facts of a diagnosis by the keys of the design, with their sentences.
 
-docs/reference/diagnosis.schema.json is generated from the entries here and the records that they
-hold: python docs/diagnosis_schema.py
+docs/reference/diagnosis.schema.json is generated from the keys here and the records that have
+them: python docs/diagnosis_schema.py
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from enum import Enum
 from math import degrees
-from typing import Annotated, Any, NotRequired, TypedDict
+from typing import Any
 
-from fisheye_svp_ros.diagnosis import (
-    Advice,
-    Cause,
-    Decision,
-    Diagnosis,
-    EffectBound,
-    Figure,
-    Finding,
-    Status,
-)
+from fisheye_svp_ros.diagnosis import Decision, Diagnosis
 from fisheye_svp_ros.reporting.wording.adequacy import flaw_document
 from fisheye_svp_ros.reporting.wording.causes import finding_reason
 from fisheye_svp_ros.reporting.wording.decisions import advised_action, decision_reason, separation
 from fisheye_svp_ros.scene.observations import photograph_names
 
-
-class Parameter(TypedDict):
-    """An estimate."""
-
-    value: float
-    stderr: float
-    unit: str
+Keys = Mapping[str, str | Callable[[Any], Any]]  # JSON key to attribute, or to what computes it
 
 
-Parameters = Annotated[Mapping[str, Any], dict[str, Parameter]]  # what the schema says of it
-StatusName = Annotated[str, Status]
+def _same(names: str) -> Keys:
+    return {name: name for name in names.split()}
 
 
-class CauseEntry(TypedDict):
-    """A cause."""
-
-    effect: str
-    form: str
-    parameters: Parameters
-    p_value: float
-    probability: float
-    status: StatusName
-    share: float
-    survives: bool
-    heldout_rms_px: float
-    gain: float
-    indistinguishable_from: list[str]
-    odds: dict[str, float]
-    to_separate: str
-    refuted_by_frames: Sequence[tuple[int, int]]
-
-
-class CandidateEntry(TypedDict):
-    """An effect that is not confirmed."""
-
-    effect: str
-    parameters: Parameters
-    p_value: float
-    probability: float
-    status: StatusName
-    why: str
-
-
-class StepEntry(TypedDict):
-    """What was tried in the selection."""
-
-    effect: str
-    statistic: float
-    rank: int
-    p_value: float
-    corrected: float
-    held_out: float
-    held_out_stderr: float
-    accepted: bool
-    why: str
-
-
-class AdviceEntry(TypedDict):
-    """What to do."""
-
-    what: str
-    frames: list[int]
-    photographs: list[str]
-    landmarks: list[int]
-    boards: list[int]
-    gain: float
-    kind: str
-
-
-class DecisionEntry(TypedDict):
-    """What to do about lens, target or photographs."""
-
-    say: str
-    why: str
-    figure: Annotated[Mapping[str, Any], Figure]
-    confidence: float | None
-    bound: NotRequired[Annotated[list[dict[str, Any]], list[EffectBound]]]
+CAUSE: Keys = {
+    **_same('effect form parameters p_value probability status share survives heldout_rms_px'),
+    **_same('gain indistinguishable_from odds'),
+    'to_separate': separation,
+    'refuted_by_frames': 'refuted_by_frames',
+}
+CANDIDATE: Keys = {
+    **_same('effect parameters'),
+    'p_value': 'p_corrected',
+    **_same('probability status'),
+    'why': finding_reason,
+}
+STEP: Keys = {
+    'effect': 'form',
+    **_same('statistic rank p_value'),
+    'corrected': 'p_corrected',
+    **_same('held_out held_out_stderr'),
+    'accepted': 'is_accepted',
+    'why': finding_reason,
+}
+ADVICE: Keys = {
+    'what': advised_action,
+    **_same('frames photographs landmarks boards gain kind'),
+}
 
 
 def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
@@ -119,7 +65,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         'observations': d.observations,
         'base': base,
         'components': [part._asdict() for part in d.components],
-        'causes': [_cause(cause) for cause in d.causes],
+        'causes': [_entry(cause, CAUSE) for cause in d.causes],
         'named': named,
         'lens': {
             **lens,
@@ -129,7 +75,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         },
         'extended': extended,
         'file': d.file._asdict(),
-        'candidates': [_candidate(candidate) for candidate in d.candidates],
+        'candidates': [_entry(candidate, CANDIDATE) for candidate in d.candidates],
         'decision': {about: _decision(decision) for about, decision in d.decision.items()},
         'adequacy': [flaw_document(flaw) for flaw in d.adequacy.flaws],
         'reached_deg': degrees(d.adequacy.reached),
@@ -140,21 +86,29 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
             ).items()
         ],
         'gross': d.gross,
-        'advice': [_advice(advice) for advice in d.advice],
+        'advice': [_entry(advice, ADVICE) for advice in d.advice],
         'remaining': {'structure': [s._asdict() for s in d.remaining]},
         'untestable': [{'effect': e, 'why': why} for e, why in d.untestable.items()],
         'gain': d.figures.gain.interval,
         'intrinsics': {name: asdict(value) for name, value in d.evaluation.intrinsics.items()},
         'uncertainty': d.evaluation.uncertainty,
-        'trace': [_step(finding) for finding in d.trace],
+        'trace': [_entry(finding, STEP) for finding in d.trace],
         **_external(d),
         'turned': [asdict(view) for view in d.turned],
         **({'hand_eye': d.hand_eye.to_dict()} if d.hand_eye else {}),
     }
 
 
-def _decision(decision: Decision) -> DecisionEntry:
-    entry: DecisionEntry = {
+def _entry(record: object, keys: Keys) -> dict[str, Any]:
+    values = {
+        key: getattr(record, source) if isinstance(source, str) else source(record)
+        for key, source in keys.items()
+    }
+    return {key: v.value if isinstance(v, Enum) else v for key, v in values.items()}
+
+
+def _decision(decision: Decision) -> dict[str, Any]:
+    entry: dict[str, Any] = {
         'say': decision.say,
         'why': decision_reason(decision),
         'figure': decision.figure._asdict(),
@@ -163,62 +117,6 @@ def _decision(decision: Decision) -> DecisionEntry:
     if decision.bound:
         entry['bound'] = [asdict(bound) for bound in decision.bound]
     return entry
-
-
-def _cause(cause: Cause) -> CauseEntry:
-    return {
-        'effect': cause.effect,
-        'form': cause.form,
-        'parameters': cause.parameters,
-        'p_value': cause.p_value,
-        'probability': cause.probability,
-        'status': cause.status.value,
-        'share': cause.share,
-        'survives': cause.survives,
-        'heldout_rms_px': cause.heldout_rms_px,
-        'gain': cause.gain,
-        'indistinguishable_from': cause.indistinguishable_from,
-        'odds': dict(cause.odds),
-        'to_separate': separation(cause),
-        'refuted_by_frames': cause.refuted_by_frames,
-    }
-
-
-def _advice(advice: Advice) -> AdviceEntry:
-    return {
-        'what': advised_action(advice),
-        'frames': advice.frames,
-        'photographs': advice.photographs,
-        'landmarks': advice.landmarks,
-        'boards': advice.boards,
-        'gain': advice.gain,
-        'kind': advice.kind,
-    }
-
-
-def _candidate(candidate: Finding) -> CandidateEntry:
-    return {
-        'effect': candidate.effect,
-        'parameters': candidate.parameters,
-        'p_value': candidate.p_corrected,
-        'probability': candidate.probability,
-        'status': candidate.status.value,
-        'why': finding_reason(candidate),
-    }
-
-
-def _step(finding: Finding) -> StepEntry:
-    return {
-        'effect': finding.form,
-        'statistic': finding.statistic,
-        'rank': finding.rank,
-        'p_value': finding.p_value,
-        'corrected': finding.p_corrected,
-        'held_out': finding.held_out,
-        'held_out_stderr': finding.held_out_stderr,
-        'accepted': finding.is_accepted,
-        'why': finding_reason(finding),
-    }
 
 
 def _external(d: Diagnosis) -> dict[str, Any]:
