@@ -43,7 +43,7 @@ def test_the_page_names_every_room_and_what_is_there() -> None:
     for registry, home in (
         ('READERS', 'io/readers.py'),
         ('COMMANDS', 'cli.py'),
-        ('_drawings', 'paper/report.py'),
+        ('_picture_tasks', 'paper/report.py'),
         ('CATALOGUE', 'effects/catalogue.py'),
         ('IMAGE_HEIGHTS', 'optics/curves.py'),
     ):

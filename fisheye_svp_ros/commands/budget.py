@@ -81,7 +81,13 @@ def run(args: argparse.Namespace) -> None:
 
     from fisheye_svp_ros.io.files import write_json
     from fisheye_svp_ros.io.share import typed_lens_path
-    from fisheye_svp_ros.reporting.budget_report import BudgetRequest, answer, document, draw, rows
+    from fisheye_svp_ros.reporting.budget_report import (
+        BudgetRequest,
+        answer,
+        budget_rows,
+        document,
+        draw,
+    )
     from fisheye_svp_ros.reporting.terminal import draw_or_note, print_table, progress
     from fisheye_svp_ros.scene.rigs import rig
     from fisheye_svp_ros.study.budget import Setup, at_point, default_spread, make_budget
@@ -103,7 +109,7 @@ def run(args: argparse.Namespace) -> None:
         f'{lens.name}: landmarks within {np.degrees(spread):.0f} degrees of the axis, at '
         f'{args.working_range:g} m, {args.noise:g} px of noise',
         asked.header,
-        rows(points, asked),
+        budget_rows(points, asked),
     )
     print(f'  {answer(points, asked)}')
     if args.output:

@@ -35,7 +35,7 @@ from fisheye_svp_ros.commands.notes import (
 from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.commands.plan import view_count, view_limits
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
-from fisheye_svp_ros.io.csv_files import write_table
+from fisheye_svp_ros.io.csv_files import write_columns
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import check_sizes, read_poses
@@ -143,7 +143,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Diagnose, say what is wrong, write report and extended lens."""
     from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose, diagnose_against
-    from fisheye_svp_ros.planning.plan import check_number
+    from fisheye_svp_ros.planning.plan import check_parameter_name
     from fisheye_svp_ros.reporting.terminal import stages
     from fisheye_svp_ros.reporting.wording.first_screen import (
         headline_changes,
@@ -167,7 +167,7 @@ def run(args: argparse.Namespace) -> None:
     other = _read(args.against, args, given)[0] if args.against else None
     if args.number and isinstance(lens, Lens):
         fitted = free_parameters(rig_lenses(observations, lens), free)
-        check_number(args.number, observations, lens, fitted)
+        check_parameter_name(args.number, observations, lens, fitted)
     told: list[tuple[str, ...]] = []
     with stages('diagnosing') as progress:
 
@@ -388,7 +388,7 @@ def _write(
 def _write_residuals(path: Path, points: PointResiduals, table: Observations) -> None:
     cameras = np.array(table.cameras)[points.camera]
     named = {'camera': cameras} if len(table.cameras) > 1 else {}
-    write_table(
+    write_columns(
         path,
         {
             'frame': points.frame,

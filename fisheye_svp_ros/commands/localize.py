@@ -30,7 +30,7 @@ from fisheye_svp_ros.commands.notes import (
 from fisheye_svp_ros.commands.outputs import add_output_folder
 from fisheye_svp_ros.detect.patterns import LOOSE_TAGS
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.io.csv_files import write_table
+from fisheye_svp_ros.io.csv_files import write_columns
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.readers import check_sizes, write_poses
 from fisheye_svp_ros.io.rig_files import load_cameras
@@ -261,7 +261,7 @@ def _write_poses(
     photographs = photograph_column(table, frame)
     write_poses(folder / 'poses.csv', frame, pose, photographs)
     names = [f'{a}_{b}' for a in _AXES for b in _AXES]
-    write_table(
+    write_columns(
         folder / 'covariance.csv',
         {
             'frame': frame,
@@ -283,7 +283,7 @@ def _write(
     used = views.used
     frame = np.broadcast_to(views.frame[:, None], used.shape)
     theta, distance = sight(model, result.pose, views)
-    write_table(
+    write_columns(
         folder / 'residuals.csv',
         {
             'frame': frame[used],
@@ -344,7 +344,7 @@ def _write_rig(folder: Path, cameras: tuple[str, ...], localization: RigLocaliza
     frame, camera = (
         np.broadcast_to(part[:, None], used.shape)[used] for part in (views.frame, data.camera_of)
     )
-    write_table(
+    write_columns(
         folder / 'residuals.csv',
         {
             'frame': frame,

@@ -12,7 +12,7 @@ from typing import Any
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.commands.processes import Processes
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
-from fisheye_svp_ros.io.parameters import SWEEP, parameters_of, read_parameter_file, rows
+from fisheye_svp_ros.io.parameters import SWEEP, node_parameters, read_parameter_file, rows
 from fisheye_svp_ros.study.sweep import CAMERA, TABLES, Plan, idle_solvers, plan_sweep
 
 _PATIENCE = 3600.0  # s, of a solver for the other topics of a set: nothing is lost in lock-step
@@ -25,7 +25,7 @@ def read_sweep(path: Path) -> Plan:
         space = namespace_of(given)
         for pattern, values in given.items():
             _check_names(pattern, values, space)
-        plan = plan_sweep({node: parameters_of(f'{space}/{node}', given) for node in TABLES})
+        plan = plan_sweep({node: node_parameters(f'{space}/{node}', given) for node in TABLES})
         # A pattern such as /** means those that there are; a name means that node.
         named = [node for node in TABLES if f'{space}/{node}' in given]
         for sentence in idle_solvers(plan, named):
@@ -62,7 +62,7 @@ def lens_folder(plan: Plan) -> str:
 
 def _check_names(pattern: str, values: Mapping[str, Any], space: str) -> None:
     """Refuse what means nothing to any node; the nodes themselves would only warn."""
-    nodes = [node for node in TABLES if parameters_of(f'{space}/{node}', {pattern: values})]
+    nodes = [node for node in TABLES if node_parameters(f'{space}/{node}', {pattern: values})]
     if values and not nodes:
         raise ParameterError(f'{pattern} is not a node of a sweep; known are {", ".join(TABLES)}')
     known = {row.name for node in nodes for row in rows(TABLES[node])}

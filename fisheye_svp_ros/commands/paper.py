@@ -21,15 +21,15 @@ def run(args: argparse.Namespace) -> None:
     import os
 
     from fisheye_svp_ros.commands.executors import process_pool
-    from fisheye_svp_ros.paper.report import write_report
-    from fisheye_svp_ros.paper.results import compute, tasks
+    from fisheye_svp_ros.paper.report import write_paper_report
+    from fisheye_svp_ros.paper.results import compute, task_count
     from fisheye_svp_ros.reporting.terminal import print_table, progress
 
     with process_pool(os.cpu_count() or 1) as workers:
-        with progress('evaluating', tasks()) as step:
+        with progress('evaluating', task_count()) as step:
             results = compute(workers.executor, step)
         with progress('drawing'):
-            written = write_report(results, args.output, workers.executor)
+            written = write_paper_report(results, args.output, workers.executor)
     print_table(
         f'Tables 1 and 2: {results.agreeing(0.10)} of 36 z and residual cells within 10 % of the '
         f'published ones, {results.agreeing(0.05)} within 5 %',

@@ -306,7 +306,7 @@ class Effect(ABC):
         """Return structure and values as the lens YAML holds them."""
         names = [parameter.name for parameter in self.parameters]
         numbers = dict(zip(names, map(float, values), strict=True))
-        structure = {name: _to_json(value) for name, value in asdict(self).items()}
+        structure = {name: _plain_value(value) for name, value in asdict(self).items()}
         return {**structure, 'parameters': numbers}
 
     @classmethod
@@ -431,9 +431,9 @@ def _shorten(value: Any) -> str:
     return f'{value:.4g}' if isinstance(value, float) else str(value)
 
 
-def _to_json(value: Any) -> Any:
+def _plain_value(value: Any) -> Any:
     if isinstance(value, tuple | list):
-        return [_to_json(item) for item in value]
+        return [_plain_value(item) for item in value]
     return value.item() if isinstance(value, np.generic) else value
 
 

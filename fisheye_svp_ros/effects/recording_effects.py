@@ -113,7 +113,7 @@ class SessionStepEffect(Effect):
         instants = np.unique(scene.times if timed else scene.views.frame.astype(float))
         if len(instants) < 6:
             raise Untestable('fewer than six frames')
-        return [cls((float(start),), timed) for start in _starts(instants)]
+        return [cls((float(start),), timed) for start in _step_instants(instants)]
 
     def beside_intrinsics(self, scene: Scene) -> Effect:
         return replace(self, means=tuple(self.step_design(scene).mean(axis=0).tolist()))
@@ -154,7 +154,7 @@ class SessionStepEffect(Effect):
         return np.asarray(instant[:, None] >= np.array(self.starts), dtype=float)
 
 
-def _starts(instants: Array) -> Array:
+def _step_instants(instants: Array) -> Array:
     """Return the instants to ask for: of a recording of many every few, and those after pauses."""
     starts, pauses = instants[2:-1], np.diff(instants)[1:-1]
     if len(starts) <= 2 * _MAX_STARTS:

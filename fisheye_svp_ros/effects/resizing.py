@@ -77,7 +77,7 @@ class ImageChange(NamedTuple):
         return np.asarray((uv + 0.5 - self.offset) * self.scale - 0.5)
 
 
-def resize_lens(lens: Lens, change: ImageChange) -> tuple[Lens, tuple[str, ...]]:
+def transform_lens(lens: Lens, change: ImageChange) -> tuple[Lens, tuple[str, ...]]:
     """Return the lens of a changed image without `uncertainty`, and which corrections are lost.
 
     Lost are those that belong to the pixels of the old image, where these have another size.

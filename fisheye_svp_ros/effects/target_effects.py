@@ -161,7 +161,7 @@ class TargetShapeEffect(Effect):
         boards = [board for board in scene.boards if board.flat]
         if not boards:
             raise Untestable('no landmarks lie on a flat board that could be bowed')
-        every = tuple(_axes(board) for board in boards)
+        every = tuple(_board_axes(board) for board in boards)
         highest = min(board.highest_degree for board in boards)
         forms: list[Effect] = [cls(degree, every) for degree in _DEGREES if degree <= highest]
         if len(every) > 1:
@@ -177,7 +177,7 @@ class TargetShapeEffect(Effect):
         return tuple(
             Parameter(f'board{int(board[0])}.z{i}{j}', 'm', 0.005)
             for board in self.boards
-            for i, j in _powers(self.degree)
+            for i, j in _monomials(self.degree)
         )
 
     @property
@@ -192,17 +192,17 @@ class TargetShapeEffect(Effect):
             arm = (views.points - np.array([ox, oy, oz])) / size
             first, second = np.array([ax, ay, az]), np.array([bx, by, bz])
             a, b = (polynomial.polyvander(arm @ axis, self.degree) for axis in (first, second))
-            shape = np.stack([a[..., i] * b[..., j] for i, j in _powers(self.degree)], axis=-1)
+            shape = np.stack([a[..., i] * b[..., j] for i, j in _monomials(self.degree)], axis=-1)
             shape = shape * (views.board == number)[..., None]
             blocks.append(shape[..., None, :] * np.cross(first, second)[:, None])
         return np.concatenate(blocks, axis=-1)
 
 
-def _powers(degree: int) -> list[tuple[int, int]]:
+def _monomials(degree: int) -> list[tuple[int, int]]:
     return [(total - j, j) for total in range(2, degree + 1) for j in range(total + 1)]
 
 
-def _axes(board: Board) -> BoardAxes:
+def _board_axes(board: Board) -> BoardAxes:
     flat = (float(board.id), *board.center, *board.axes[0], *board.axes[1], board.size)
     return tuple(float(x) for x in np.round(flat, 9))
 

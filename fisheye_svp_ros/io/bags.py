@@ -67,7 +67,7 @@ def decompress_file(file: Path, note: Callable[[str], None]) -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / file.stem
         try:
-            _unpack(file, whole)
+            _decompress(file, whole)
         except (zstandard.ZstdError, ValueError) as cause:
             note(f'{file.name} is damaged ({cause})')
         except OSError as cause:
@@ -87,7 +87,7 @@ def unpacked_message(data: bytes) -> bytes:
     return zstandard.ZstdDecompressor().decompress(data, max_output_size=MAX_BYTES)
 
 
-def _unpack(file: Path, whole: Path) -> None:
+def _decompress(file: Path, whole: Path) -> None:
     most, size = _EXPANDS * file.stat().st_size, 0
     reader = zstandard.ZstdDecompressor().stream_reader
     with file.open('rb') as packed, reader(packed) as stream, whole.open('wb') as output:

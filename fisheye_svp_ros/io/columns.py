@@ -140,8 +140,8 @@ class TableParts:
                 raise ValueError('rows are missing')
         except Exception as cause:  # whatever pandas makes of what is damaged
             raise OutputError(
-                f'{self._path(number)}: a part of the table is damaged ({_brief(cause)}); remove '
-                'it and compute it again'
+                f'{self._path(number)}: a part of the table is damaged ({_first_line(cause)}); '
+                'remove it and compute it again'
             ) from cause
         return part
 
@@ -157,11 +157,11 @@ def read_table(path: Path, wanted: Callable[[str], bool] = lambda _: True) -> Da
     with open_bytes(path, OutputError) as stream:
         try:
             if path.suffix == '.csv':
-                _check_rows(stream)
+                _check_row_lengths(stream)
                 return _read_in_pieces(stream, wanted)
             return _read_parquet(pyarrow, stream, wanted)
         except Exception as cause:  # whatever pandas or pyarrow makes of what is damaged
-            raise OutputError(f'{path}: not a table ({_brief(cause)})') from cause
+            raise OutputError(f'{path}: not a table ({_first_line(cause)})') from cause
 
 
 def _read_csv(stream: IO[bytes], **options: Any) -> DataFrame:
@@ -173,7 +173,7 @@ def _read_csv(stream: IO[bytes], **options: Any) -> DataFrame:
     return pandas.read_csv(stream, keep_default_na=False, na_values=[''], **options)
 
 
-def _check_rows(stream: IO[bytes]) -> None:
+def _check_row_lengths(stream: IO[bytes]) -> None:
     """Raise ValueError for what pandas passes over: columns of one name, rows of other lengths."""
     text = TextIOWrapper(stream, encoding='utf-8', newline='')
     header = next(csv.reader(text), [])
@@ -215,7 +215,7 @@ def _read_in_pieces(stream: IO[bytes], wanted: Callable[[str], bool]) -> DataFra
             return _read_csv(stream, usecols=wanted, low_memory=False)
 
 
-def _brief(cause: Exception) -> str:
+def _first_line(cause: Exception) -> str:
     return (str(cause) or type(cause).__name__).splitlines()[0]
 
 

@@ -210,7 +210,7 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def write_table(path: str | Path, columns: Mapping[str, NDArray[Any]]) -> None:
+def write_columns(path: str | Path, columns: Mapping[str, NDArray[Any]]) -> None:
     """Write columns (N,) as CSV, which reads back to the same bits; raise OutputError."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')
@@ -310,7 +310,7 @@ def write_observations(path: str | Path, observations: Observations) -> None:
         columns['t'] = table.t
     if known.any():
         columns['sigma'] = np.where(known, table.sigma.astype(object), '')
-    write_table(path, columns)
+    write_columns(path, columns)
 
 
 class FramePoses(NamedTuple):
@@ -347,7 +347,7 @@ def write_poses(
 
     Raises OutputError where the file cannot be written.
     """
-    write_table(path, pose_columns(frame, pose) | dict(more))
+    write_columns(path, pose_columns(frame, pose) | dict(more))
 
 
 def pose_columns(frame: Index, pose: Pose) -> dict[str, NDArray[Any]]:

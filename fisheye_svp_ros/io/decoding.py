@@ -264,7 +264,7 @@ def columns(points: Points, names: Sequence[str]) -> Array:
 
 def read_pose(message: Any, topic: str = 'true_pose') -> Pose:
     """Return the pose of a PoseStamped."""
-    return _pose(message.pose.position, message.pose.orientation, topic)
+    return _decode_pose(message.pose.position, message.pose.orientation, topic)
 
 
 def read_framed_pose(message: Any, topic: str = 'true_pose') -> FramedPose:
@@ -274,7 +274,7 @@ def read_framed_pose(message: Any, topic: str = 'true_pose') -> FramedPose:
 
 def read_transform(message: Any, topic: str = 'rig') -> Pose:
     """Return the pose of a TransformStamped's child in its frame."""
-    return _pose(message.transform.translation, message.transform.rotation, topic)
+    return _decode_pose(message.transform.translation, message.transform.rotation, topic)
 
 
 def read_framed_rig(message: Any, topic: str = 'rig') -> FramedRig:
@@ -332,7 +332,7 @@ def read_framed_camera(
     return FramedCamera(read_camera_info(message, topic, rectified), str(message.header.frame_id))
 
 
-def frames_differ(one: str, other: str) -> bool:
+def are_different_frames(one: str, other: str) -> bool:
     """Say whether two frame_ids name different frames; an empty one may be any."""
     return bool(one and other) and one.lstrip('/') != other.lstrip('/')
 
@@ -357,7 +357,7 @@ def read_key_values(message: Any, topic: str = 'scenario') -> dict[str, str]:
     return states[0].values
 
 
-def _pose(position: Any, orientation: Any, topic: str) -> Pose:
+def _decode_pose(position: Any, orientation: Any, topic: str) -> Pose:
     place = np.array([position.x, position.y, position.z], dtype=float)
     quaternion = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
     if not (np.isfinite(place).all() and np.isfinite(quaternion).all()):

@@ -66,7 +66,7 @@ def load_lens(path: str | Path) -> Lens:
 
     Raises LensError, naming file and field, for anything impossible.
     """
-    text, camera = _read(path)
+    text, camera = _read_text_and_camera(path)
     foreign = read_foreign(path, text)
     if foreign is None and not camera:
         if not OWN_SECTIONS.search(text):
@@ -91,7 +91,7 @@ def read_lens_file(path: str | Path) -> Foreign | None:
 
     Raises LensError, naming file and field, for anything impossible.
     """
-    return read_foreign(path, _read(path)[0])
+    return read_foreign(path, _read_text_and_camera(path)[0])
 
 
 def cameras_in(path: str | Path) -> tuple[str, ...]:
@@ -102,7 +102,7 @@ def cameras_in(path: str | Path) -> tuple[str, ...]:
     if Path(path).is_dir():
         names = tuple(_in_folder(Path(path)))
         return names if len(names) > 1 else ()
-    text, camera = _read(path)
+    text, camera = _read_text_and_camera(path)
     foreign = None if camera else read_foreign(path, text)
     return tuple(foreign.lenses) if foreign and len(foreign.lenses) > 1 else ()
 
@@ -122,9 +122,9 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
     Target.from_entries(target, where)
     lens = Lens(
         name=str(document.get('name', Path(where).stem)),
-        width=_pixels(image, 'width', f'{where}: image'),
-        height=_pixels(image, 'height', f'{where}: image'),
-        **_projection(_section(document, 'projection', where), f'{where}: projection'),
+        width=_pixel_count(image, 'width', f'{where}: image'),
+        height=_pixel_count(image, 'height', f'{where}: image'),
+        **_projection_fields(_section(document, 'projection', where), f'{where}: projection'),
         max_incidence=np.nan,
         viewpoint_shift=_viewpoint_shift(document.get('viewpoint_shift'), where),
         port=None
@@ -143,7 +143,7 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
         raise LensError(f'{where}: {wrong}')
     given = document.get('max_incidence_deg')
     if given is not None:
-        degrees = _number(document, 'max_incidence_deg', where)
+        degrees = _number_at(document, 'max_incidence_deg', where)
         lens = check_lens(replace(lens, max_incidence=np.radians(degrees).item()), where)
     own = {name: entry for name, entry in own.items() if name not in _OF_LENS}
     for entries in (_effects(document, _LEGACY_KEY, where), own):
@@ -180,7 +180,7 @@ def lens_to_dict(lens: Lens) -> dict[str, Any]:
     return document
 
 
-def _read(path: str | Path) -> tuple[str, str]:
+def _read_text_and_camera(path: str | Path) -> tuple[str, str]:
     """Return the text of a file and the camera after its name, as in FILE#cam1."""
     file, camera = without_camera(str(path))
     if Path(file).is_dir():
@@ -225,14 +225,14 @@ def _in_folder(folder: Path) -> dict[str, Path]:
     return paths
 
 
-def _projection(section: Mapping[str, Any], where: str) -> dict[str, Any]:
+def _projection_fields(section: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Return what an image height and intrinsics are given by, as fields of a lens."""
     values = dict(section)
     if 'f' in values:
         if 'fx' in values or 'fy' in values:
             raise LensError(f'{where} has both f and fx or fy; keep one of them')
         values['fx'] = values['fy'] = values.pop('f')
-    numbers = {name: _number(values, name, where) for name in INTRINSICS}
+    numbers = {name: _number_at(values, name, where) for name in INTRINSICS}
     curve = {name: value for name, value in values.items() if name not in INTRINSICS}
     return {**numbers, 'image_height': _curve(curve, IMAGE_HEIGHTS, 'k', 1, where)}
 
@@ -254,7 +254,7 @@ def _tangential(section: Mapping[str, Any] | None, where: str) -> TangentialDist
         return None
     where = f'{where}: corrections.{TANGENTIAL}'
     _refuse_unknown(section, set(TangentialDistortion().values), where)
-    return TangentialDistortion(**{name: _number(section, name, where) for name in section})
+    return TangentialDistortion(**{name: _number_at(section, name, where) for name in section})
 
 
 def _curve(
@@ -270,7 +270,7 @@ def _curve(
     if not isinstance(name, str) or name not in registry:
         raise LensError(f'{where}.model is {name!r}; known are {", ".join(registry)}')
     kind = registry[name]
-    numbered = _vector(values.pop(listed, []), f'{where}.{listed}')
+    numbered = _three_numbers(values.pop(listed, []), f'{where}.{listed}')
     known = kind.coefficient_names
     most = sum(name.removeprefix(listed).isdigit() for name in known)
     if len(numbered) > most:
@@ -286,7 +286,7 @@ def _curve(
     ]
     if missing:
         raise LensError(f'{where}: incomplete; add {", ".join(missing)}')
-    return kind(**{name: _number(values, name, where) for name in values})
+    return kind(**{name: _number_at(values, name, where) for name in values})
 
 
 def _curve_to_dict(curve: Curve, registry: Registry[Any], listed: str) -> dict[str, Any]:
@@ -329,7 +329,7 @@ def _section(document: Mapping[str, Any], name: str, where: str) -> Mapping[str,
     return section
 
 
-def _number(mapping: Mapping[str, Any], name: str, where: str) -> float:
+def _number_at(mapping: Mapping[str, Any], name: str, where: str) -> float:
     value = mapping.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise LensError(f'{where}: {name} is {value!r}; a number is needed')
@@ -340,17 +340,17 @@ def _number(mapping: Mapping[str, Any], name: str, where: str) -> float:
     return float(value)
 
 
-def _pixels(mapping: Mapping[str, Any], name: str, where: str) -> int:
-    value = _number(mapping, name, where)
+def _pixel_count(mapping: Mapping[str, Any], name: str, where: str) -> int:
+    value = _number_at(mapping, name, where)
     if not value.is_integer():
         raise LensError(f'{where}: {name} is {value}; a whole number of pixels is needed')
     return int(value)
 
 
-def _vector(values: Any, where: str) -> list[float]:
+def _three_numbers(values: Any, where: str) -> list[float]:
     if not isinstance(values, list):
         raise LensError(f'{where} must be a list of numbers, is {values!r}')
-    return [_number({'value': value}, 'value', where) for value in values]
+    return [_number_at({'value': value}, 'value', where) for value in values]
 
 
 def _refuse_unknown(

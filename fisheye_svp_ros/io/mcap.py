@@ -56,7 +56,7 @@ def whole_messages(
     note: told what is damaged, and where; passed: told how many bytes more have been read.
     """
     held: list[RawMessage] = []
-    for batch in _batches(path, note, passed):
+    for batch in _chunk_messages(path, note, passed):
         first = min(message.time for message in batch)
         yield from (message for message in held if message.time <= first)
         rest = (message for message in held if message.time > first)
@@ -80,7 +80,7 @@ def listed_topics(path: Path) -> set[tuple[str, str]]:
     }
 
 
-def _batches(path: Path, note: _Note, passed: _Passed) -> Iterator[list[RawMessage]]:
+def _chunk_messages(path: Path, note: _Note, passed: _Passed) -> Iterator[list[RawMessage]]:
     """Yield the messages of each chunk that holds any."""
     schemas: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}

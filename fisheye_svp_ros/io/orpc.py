@@ -75,14 +75,14 @@ def _read_boards(path: Path) -> dict[int, BoardCorners]:
     """Read a .dsc and the .tp of the same name, which a single board can do without."""
     corners: dict[int, list[list[float]]] = {}
     number, places = -1, set()
-    for line, fields in _lines(path):
+    for line, fields in _numbered_lines(path):
         if len(fields) == 4:
             number = _parse_int(path, line, fields[0])
             if number in corners:
                 raise ObservationError(f'{path}, line {line}: board {number} is listed twice')
             corners[number] = []
         elif len(fields) == 6 and corners:
-            values = _numbers(path, line, fields)
+            values = _field_numbers(path, line, fields)
             if (corner := (number, *values[:3])) in places:
                 raise ObservationError(f'{path}, line {line}: this corner is listed twice')
             places.add(corner)
@@ -105,8 +105,8 @@ def _read_board_poses(path: Path, single: bool) -> dict[float, Array]:
     if single and not path.exists():
         return {0: np.eye(3, 4)}
     numbers: list[float] = []
-    for line, fields in _lines(path, separator=None):
-        numbers += _numbers(path, line, fields)
+    for line, fields in _numbered_lines(path, separator=None):
+        numbers += _field_numbers(path, line, fields)
     if not numbers or len(numbers) % 13:
         raise ObservationError(f'{path}: a board number and 3 x 4 numbers are needed for each')
     poses = {one[0]: one[1:].reshape(3, 4) for one in np.reshape(numbers, (-1, 13))}
@@ -122,13 +122,13 @@ def _read_board_poses(path: Path, single: bool) -> dict[float, Array]:
 def _read_corners(path: Path, boards: dict[int, BoardCorners]) -> Array:
     """Return the rows (N, 5) of one .orpc file: board, corner, 1, u, v."""
     rows, promised = [], None
-    for line, fields in _lines(path):
+    for line, fields in _numbered_lines(path):
         if len(fields) == 1 and ':' in fields[0]:
             name, value = fields[0].split(':', 1)
             if name == 'num_corners':
                 promised = _parse_int(path, line, value)
             continue
-        row = _numbers(path, line, fields)
+        row = _field_numbers(path, line, fields)
         if len(row) != 5:
             raise ObservationError(f'{path}, line {line}: board, corner, 1, u, v are needed')
         board = boards.get(_parse_int(path, line, fields[0]))
@@ -169,7 +169,7 @@ def _time(file: Path) -> datetime | None:
         return None
 
 
-def _lines(path: Path, separator: str | None = ',') -> list[tuple[int, list[str]]]:
+def _numbered_lines(path: Path, separator: str | None = ',') -> list[tuple[int, list[str]]]:
     """Return line numbers and fields of the lines that are neither empty nor a comment."""
     text = read_text(path, ObservationError, _MAX_BYTES)
     return [
@@ -180,7 +180,7 @@ def _lines(path: Path, separator: str | None = ',') -> list[tuple[int, list[str]
 
 
 def _parse_int(path: Path, line: int, field: str) -> int:
-    value = _numbers(path, line, [field])[0]
+    value = _field_numbers(path, line, [field])[0]
     if not (value.is_integer() and 0 <= value <= MOST_LANDMARK):
         raise ObservationError(
             f'{path}, line {line}: {field.strip()!r} is not a whole number '
@@ -189,7 +189,7 @@ def _parse_int(path: Path, line: int, field: str) -> int:
     return int(value)
 
 
-def _numbers(path: Path, line: int, fields: list[str]) -> list[float]:
+def _field_numbers(path: Path, line: int, fields: list[str]) -> list[float]:
     try:
         values = [parse_number(field) for field in fields]
     except ValueError as cause:

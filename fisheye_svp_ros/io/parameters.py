@@ -190,7 +190,7 @@ def read_parameter_file(path: Path) -> ByNode:
     return result
 
 
-def parameters_of(node: str, by_node: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def node_parameters(node: str, by_node: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Return the parameters that apply to a node, by its full name; later patterns win."""
     values: dict[str, Any] = {}
     for pattern, parameters in by_node.items():
@@ -218,7 +218,7 @@ def _flatten(node: yaml.Node, prefix: str) -> dict[str, Any]:
         new = (
             _flatten(value, f'{name}.')
             if isinstance(value, yaml.MappingNode)
-            else {name: _value(value, name)}
+            else {name: _parameter_value(value, name)}
         )
         if new.keys() & values.keys():
             raise ValueError(
@@ -236,10 +236,10 @@ def _items(node: yaml.Node | None) -> list[tuple[str, yaml.Node]]:
     return [(str(key.value), value) for key, value in node.value]
 
 
-def _value(node: yaml.Node | None, name: str) -> Any:
+def _parameter_value(node: yaml.Node | None, name: str) -> Any:
     """Return a parameter value with the type that rcl gives it, which is not always YAML's."""
     if isinstance(node, yaml.SequenceNode):
-        values = [_value(item, name) for item in node.value]
+        values = [_parameter_value(item, name) for item in node.value]
         kinds = {type(value) for value in values}
         if len(kinds) > 1:
             whole = [value for value in values if isinstance(value, int)]

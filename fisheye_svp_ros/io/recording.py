@@ -79,7 +79,7 @@ def tabulate(records: Iterable[Any]) -> DataFrame:
         else:
             text = '; '.join(status.text for status in told)
             if any(status.level for status in told):
-                values |= _warning(text) if values else {'note': note_of_set(text)}
+                values |= _warning_columns(text) if values else {'note': note_of_set(text)}
             results.append((base, stamp, values))
     bases = {base for base, _ in tags}
     rows = {key: dict(values) for key, values in tags.items()}
@@ -101,7 +101,7 @@ def note_of_set(reason: str) -> str:
     return _EXCESS.sub('', _FRAME.sub('the set ', reason))
 
 
-def _warning(text: str) -> dict[str, str]:
+def _warning_columns(text: str) -> dict[str, str]:
     """Return why a solution should not be relied on: in few distinct words, and its first number.
 
     The number is a factor on sigma, or the first landmark that was left out.
@@ -187,7 +187,7 @@ def read(path: str | Path) -> Observations:
             f'{path}: observations need image_points and landmarks of one '
             f'namespace; {_topics_present(bag, worlds)}'
         )
-    return _table(sorted(sets, key=lambda one: one[:2]), landmarks, worlds.pop(), str(path))
+    return _join_sets(sorted(sets, key=lambda one: one[:2]), landmarks, worlds.pop(), str(path))
 
 
 def _topics_present(bag: Bag, worlds: set[str]) -> str:
@@ -200,7 +200,7 @@ def _topics_present(bag: Bag, worlds: set[str]) -> str:
     return f"landmarks are in: {listed}; record with --topics '{wanted}'"
 
 
-def _table(
+def _join_sets(
     sets: list[_PointSet], landmarks: dict[int, Landmarks], world: str, source: str
 ) -> Observations:
     stamps = sorted({one.stamp for one in sets})

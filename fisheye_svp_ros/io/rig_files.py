@@ -141,13 +141,13 @@ def pair_of_camera_infos(paths: Sequence[str | Path]) -> Pose | None:
 def rigs_of_lenses(path: str | Path) -> tuple[Pose, ...]:
     """Return each camera in the next one, as a file or folder of lenses holds them, if it does."""
     if Path(path).is_dir():
-        held = _read_rig(path) if _rig_file(path).exists() else _pair_in_folder(path)
+        held = _read_rig(path) if _rig_path(path).exists() else _pair_in_folder(path)
         return held.rigs if held else ()
     foreign = read_lens_file(path)
     return foreign.rigs if foreign else ()
 
 
-def _rig_file(path: str | Path) -> Path:
+def _rig_path(path: str | Path) -> Path:
     given = path_of(path)
     return given / 'rig.yaml' if given.is_dir() else given
 
@@ -171,7 +171,7 @@ def _pair_in_folder(folder: str | Path) -> Foreign | None:
 
 
 def _read_rig(path: str | Path) -> Foreign:
-    file = _rig_file(path)
+    file = _rig_path(path)
     if path_of(path).is_dir() and not file.exists() and (pair := _pair_in_folder(path)):
         return pair
     foreign = read_foreign(file, read_text(file, LensError, MAX_LENS_BYTES))

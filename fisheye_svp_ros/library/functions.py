@@ -455,7 +455,7 @@ def diagnose(
     from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose_against
     from fisheye_svp_ros.diagnosis import diagnose as find_causes
     from fisheye_svp_ros.planning.optimal_design import ViewLimits
-    from fisheye_svp_ros.planning.plan import check_number as check_number_known
+    from fisheye_svp_ros.planning.plan import check_parameter_name as check_number_known
     from fisheye_svp_ros.planning.plan import next_photographs
     from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
     from fisheye_svp_ros.solve.measured_poses import poses_by_frame, usable_observations

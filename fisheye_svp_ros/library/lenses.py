@@ -117,7 +117,7 @@ def undistort_views(
 
 def change_image(lens: Lens, change: ImageChange) -> tuple[Lens, tuple[str, ...]]:
     """Return the lens of a changed image, and what of it is lost."""
-    resized, lost = resizing.resize_lens(lens, change)
+    resized, lost = resizing.transform_lens(lens, change)
     if lens.uncertainty is None:
         return resized, lost
     if not change.keeps_square_pixels:

@@ -14,10 +14,10 @@ from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterE
 from fisheye_svp_ros.io.decoding import (
     CameraModel,
     FramedCamera,
-    frames_differ,
+    are_different_frames,
     read_framed_camera,
 )
-from fisheye_svp_ros.io.lens_formats.ros import lens_of
+from fisheye_svp_ros.io.lens_formats.ros import distortion_lens
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.quality import INFO_INPUT, SENSOR
 from fisheye_svp_ros.nodes.subscriptions import Unread
@@ -61,9 +61,9 @@ class CameraInfos:
         frame: that the camera_info must be of, where it is known.
         """
         known, own = self._camera(topic, stamp)
-        if frames_differ(own, frame):
+        if are_different_frames(own, frame):
             raise ObservationError(wording.camera_info_of_another(topic, own, frame))
-        lens = lens_of(*known, topic.replace('/', '_'), topic)
+        lens = distortion_lens(*known, topic.replace('/', '_'), topic)
         if self._told.get(topic) != known:
             self._told[topic] = known
             self._tell(f'{topic}: {known.model or "pinhole"} of {lens.width}x{lens.height} px')

@@ -14,7 +14,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from fisheye_svp_ros.errors import GraphError, ParameterError
-from fisheye_svp_ros.io.parameters import parameters_of, read_parameter_file
+from fisheye_svp_ros.io.parameters import node_parameters, read_parameter_file
 
 PACKAGE = 'fisheye_svp_ros'
 PROGRAM = 'fisheye-svp'
@@ -131,7 +131,7 @@ def compose_nodes(
     for name, own in given.items():
         values: dict[str, Any] = {}
         for file in _files(context, name):
-            values |= parameters_of(f'{space}/{name}', read_parameter_file(Path(file)))
+            values |= node_parameters(f'{space}/{name}', read_parameter_file(Path(file)))
         values |= {**_node_parameters(context, name), **own}
         document[f'{space}/{name}'] = {'ros__parameters': values}
     with NamedTemporaryFile('w', prefix='composed_', suffix='.yaml', delete=False) as stream:

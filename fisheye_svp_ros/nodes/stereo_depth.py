@@ -16,7 +16,7 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.decoding import (
     LANDMARKS,
     FramedRig,
-    frames_differ,
+    are_different_frames,
     read_framed_rig,
     structured_array,
 )
@@ -105,7 +105,7 @@ class StereoDepth(SolverNode):
         if self.settings.rig == 'topic' and self._latest is not None:
             rig, *frames = self._latest
             cameras = [items[f'{camera}image_points'].frame for camera in self.CAMERAS]
-            if any(map(frames_differ, frames, cameras)):
+            if any(map(are_different_frames, frames, cameras)):
                 raise ObservationError(wording.rig_of_others(frames, cameras))
             return rig
         known = true_rig(items) if self.settings.rig == 'true' else self._given

@@ -11,7 +11,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
-from fisheye_svp_ros.io.decoding import FramedPose, ImagePoints, LandmarkSet, frames_differ
+from fisheye_svp_ros.io.decoding import FramedPose, ImagePoints, LandmarkSet, are_different_frames
 from fisheye_svp_ros.nodes.join import NeighborPair
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.wording import inputs as wording
@@ -91,7 +91,7 @@ class SetValidation:
             if topic not in items:
                 continue
             pose, frame = items[topic]
-            if not frames_differ(frame, landmarks.frame):
+            if not are_different_frames(frame, landmarks.frame):
                 checked[topic] = pose
             elif (there := self._find(landmarks.frame, frame, stamp)) is not None:
                 checked[topic] = there.compose(pose)
@@ -139,13 +139,13 @@ class SetValidation:
         """Raise ObservationError for image points of another camera than those before."""
         now = time.monotonic()
         before, last = self._frames.get(topic, (frame, now))
-        if frames_differ(frame, before) and now - last < _FRAME_HOLDS:
+        if are_different_frames(frame, before) and now - last < _FRAME_HOLDS:
             raise ObservationError(wording.cameras_mixed(topic, frame, before))
         self._frames[topic] = frame, now
 
 
 def _interpolate(poses: NeighborPair) -> FramedPose:
     (first, frame), (second, other) = poses.first.read(), poses.second.read()
-    if frames_differ(frame, other):
+    if are_different_frames(frame, other):
         raise ObservationError(wording.frames_differ('true_pose', frame, 'true_pose', other))
     return FramedPose(Pose(*first.retract(poses.fraction * second.difference(first))), frame)

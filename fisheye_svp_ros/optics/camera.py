@@ -116,7 +116,7 @@ class LinearImage:
 
     @cached_property
     def _behind_port(self) -> tuple[Array, Array]:
-        shift, port = port_projection.columns(self.lens, self._sight)
+        shift, port = port_projection.port_columns(self.lens, self._sight)
         shape = (*self.points.shape[:-1], 2)
         columns = np.concatenate([shift[..., None], port], axis=-1).reshape(*shape, -1)
         columns = self.through_field(columns)

@@ -159,7 +159,7 @@ class ImageField:
                 f'{where}: unknown field {unknown[0]!r}; known are ' + ', '.join(_FIELDS)
             )
         arrays = {
-            name: _numbers(entry, name, where)
+            name: _number_array(entry, name, where)
             for name in _FIELDS
             if name in entry or name != 'stderr'
         }
@@ -222,7 +222,7 @@ def _node_weights(count: int) -> Array:
     return (4 * np.eye(count) + np.eye(count, k=1) + np.eye(count, k=-1)) / 6
 
 
-def _numbers(entry: Mapping[str, Any], name: str, where: str) -> Array:
+def _number_array(entry: Mapping[str, Any], name: str, where: str) -> Array:
     """Return a list of numbers, or of rows of them, as an array of finite ones."""
     if name not in entry:
         raise LensError(f'{where}.{name} is missing')

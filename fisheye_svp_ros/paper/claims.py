@@ -44,7 +44,7 @@ def claims(evaluations: Mapping[str, LensEvaluation]) -> list[Claim]:
     ]
 
 
-def _claim(
+def _make_claim(
     section: int, statement: str, holds: Sequence[Any], numbers: Mapping[str, Any]
 ) -> Claim:
     flat = np.concatenate([np.ravel(part) for part in holds])
@@ -56,7 +56,7 @@ def _localization_bounds(evaluation: LensEvaluation) -> Iterator[Claim]:
     lens, table = evaluation.lens.name, evaluation.localization
     name = NAMES[lens]
     worst = np.abs(table[..., :2]).max()
-    yield _claim(
+    yield _make_claim(
         3,
         f'{name}: position errors in x and y are less than {_SIDEWAYS[lens]} mm.',
         [worst < _SIDEWAYS[lens]],
@@ -67,7 +67,7 @@ def _localization_bounds(evaluation: LensEvaluation) -> Iterator[Claim]:
     ):
         between = f'{low} to {high}' if low != high else f'{low}'
         rounded = z.round(decimals)
-        yield _claim(
+        yield _make_claim(
             3,
             f'{name}: position errors in z for {spread.title()} are {between} mm.',
             [(rounded >= low) & (rounded <= high)],
@@ -75,7 +75,7 @@ def _localization_bounds(evaluation: LensEvaluation) -> Iterator[Claim]:
         )
     bound, decimals = _AXES[lens]
     worst = float(table[..., _AXIS].max())
-    yield _claim(
+    yield _make_claim(
         3,
         f'{name}: axis errors are very small, at most {bound} degree.',
         [round(worst, decimals) <= bound],
@@ -88,7 +88,7 @@ def _localization(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator
     size = [np.abs(values).mean() for values in z]
     angles = np.radians(np.linspace(0, 88, 89))
     spans = [1e3 * np.ptp(found.lens.shift_at(angles)) for found in (evaluation, other)]
-    yield _claim(
+    yield _make_claim(
         3,
         'The z errors of Fish214 are fairly large, those of Fish180 much smaller, because the '
         'viewpoint shift of Fish214 is much larger.',
@@ -98,7 +98,7 @@ def _localization(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator
     change = [(np.ptp(v, axis=0) / np.abs(v).mean(axis=0)).max() for v in z]
     axis = [found.localization[..., _AXIS] for found in (evaluation, other)]
     growth = min((a[-1] / a[0]).min() for a in axis)
-    yield _claim(
+    yield _make_claim(
         3,
         'The distance between camera and landmarks does not affect the localization errors.',
         [max(change) < 0.15, growth < 1.15],
@@ -107,7 +107,7 @@ def _localization(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator
     )
     far = [values[0] for values in z]
     ratios = [np.ptp(values) / np.abs(values).min() for values in far]
-    yield _claim(
+    yield _make_claim(
         3,
         'The range of the landmarks (Whole, Inner, Outer) affects the localization errors.',
         [min(ratios) > 1.0],
@@ -125,7 +125,7 @@ def _localization(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator
                 f'|z| from SVP, {where}': error,
             }
         best += [noise[0] == min(noise), bool(np.abs(values).argmin() == 0)]
-    yield _claim(
+    yield _make_claim(
         3,
         'Landmarks over the whole field of view give stable localization results.',
         [np.array(best)],
@@ -137,14 +137,14 @@ def _calibration(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator[
     position = [np.linalg.norm(f.calibration[..., :3], axis=-1) for f in (evaluation, other)]
     axis = [found.calibration[..., _AXIS] for found in (evaluation, other)]
     worst, worst_axis = position[0].max(), axis[0].max()
-    yield _claim(
+    yield _make_claim(
         4,
         'Fish180: position and axis errors of the three stereo styles are very small '
         '(published: at most 0.19 mm and 0.027 degree).',
         [worst < 0.19, worst_axis <= 0.027],
         {'largest position error, mm': worst, 'largest axis error, degree': worst_axis},
     )
-    yield _claim(
+    yield _make_claim(
         4,
         'Fish214: position and axis errors are rather larger than those of Fish180.',
         [position[1] > position[0], axis[1] > axis[0]],
@@ -162,7 +162,7 @@ def _stereo(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator[Claim
         for name in ('error2_px', 'error2_max_px', 'error3_m')
     )
     growth = error2[:, 1:] / error2[:, :-1]
-    yield _claim(
+    yield _make_claim(
         5,
         'Vertical errors of epipolar lines increase when the targets come close.',
         [growth > 1],
@@ -172,7 +172,7 @@ def _stereo(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator[Claim
         },
     )
     ordered = np.all(np.diff(error2, axis=2) > 0, axis=2).sum()
-    yield _claim(
+    yield _make_claim(
         5,
         'In most cases the errors increase in the order parallel, vergent, divergent.',
         [ordered > 3],
@@ -183,14 +183,14 @@ def _stereo(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator[Claim
     )
     yield from _ranges_met(error2, ERROR2_RANGE, 'vertical errors', 'px')
     ratio = error2[1] / error2[0]
-    yield _claim(
+    yield _make_claim(
         5,
         'The vertical errors of Fish214 are much larger than those of Fish180.',
         [ratio > 2],
         {'least ratio': ratio.min(), 'largest ratio': ratio.max()},
     )
     ratio = largest / error2
-    yield _claim(
+    yield _make_claim(
         5,
         'In every case the error size greatly varies with the position in the left image.',
         [ratio > 2],
@@ -202,7 +202,7 @@ def _stereo(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator[Claim
     yield from _ranges_met(1e3 * error3, ERROR3_RANGE, '3-D position errors', 'mm')
     # A relation would be a style or a radius that is worst throughout.
     farther, worst = error3[:, 0] > error3[:, 2], error3.argmax(axis=2)
-    yield _claim(
+    yield _make_claim(
         5,
         'There is no clear relation of the 3-D error to the distance or the stereo style.',
         [(worst != worst[0, 0]).any(), not farther.all()],
@@ -213,7 +213,7 @@ def _stereo(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator[Claim
         },
     )
     over = error2 > 1
-    yield _claim(
+    yield _make_claim(
         6,
         'For a target close to a stereo camera of Fish214 the viewpoint shift must be '
         'considered (more than one pixel off the epipolar line).',
@@ -231,7 +231,7 @@ def _ranges_met(
     for lens, values in zip(LENSES, errors, strict=True):
         low, high = published[lens]
         off = np.abs(np.log([values.min() / low, values.max() / high]))
-        yield _claim(
+        yield _make_claim(
             5,
             f'{NAMES[lens]}: the averages of the {what} are between {low} and {high} {unit} '
             f'(met within a factor of {_FACTOR:g} at both ends).',

@@ -79,10 +79,10 @@ def draw_residual_fields(path: Path, fields: Sequence[ResidualSet]) -> None:
         for line, name in zip(axes, names, strict=True):
             lens, mine = load_lens(lens_path(name)), [f for f in fields if f.tags['lens'] == name]
             for axis, field in zip(line, mine, strict=False):
-                _draw_field(axis, field, lens)
+                _draw_residuals(axis, field, lens)
 
 
-def _draw_field(axis: Any, field: ResidualSet, lens: Lens) -> None:
+def _draw_residuals(axis: Any, field: ResidualSet, lens: Lens) -> None:
     uv, residual = columns(field.points, ('u', 'v')), columns(field.points, ('du', 'dv'))
     edge, _ = lens.image_height.value_and_slope(np.array(lens.max_incidence))
     axis.add_patch(Circle((lens.cx, lens.cy), lens.fx * float(edge), fill=False, color=FAINT))

@@ -103,7 +103,7 @@ def localize_environments(
     views = views_of(points, ForwardModel(lens).predict(true, views_of(points)).uv)
     model = ForwardModel(lens.svp() if solver is None else solver)
     solved = localize_sets(model, views, true, true if start is None else start)
-    return LocalizedSpread(_rows(solved.metrics), solved.solution, views)
+    return LocalizedSpread(_paper_rows(solved.metrics), solved.solution, views)
 
 
 def localize_spreads(lens: Lens, solver: Lens | None = None) -> tuple[LocalizedSpread, ...]:
@@ -147,7 +147,7 @@ def calibrate_rigs(
         len(systems),
         Pose.stack([true for _, true in systems]),
     )
-    table = _rows(solved.metrics)
+    table = _paper_rows(solved.metrics)
     table[:, :3] = table[:, :3] @ PAPER_FROM_OPTICAL
     return table.reshape(len(RADII), len(STYLE_NAMES), -1), solved.solution
 
@@ -198,7 +198,7 @@ def captions_of(lens: str, error2: Array, error3: Array) -> dict[int, tuple[floa
     return {panel: CAPTIONS[lens][i] for i, panel in enumerate(best)}
 
 
-def _rows(metrics: Metrics) -> Array:
+def _paper_rows(metrics: Metrics) -> Array:
     """Return rows (E, 5) in the paper's units."""
     position = [1000 * metrics[f'position_error_{axis}_m'] for axis in 'xyz']
     return np.column_stack(

@@ -43,7 +43,7 @@ _ANGLES = (0, 20, 40, 60, 75, 85)  # degree
 _MM = 1e3
 
 
-def write_report(results: Results, folder: Path, executor: Executor) -> list[Path]:
+def write_paper_report(results: Results, folder: Path, executor: Executor) -> list[Path]:
     """Write everything into a folder, pictures by the executor; return the files.
 
     Raises OutputError where one cannot be written.
@@ -51,29 +51,29 @@ def write_report(results: Results, folder: Path, executor: Executor) -> list[Pat
     parts = (
         _summary,
         _recovery,
-        _localization,
+        _localization_blocks,
         _stopping,
-        _calibration,
-        _stereo,
+        _calibration_blocks,
+        _stereo_blocks,
         _claims,
         _solvers,
-        _noise,
+        _noise_blocks,
         _differences,
     )
     blocks = [block for part in parts for block in part(results)]
     write_json(folder / 'paper.json', results.document())
     with write_together():
-        pictures = _drawn(results, folder, executor)
+        pictures = _draw_pictures(results, folder, executor)
         return [folder / 'paper.json', *write_blocks(folder, 'paper', blocks), *pictures]
 
 
-def _drawn(results: Results, folder: Path, executor: Executor) -> list[Path]:
+def _draw_pictures(results: Results, folder: Path, executor: Executor) -> list[Path]:
     """Draw the pictures by the executor; return them."""
     under_way: dict[str, Future[None]] = {}
     with TemporaryDirectory() as scratch, ExitStack() as stack:
         # Whatever ends this, nobody draws any longer when the scratch folder goes.
         stack.callback(lambda: wait([one for one in under_way.values() if not one.cancel()]))
-        for name, (draw, *arguments) in _drawings(results).items():
+        for name, (draw, *arguments) in _picture_tasks(results).items():
             under_way[name] = executor.submit(draw, Path(scratch, f'{name}.png'), *arguments)
 
         def keep(path: Path) -> None:
@@ -84,7 +84,7 @@ def _drawn(results: Results, folder: Path, executor: Executor) -> list[Path]:
         return [path for path in paths if draw_or_note(path, keep)]
 
 
-def _drawings(results: Results) -> dict[str, tuple[Any, ...]]:
+def _picture_tasks(results: Results) -> dict[str, tuple[Any, ...]]:
     """Return functions and their arguments; the slowest first, so that workers end together."""
     panels = results.panels()
     half = len(panels) // 2
@@ -154,7 +154,7 @@ def _recovery(results: Results) -> Iterator[Block]:
     )
 
 
-def _localization(results: Results) -> Iterator[Block]:
+def _localization_blocks(results: Results) -> Iterator[Block]:
     yield Heading('Self-localization: tables 1 and 2, figure 6')
     for table in (1, 2):
         yield Heading(f'Table {table}: {NAMES[LENSES[table - 1]]}', 3)
@@ -207,7 +207,7 @@ def _stopping(results: Results) -> Iterator[Block]:
     )
 
 
-def _calibration(results: Results) -> Iterator[Block]:
+def _calibration_blocks(results: Results) -> Iterator[Block]:
     yield Heading('Stereo calibration: tables 3 and 4, figures 7 and 8')
     yield Picture('figure7.png', 'Figure 7: stereo configurations, from above.')
     yield Picture(
@@ -226,7 +226,7 @@ def _calibration(results: Results) -> Iterator[Block]:
     )
 
 
-def _stereo(results: Results) -> Iterator[Block]:
+def _stereo_blocks(results: Results) -> Iterator[Block]:
     yield Heading('Stereo measurement: figures 9 and 10')
     rows = []
     for panel in results.panels():
@@ -342,7 +342,7 @@ def _solvers(results: Results) -> Iterator[Block]:
     yield Picture('solvers.png', 'Mean errors by solver, on a logarithmic scale.')
 
 
-def _noise(results: Results) -> Iterator[Block]:
+def _noise_blocks(results: Results) -> Iterator[Block]:
     yield Heading('Where noise hides the SVP error')
     yield Text(
         'The range beyond which an SVP error is smaller than the noise: z against its standard '
@@ -378,7 +378,7 @@ def _differences(results: Results) -> Iterator[Block]:
                 f'{NAMES[cell.lens]} {cell.radius} m {cell.row}',
                 cell.quantity,
                 cell.unit,
-                _reason(cell, low, high),
+                _difference_reason(cell, low, high),
                 f'{cell.published:.4f}',
                 f'{cell.ours:.4f}',
                 *ends,
@@ -402,7 +402,7 @@ def _differences(results: Results) -> Iterator[Block]:
     yield TableBlock(header, rows, 5)
 
 
-def _reason(cell: Cell, low: Array, high: Array) -> str:
+def _difference_reason(cell: Cell, low: Array, high: Array) -> str:
     if cell.table < 3:
         return (
             f'{abs(cell.ours - cell.published):.4f} {cell.unit} that the recovered layout '

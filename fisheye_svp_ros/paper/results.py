@@ -103,7 +103,7 @@ class Results(NamedTuple):
                 'claims': self.verdicts(),
             },
             'lenses': {name: lens_to_dict(lens) for name, lens in self.lenses.items()},
-            'cells': [_cell(cell) for cell in self.cells()],
+            'cells': [_cell_document(cell) for cell in self.cells()],
             'panels': [
                 {
                     'figure': 9 + LENSES.index(panel.lens),
@@ -111,15 +111,16 @@ class Results(NamedTuple):
                     'radius_m': panel.radius,
                     'style': panel.style,
                     'points': panel.points,
-                    'error2_px': _pair(panel.published_error2, panel.error2),
-                    'error2_vertical_px': _pair(np.nan, panel.vertical),
-                    'error3_mm': _pair(panel.published_error3, panel.error3),
+                    'error2_px': _published_and_ours(panel.published_error2, panel.error2),
+                    'error2_vertical_px': _published_and_ours(np.nan, panel.vertical),
+                    'error3_mm': _published_and_ours(panel.published_error3, panel.error3),
                 }
                 for panel in self.panels()
             ],
             'claims': [claim._asdict() for claim in self.claims],
             'other_solvers': {
-                variant: [_cell(cell) for cell in self.cells(variant)] for variant in self.found
+                variant: [_cell_document(cell) for cell in self.cells(variant)]
+                for variant in self.found
             },
             'noise': [
                 {
@@ -163,7 +164,7 @@ def compute(executor: Executor, done: Callable[[], None] = lambda: None) -> Resu
     )
 
 
-def tasks() -> int:
+def task_count() -> int:
     """Return how many tasks `compute` hands to its executor."""
     return len(LENSES) * (len(VARIANTS) + 1)
 
@@ -204,7 +205,7 @@ def _out_of_line(study: Stopping) -> dict[str, Any]:
     }
 
 
-def _cell(cell: Cell) -> dict[str, Any]:
+def _cell_document(cell: Cell) -> dict[str, Any]:
     return {
         'table': cell.table,
         'lens': cell.lens,
@@ -212,10 +213,10 @@ def _cell(cell: Cell) -> dict[str, Any]:
         'row': cell.row,
         'quantity': cell.quantity,
         'unit': cell.unit,
-        **_pair(cell.published, cell.ours),
+        **_published_and_ours(cell.published, cell.ours),
         'new': bool(np.isnan(cell.published)),
     }
 
 
-def _pair(published: float, ours: float) -> dict[str, float]:
+def _published_and_ours(published: float, ours: float) -> dict[str, float]:
     return {'published': published, 'ours': ours, 'relative_difference': ours / published - 1}

@@ -76,7 +76,7 @@ def load_family(path: str | Path | None = None) -> Family:
 
     Raises ParameterError, naming the file, for one that the search did not make.
     """
-    path, document = _read(path, 'paper_search.yaml')
+    path, document = _read_study(path, 'paper_search.yaml')
     try:
         members = tuple(
             Member(
@@ -106,7 +106,7 @@ def load_stopping(path: str | Path | None = None) -> Stopping:
 
     Raises ParameterError, naming the file, for one that the study did not make.
     """
-    path, document = _read(path, 'paper_stopping.yaml')
+    path, document = _read_study(path, 'paper_stopping.yaml')
     try:
         dampings, gains = tuple(document['dampings']), tuple(document['gains_px2'])
         off = np.array([document['median_off_z'][lens] for lens in LENSES], dtype=float)
@@ -130,6 +130,6 @@ def shift_curves(members: Sequence[Member], lens: str, theta: Array) -> Array:
     return np.stack([curve.value_and_slope(theta, np.tan(theta / 2))[0] for curve in curves])
 
 
-def _read(path: str | Path | None, name: str) -> tuple[Path, Mapping[str, Any]]:
+def _read_study(path: str | Path | None, name: str) -> tuple[Path, Mapping[str, Any]]:
     path = config_path(name) if path is None else Path(path)
     return path, read_yaml(path, ParameterError)

@@ -94,26 +94,26 @@ class SessionState(NamedTuple):
 def evaluate_session(session: Session) -> SessionState | Exception:
     """Return what the photographs tell and which is wanted next; errors are returned, too."""
     try:
-        return _evaluate(session)
+        return _evaluate_photographs(session)
     except Exception as error:
         return error
 
 
-def _evaluate(session: Session) -> SessionState:
+def _evaluate_photographs(session: Session) -> SessionState:
     number, room = session.number, session.room
     if not session.taken:
         planned = plan(session.lens, session.points, room, _VIEWS_AHEAD, number, _DEFAULT_NOISE)
         return _session_state(session, ForwardModel(session.lens), planned.wanted)
     table = observations_of(session.taken, session.points)
-    linear = _refit(session, table)
+    linear = _refit_lens(session, table)
     lens, shift = linear.state.lens, linear.state.terms[0].values
     session = replace(session, latest=(lens, float(shift[0])))
     if len(session.taken) >= _MIN_DIAGNOSED:
         with suppress(FisheyeSvpError):  # the next photograph may mend it
             return _diagnose_session(session, usable_observations(table, lens).observations, lens)
-    wanted = next_photographs(linear, (), _noise(linear), _VIEWS_AHEAD, number, room)
+    wanted = next_photographs(linear, (), _noise_of_fit(linear), _VIEWS_AHEAD, number, room)
     return _session_state(
-        session, _model(linear), wanted, _value(linear, number), wanted.answers[0]
+        session, _board_model(linear), wanted, _number_value(linear, number), wanted.answers[0]
     )
 
 
@@ -135,7 +135,7 @@ def _diagnose_session(session: Session, table: Observations, lens: Lens) -> Sess
         if wanted.answers[-1] > MIN_PROBABILITY and len(session.taken) < _MAX_UNDECIDED:
             return _session_state(
                 session,
-                _model(diagnosis.evaluation.fixed_model),
+                _board_model(diagnosis.evaluation.fixed_model),
                 wanted,
                 named=(cause.effect,),
                 alike=names[1:],
@@ -154,14 +154,14 @@ def _diagnose_session(session: Session, table: Observations, lens: Lens) -> Sess
         number,
         room,
     )
-    value, stderr = _value(diagnosis.evaluation.fixed_model, number), wanted.answers[0]
+    value, stderr = _number_value(diagnosis.evaluation.fixed_model, number), wanted.answers[0]
     for cause in diagnosis.causes:
         if number in cause.parameters:
             value = cause.parameters[number]['value']
             stderr = max(stderr, cause.parameters[number]['stderr'])
     return _session_state(
         session,
-        _model(diagnosis.evaluation.fixed_model),
+        _board_model(diagnosis.evaluation.fixed_model),
         wanted,
         value,
         stderr,
@@ -171,7 +171,7 @@ def _diagnose_session(session: Session, table: Observations, lens: Lens) -> Sess
     )
 
 
-def _model(linear: Linearization) -> ForwardModel:
+def _board_model(linear: Linearization) -> ForwardModel:
     """Return how the lens images a board that is as it should be."""
     terms = [
         term
@@ -199,7 +199,7 @@ def _session_state(
     )
 
 
-def _value(linear: Linearization, number: str) -> float:
+def _number_value(linear: Linearization, number: str) -> float:
     """Return a number of lens or effects; 0 where there is none of it."""
     values = dict(linear.state.parameters)
     for term in linear.state.terms:
@@ -208,7 +208,7 @@ def _value(linear: Linearization, number: str) -> float:
     return values.get(number, 0.0)
 
 
-def _refit(session: Session, table: Observations) -> Linearization:
+def _refit_lens(session: Session, table: Observations) -> Linearization:
     """Return lens and e0 as far as the photographs tell them; the data sheet says the rest."""
     lens, shift = session.latest or (session.lens, 0.0)
     data, free = group_by_frame(table), intrinsic_names(lens)
@@ -229,7 +229,7 @@ def _prior(lens: Lens, free: Sequence[str]) -> Prior:
     )
 
 
-def _noise(linear: Linearization) -> float:
+def _noise_of_fit(linear: Linearization) -> float:
     """Return the noise of u and of v, px, from what the fit leaves, no less than is stated."""
     weight = linear.row_weight
     px = linear.residual[weight > 0] / weight[weight > 0]

@@ -162,7 +162,9 @@ def _choose_question(
     return 'e0', (), [ViewpointShiftEffect(1)]
 
 
-def check_number(number: str, observations: Observations, lens: Lens, free: Sequence[str]) -> None:
+def check_parameter_name(
+    number: str, observations: Observations, lens: Lens, free: Sequence[str]
+) -> None:
     """Raise ParameterError for a number that no diagnosis of a table determines.
 
     How many parts an effect has, and their names (NAME.PART), only the diagnosis tells.

@@ -42,18 +42,18 @@ def image_error(side: Rectification, ranges: Array) -> ImageError:
 
     Of a sphere along great circles: near its poles a small angle takes many pixels of azimuth.
     """
-    pixels, directions = _samples(side)
+    pixels, directions = _sample_pixels(side)
     px = np.full((len(ranges), len(pixels)), np.nan)
     for row, range_m in enumerate(ranges):
         uv, seen = side.image_points(directions, range_m)
         points = side.rectified_points(np.where(seen[:, None], uv, np.nan))
-        px[row] = _distances(side.camera, points, pixels)
+        px[row] = _pixel_distances(side.camera, points, pixels)
     return ImageError(ranges, pixels, px)
 
 
 def pair_error(pair: RectifiedPair, ranges: Array) -> PairError:
     """Return what is left of the difference of rows, and of depths by disparity, at ranges."""
-    pixels, directions = _samples(pair.left)
+    pixels, directions = _sample_pixels(pair.left)
     row, depth = np.full((2, len(ranges), len(pixels)), np.nan)
     for number, range_m in enumerate(ranges):
         points = pair.left.scene_points(directions, range_m)
@@ -110,7 +110,7 @@ def quantiles(errors: Array) -> Array:
     )
 
 
-def _distances(camera: RectifiedCamera, places: Array, pixels: Array) -> Array:
+def _pixel_distances(camera: RectifiedCamera, places: Array, pixels: Array) -> Array:
     """Return the distances (N,), px, between pixels (N, 2); NaN where `places` is."""
     straight: Array = np.linalg.norm(places - pixels, axis=-1)
     if camera.projection != 'equirectangular':
@@ -120,7 +120,7 @@ def _distances(camera: RectifiedCamera, places: Array, pixels: Array) -> Array:
     return np.asarray(np.where(np.isfinite(straight), along, np.nan))
 
 
-def _samples(side: Rectification) -> tuple[Array, Array]:
+def _sample_pixels(side: Rectification) -> tuple[Array, Array]:
     """Return rectified pixels (N, 2) all over what the maps reach, and their directions (N, 3)."""
     camera = side.camera
     step = max(camera.width, camera.height) / _SAMPLES

@@ -67,7 +67,7 @@ class BudgetRequest(NamedTuple):
         return [point for point in points if not self.given or point.quantity in self.given]
 
 
-def rows(points: Sequence[Point], asked: BudgetRequest) -> list[tuple[str, ...]]:
+def budget_rows(points: Sequence[Point], asked: BudgetRequest) -> list[tuple[str, ...]]:
     """Return the table's rows, under the header."""
     found = []
     for point in asked.relevant_points(points):
@@ -174,7 +174,7 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: BudgetReque
                 norm=LogNorm(),
                 cmap='Blues',
             )
-            _label(figure.colorbar(mesh, ax=axis, label=unit), error)
+            _label_color_bar(figure.colorbar(mesh, ax=axis, label=unit), error)
             title = f'{_LABELS[point.quantity]}: no limit'
             if point in asked.relevant_points(points):
                 _draw_limit(axis, budget, point, point.quantity in asked.given)
@@ -190,7 +190,7 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: BudgetReque
         _explain(axes.flat[len(points)], asked)
 
 
-def _label(bar: Any, error: Array) -> None:
+def _label_color_bar(bar: Any, error: Array) -> None:
     """Write plain numbers beside a logarithmic color bar; 1, 2, 5 where it is short."""
     short = error.max() < _LINEAR_AXIS_RATIO * error.min()
     bar.ax.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))

@@ -71,12 +71,12 @@ class CalibratedCamera:
 def hand_eye_rows(hand_eye: HandEye) -> list[tuple[str, ...]]:
     """Return both transforms as ROBOT_HEADER has them, each with its standard errors below it."""
     return [
-        *_rows(hand_eye.transform_names[0], hand_eye.camera, hand_eye.stderr[:6]),
-        *_rows(hand_eye.transform_names[1], hand_eye.target, hand_eye.stderr[6:12]),
+        *_transform_rows(hand_eye.transform_names[0], hand_eye.camera, hand_eye.stderr[:6]),
+        *_transform_rows(hand_eye.transform_names[1], hand_eye.target, hand_eye.stderr[6:12]),
     ]
 
 
-def _rows(name: str, pose: Pose, stderr: Array) -> list[tuple[str, ...]]:
+def _transform_rows(name: str, pose: Pose, stderr: Array) -> list[tuple[str, ...]]:
     turn = np.degrees(vector_from_rotation(pose.rotation))
     values = [
         *(f'{1e3 * value:.3f}' for value in pose.position),

@@ -55,12 +55,12 @@ def write_calibration_report(
             standard_errors=STANDARD_ERRORS,
             any_target=ANY_TARGET,
             any_target_note=ANY_TARGET_NOTE,
-            cameras=[_camera(name, camera) for name, camera in cameras.items()],
+            cameras=[_camera_section(name, camera) for name, camera in cameras.items()],
         ),
     )
 
 
-def _camera(name: str, camera: CalibratedCamera) -> dict[str, Any]:
+def _camera_section(name: str, camera: CalibratedCamera) -> dict[str, Any]:
     rays, ray_map = _rays(camera)
     figures = camera.lens.calibration or {}
     return {
@@ -81,10 +81,10 @@ def _camera(name: str, camera: CalibratedCamera) -> dict[str, Any]:
             (f'{e.range_m:g}', f'{1e3 * e.value:.2g}', f'{1e3 * e.low:.2g}', f'{1e3 * e.high:.2g}')
             for e in rays.errors()
         ],
-        'coverage': _drawn('coverage', 2, _coverage, camera),
-        'residuals': _drawn('residuals', 2, _residuals, camera),
-        'frames_picture': _drawn('residuals by frame', 1, _frames, camera),
-        'uncertainty': _drawn('uncertainty', 2, _uncertainty, ray_map),
+        'coverage': _picture_uris('coverage', 2, _draw_coverage, camera),
+        'residuals': _picture_uris('residuals', 2, _residuals, camera),
+        'frames_picture': _picture_uris('residuals by frame', 1, _frames, camera),
+        'uncertainty': _picture_uris('uncertainty', 2, _uncertainty, ray_map),
     }
 
 
@@ -107,7 +107,7 @@ def _rays(camera: CalibratedCamera) -> tuple[RayModel, RayMap]:
     return model, map_rays(rays_of, uv, (camera.lens.width, camera.lens.height))
 
 
-def _drawn(name: str, count: int, draw: Any, *arguments: Any) -> tuple[str, str]:
+def _picture_uris(name: str, count: int, draw: Any, *arguments: Any) -> tuple[str, str]:
     """Return a picture as part of the page, wide and narrow; '' where it cannot be drawn.
 
     count: of its panels; draw: takes a figure, the arguments, and whether the figure is narrow.
@@ -125,7 +125,7 @@ def _drawn(name: str, count: int, draw: Any, *arguments: Any) -> tuple[str, str]
     return png_uri(wide.getvalue()), png_uri(narrow.getvalue())
 
 
-def _image(axis: Any, lens: Lens) -> None:
+def _draw_image(axis: Any, lens: Lens) -> None:
     axis.set(
         xlim=(-0.5, lens.width - 0.5),
         ylim=(lens.height - 0.5, -0.5),
@@ -135,11 +135,11 @@ def _image(axis: Any, lens: Lens) -> None:
     )
 
 
-def _coverage(figure: Any, camera: CalibratedCamera, narrow: bool) -> None:
+def _draw_coverage(figure: Any, camera: CalibratedCamera, narrow: bool) -> None:
     image, field = panels(figure, 1, narrow)[0]
     views = camera.result.views
     image.plot(*views.uv[views.used].T, '.', color=OURS, ms=2)
-    _image(image, camera.lens)
+    _draw_image(image, camera.lens)
     image.set_title('image points')
     points = camera.result.adjusted.pose.into_body(views.points)[views.used]
     distance = np.linalg.norm(points, axis=-1)
@@ -162,7 +162,7 @@ def _residuals(figure: Any, camera: CalibratedCamera, narrow: bool) -> None:
     size = np.linalg.norm(residual, axis=1)
     typical = max(float(np.quantile(size, 0.9)), 1e-9)
     draw_arrows(image, uv[::step], residual[::step], typical, _ARROW_LENGTH * lens.width, OURS)
-    _image(image, lens)
+    _draw_image(image, lens)
     image.set_title('residuals')
     arm = uv - (lens.cx, lens.cy)
     radial = (residual * arm).sum(axis=1) / np.maximum(np.linalg.norm(arm, axis=1), 1e-9)

@@ -65,7 +65,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         'observations': d.observations,
         'base': base,
         'components': [part._asdict() for part in d.components],
-        'causes': [_entry(cause, CAUSE) for cause in d.causes],
+        'causes': [_record_entry(cause, CAUSE) for cause in d.causes],
         'named': named,
         'lens': {
             **lens,
@@ -75,7 +75,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         },
         'extended': extended,
         'file': d.file._asdict(),
-        'candidates': [_entry(candidate, CANDIDATE) for candidate in d.candidates],
+        'candidates': [_record_entry(candidate, CANDIDATE) for candidate in d.candidates],
         'decision': {about: _decision(decision) for about, decision in d.decision.items()},
         'adequacy': [flaw_document(flaw) for flaw in d.adequacy.flaws],
         'reached_deg': degrees(d.adequacy.reached),
@@ -86,20 +86,20 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
             ).items()
         ],
         'gross': d.gross,
-        'advice': [_entry(advice, ADVICE) for advice in d.advice],
+        'advice': [_record_entry(advice, ADVICE) for advice in d.advice],
         'remaining': {'structure': [s._asdict() for s in d.remaining]},
         'untestable': [{'effect': e, 'why': why} for e, why in d.untestable.items()],
         'gain': d.figures.gain.interval,
         'intrinsics': {name: asdict(value) for name, value in d.evaluation.intrinsics.items()},
         'uncertainty': d.evaluation.uncertainty,
-        'trace': [_entry(finding, STEP) for finding in d.trace],
+        'trace': [_record_entry(finding, STEP) for finding in d.trace],
         **_external(d),
         'turned': [asdict(view) for view in d.turned],
         **({'hand_eye': d.hand_eye.to_dict()} if d.hand_eye else {}),
     }
 
 
-def _entry(record: object, keys: Keys) -> dict[str, Any]:
+def _record_entry(record: object, keys: Keys) -> dict[str, Any]:
     values = {
         key: getattr(record, source) if isinstance(source, str) else source(record)
         for key, source in keys.items()

@@ -149,7 +149,7 @@ def draw_against(
     """Radial and tangential residuals against a variable (K,), with binned means."""
     rows = [('radial / px', 0), ('tangential / px', 1)]
     polar = {side: _polar(shown, getattr(shown.points, side)) for side, _ in _SIDES}
-    _grid(
+    _draw_grid(
         file,
         shown,
         [(name, x, {side: values[:, i] for side, values in polar.items()}) for name, i in rows],
@@ -162,7 +162,7 @@ def draw_against(
 def draw_phase(file: File, shown: PlotData, narrow: bool = False) -> None:
     """Residuals of u and v against the place of u and v within its pixel."""
     phase = np.mod(shown.points.uv + 0.5, 1.0) - 0.5
-    _grid(
+    _draw_grid(
         file,
         shown,
         [
@@ -201,7 +201,7 @@ def draw_histogram(file: File, shown: PlotData, narrow: bool = False) -> None:
             axis.label_outer()
 
 
-def _grid(
+def _draw_grid(
     file: File,
     shown: PlotData,
     rows: list[tuple[str, Array, dict[str, Array]]],

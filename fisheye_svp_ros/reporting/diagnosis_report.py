@@ -98,7 +98,7 @@ def write_report(
     Raises OutputError where one cannot be written.
     """
     pictures, narrow = [], {}
-    for name, draw, arguments in _drawings(diagnosis, wanted):
+    for name, draw, arguments in _picture_tasks_of(diagnosis, wanted):
         path, below = inputs.folder / f'{name}.png', BytesIO()
         if draw_or_note(path, _draw_both, below, draw, arguments):
             pictures.append(path)
@@ -123,9 +123,9 @@ def write_report(
             pictures={**dict.fromkeys(('target', 'evidence', 'next', 'uncertainty')), **drawn},
             narrow=narrow,
             shown=[(name, text) for name, text in CAPTIONS.items() if name in drawn],
-            **_causes(diagnosis),
+            **_cause_rows(diagnosis),
             **_budget(diagnosis),
-            **_evidence(diagnosis),
+            **_evidence_section(diagnosis),
             **_remaining_structures(diagnosis),
             next={}
             if wanted is None
@@ -156,7 +156,7 @@ def _draw_both(
     draw(below, *arguments, narrow=True)
 
 
-def _drawings(
+def _picture_tasks_of(
     diagnosis: Diagnosis, wanted: NextViews | None
 ) -> Iterator[tuple[str, Callable[..., None], Sequence[Any]]]:
     """Yield the pictures: name, what draws it into a file, arguments."""
@@ -199,7 +199,7 @@ def _free(inputs: ReportInputs, diagnosis: Diagnosis) -> str:
     return join_names([name for name, fitted in free.items() if fitted]) or 'nothing'
 
 
-def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
+def _cause_rows(diagnosis: Diagnosis) -> dict[str, Any]:
     causes = []
     for cause, row in zip(diagnosis.causes, cause_rows(diagnosis), strict=True):
         fields = dict(
@@ -228,15 +228,15 @@ def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
     return {'causes': causes, 'on_target': 'target' in stages}
 
 
-def _evidence(diagnosis: Diagnosis) -> dict[str, Any]:
+def _evidence_section(diagnosis: Diagnosis) -> dict[str, Any]:
     withdrawn = {candidate.effect: finding_reason(candidate) for candidate in diagnosis.candidates}
     return {
-        'steps': [_step(step, withdrawn) for step in diagnosis.trace],
+        'steps': [_step_row(step, withdrawn) for step in diagnosis.trace],
         'tested': len(CATALOGUE) - len(diagnosis.untestable),
     }
 
 
-def _step(step: Finding, withdrawn: Mapping[str, str]) -> dict[str, Any]:
+def _step_row(step: Finding, withdrawn: Mapping[str, str]) -> dict[str, Any]:
     """Return a row of the evidence; withdrawn: why accepted effects were not confirmed."""
     why = withdrawn.get(step.effect) if step.is_accepted else None
     reason = finding_reason(step)

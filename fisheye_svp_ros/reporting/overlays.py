@@ -62,7 +62,7 @@ def write_coverage(path: Path, detection: Detection) -> None:
             title=f'{len(table)} corners in {shown}',
         )
         for camera, name in enumerate(table.cameras):
-            _angles(field, detection, camera, name)
+            _draw_angles(field, detection, camera, name)
         field.set(
             xlabel='incidence angle, deg',
             ylabel='range, m',
@@ -70,7 +70,7 @@ def write_coverage(path: Path, detection: Detection) -> None:
         )
 
 
-def _angles(axes: object, detection: Detection, camera: int, name: str) -> None:
+def _draw_angles(axes: object, detection: Detection, camera: int, name: str) -> None:
     table = detection.observations
     try:
         fitted = calibrate(

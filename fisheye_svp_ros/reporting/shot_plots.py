@@ -135,8 +135,8 @@ def _draw_texts(picture: NDArray[np.uint8], guide: Guide) -> None:
     for top, bottom in ((0, round(2.6 * line)), (height - round(1.3 * line), height)):
         picture[top:bottom] //= 4
     for text, base in ((todo, 1.0), (where, 2.0)):
-        _write(picture, text, round(base * line), size)
-    _write(picture, known, height - round(0.4 * line), size)
+        _write_words(picture, text, round(base * line), size)
+    _write_words(picture, known, height - round(0.4 * line), size)
     left, right, top = round(0.6 * width), round(0.98 * width), round(0.3 * line)
     ready = guide.score >= MIN_SCORE
     cv2.rectangle(
@@ -151,7 +151,7 @@ def _draw_texts(picture: NDArray[np.uint8], guide: Guide) -> None:
     cv2.line(picture, (mark, top), (mark, line), _TEXT, 2)
 
 
-def _write(picture: NDArray[np.uint8], text: str, base: int, size: float) -> None:
+def _write_words(picture: NDArray[np.uint8], text: str, base: int, size: float) -> None:
     cv2.putText(
         picture,
         text,

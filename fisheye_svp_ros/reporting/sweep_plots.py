@@ -154,7 +154,9 @@ def _draw_curves(
                         f'{name} {value_text(v)}' for name, v in zip(by, curve.key, strict=True)
                     ),
                 )
-            _scale(axis, found[0].x, metric.factor * np.concatenate([c.median for c in found]))
+            _scale_axis(
+                axis, found[0].x, metric.factor * np.concatenate([c.median for c in found])
+            )
             axis.set_xlabel(_label(x))
             axis.set_title(metric.title, loc='left')
         if by:
@@ -276,7 +278,7 @@ def _hues(count: int) -> list[Any]:
     return [colormaps[_COLORS](part) for part in np.linspace(0.0, 0.85, count)]
 
 
-def _scale(axis: Any, x: Sequence[float], y: Array) -> None:
+def _scale_axis(axis: Any, x: Sequence[float], y: Array) -> None:
     """Take logarithms where the values span a decade and more; a rounding error is no error."""
     if min(x) > 0 and max(x) >= 10 * min(x):
         axis.set_xscale('log')

@@ -53,18 +53,18 @@ def shift_left(side: Rectification) -> Remaining:
     """Return what the viewpoint shift leaves at other ranges than that of the maps."""
     error = image_error(side, table_ranges(side))
     curve = image_error(side, search_ranges(side))
-    return _remaining(side, error, error.px, curve.ranges, curve.px)
+    return _remaining_errors(side, error, error.px, curve.ranges, curve.px)
 
 
 def rows_left(pair: RectifiedPair) -> Remaining:
     """Return how rows of both images differ at other ranges than that of the maps."""
     error = pair_error(pair, table_ranges(pair.left))
     curve = pair_error(pair, search_ranges(pair.left))
-    left = _remaining(pair.left, error, error.row, curve.ranges, curve.row)
+    left = _remaining_errors(pair.left, error, error.row, curve.ranges, curve.row)
     return left._replace(depth=quantiles(error.depth))
 
 
-def _remaining(
+def _remaining_errors(
     side: Rectification,
     error: ImageError | PairError,
     px: Array,

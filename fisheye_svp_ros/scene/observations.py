@@ -260,7 +260,7 @@ def group_views(observations: Observations) -> Views:
     shape = (len(groups), int(counts.max()))
     row = np.full(shape, -1, dtype=np.int64)
     row[view, slot] = np.arange(len(view))
-    return _views(observations, row, groups[:, 0], groups[:, 1], 1.0)
+    return _make_views(observations, row, groups[:, 0], groups[:, 1], 1.0)
 
 
 def select_cameras(table: Observations, cameras: Sequence[str]) -> Observations:
@@ -320,11 +320,11 @@ def stereo_views(observations: Observations, default_sigma: float = 1.0) -> tupl
                 f'twice in frame {observations.frame[twice[0]]} of one camera'
             )
         cameras = np.full(len(frames), camera)
-        pair.append(_views(observations, row, frames, cameras, default_sigma))
+        pair.append(_make_views(observations, row, frames, cameras, default_sigma))
     return pair[0], pair[1]
 
 
-def _views(
+def _make_views(
     observations: Observations, row: Index, frame: Index, camera: Index, default_sigma: float
 ) -> Views:
     used = row >= 0

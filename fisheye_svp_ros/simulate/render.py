@@ -145,7 +145,7 @@ def render(
     that are not among the lens's own.  rays (H, W): `pixel_rays(lens)`, for many photographs of
     one lens.  The same rng gives the same photograph.
     """
-    uv, rays = _pixels(lens), pixel_rays(lens) if rays is None else rays
+    uv, rays = _pixel_grid(lens), pixel_rays(lens) if rays is None else rays
     theta = rays.theta
     light = np.full(theta.shape, _ROOM)
     boards = [BoardPose(printed, identity())] if isinstance(printed, Print) else printed
@@ -173,10 +173,10 @@ def render(
 
 def pixel_rays(lens: Lens) -> Rays:
     """Return the rays of all pixels (H, W), camera frame."""
-    return back_project_corrected(lens, _pixels(lens))
+    return back_project_corrected(lens, _pixel_grid(lens))
 
 
-def _pixels(lens: Lens) -> Array:
+def _pixel_grid(lens: Lens) -> Array:
     """Return the image points of all pixels (H, W, 2)."""
     v, u = np.mgrid[: lens.height, : lens.width].astype(float)
     return np.stack([u, v], axis=-1)
@@ -220,7 +220,7 @@ def _of_board(
             places = _board_xy(
                 lens, board, camera, exposure, unmoved, back_project_corrected(lens, unmoved)
             )
-    return _light(board.printed, places) - np.float32(_ROOM)
+    return _sheet_reflectance(board.printed, places) - np.float32(_ROOM)
 
 
 def _board_xy(
@@ -282,7 +282,7 @@ def _is_near_sheet(places: Array, printed: Print) -> Array:
     return np.clip(np.nan_to_num(places, nan=float(low[0]), posinf=0, neginf=0), low, high)
 
 
-def _light(printed: Print, places: Array) -> NDArray[np.float32]:
+def _sheet_reflectance(printed: Print, places: Array) -> NDArray[np.float32]:
     """Return the reflectance (H, W, each times _SAMPLES) that the parts of pixels see."""
     part = places / printed.size
     by_v, by_u = np.gradient(part, axis=(0, 1))
@@ -330,13 +330,13 @@ def _reflectance(printed: Print, places: Array, width: Array) -> Array:
         line = np.clip(np.round(places), 0, high - 1)
         face = np.where(line % 2 == 0, 1.0, -1.0) * np.clip(2 * (places - line) / width, -1, 1)
         ink = 0.5 + 0.5 * face[..., 0] * face[..., 1]
-    squares = _coverage(places, low, high, width)
-    sheet = _coverage(places, low - printed.margin, high + printed.margin, width)
+    squares = _covered_share(places, low, high, width)
+    sheet = _covered_share(places, low - printed.margin, high + printed.margin, width)
     board = _BRIGHT + (_DARK - _BRIGHT) * ink * squares
     return np.asarray(_ROOM + (board - _ROOM) * sheet)
 
 
-def _coverage(places: Array, low: Any, high: Any, width: Array) -> Array:
+def _covered_share(places: Array, low: Any, high: Any, width: Array) -> Array:
     depth = np.minimum(places - low, high - places) / width
     share = np.clip(depth + 0.5, 0.0, 1.0)
     return np.asarray(share[..., 0] * share[..., 1])

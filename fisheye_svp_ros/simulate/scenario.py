@@ -271,11 +271,11 @@ def model_of(lens: str, shift_scale: float, svp: bool) -> ForwardModel:
 def scenario_landmarks(scenario: Scenario) -> Landmarks:
     """Return the landmarks of a scenario, m, in the world."""
     path = Path(scenario.environment)
-    return _landmarks(scenario.environment, _version(path), scenario.radius)
+    return _load_landmarks(scenario.environment, _version(path), scenario.radius)
 
 
 @lru_cache(maxsize=64)
-def _landmarks(name: str, version: int, radius: float) -> Landmarks:
+def _load_landmarks(name: str, version: int, radius: float) -> Landmarks:
     return load_landmarks(name) if name.endswith('.csv') else environment(name, radius)
 
 
@@ -354,7 +354,7 @@ class ScenarioBatch(NamedTuple):
     uv: tuple[Array, ...]
 
 
-class _Scene(NamedTuple):
+class _ScenarioScene(NamedTuple):
     row: int
     scenario: Scenario
     landmarks: Landmarks
@@ -366,13 +366,13 @@ def simulate_batches(scenarios: Sequence[Scenario], first: int) -> Iterator[Scen
 
     Raises FisheyeSvpError as `simulate_scenario` does.
     """
-    groups: dict[tuple[object, ...], list[_Scene]] = {}
+    groups: dict[tuple[object, ...], list[_ScenarioScene]] = {}
     known: dict[tuple[object, ...], Pose] = {}
     for row, scenario in enumerate(scenarios):
         where = (scenario.poses, scenario.poses_file, scenario.trajectory_steps, scenario.baseline)
         if where not in known:
             known[where] = scenario_poses(scenario)
-        scene = _Scene(row, scenario, scenario_landmarks(scenario), known[where])
+        scene = _ScenarioScene(row, scenario, scenario_landmarks(scenario), known[where])
         shape = len(scene.landmarks.ids), len(scene.poses.position)
         key = (scenario.lens, scenario.shift_scale, scenario.style == MONO, *shape)
         groups.setdefault(key, []).append(scene)
@@ -380,7 +380,7 @@ def simulate_batches(scenarios: Sequence[Scenario], first: int) -> Iterator[Scen
         yield _simulate_batch(scenes, first)
 
 
-def _simulate_batch(scenes: Sequence[_Scene], first: int) -> ScenarioBatch:
+def _simulate_batch(scenes: Sequence[_ScenarioScene], first: int) -> ScenarioBatch:
     one = scenes[0].scenario
     poses = Pose.stack([scene.poses for scene in scenes])
     rigs = [rig for scene in scenes if (rig := scenario_rig(scene.scenario)) is not None]

@@ -42,7 +42,7 @@ def simulate(
     """
     views = blank_views(landmarks.ids, landmarks.points, len(poses.position), t, board)
     seen = add_noise(model, predict_points(model, poses, views), sigma, rng)
-    return _table(seen[:, None], landmarks, sigma, t, board, ('',))
+    return _make_table(seen[:, None], landmarks, sigma, t, board, ('',))
 
 
 def simulate_stereo(
@@ -89,7 +89,7 @@ def simulate_rig(
         )
         for camera, (model, place) in enumerate(zip(models, poses, strict=True))
     ]
-    return _table(np.stack(seen, axis=1), landmarks, sigma, t, None, cameras)
+    return _make_table(np.stack(seen, axis=1), landmarks, sigma, t, None, cameras)
 
 
 def blank_views(
@@ -130,7 +130,7 @@ def add_noise(
     return uv
 
 
-def _table(
+def _make_table(
     seen: Array,
     landmarks: Landmarks,
     sigma: float,

@@ -173,7 +173,7 @@ def adjust_lens(lens: Lens, views: Views, pose: Pose, names: Sequence[str]) -> A
         )
     fitted = problem.unpack(solved.state)
     linear = Linearization(data, fitted, names)
-    _, arrow = _equations(linear, linear.shared_columns)
+    _, arrow = _arrow_equations(linear, linear.shared_columns)
     _check_determined(arrow, names)
     covariance = arrow_covariance(arrow)
     return AdjustedLens(
@@ -230,8 +230,8 @@ def rig_covariance(linear: Linearization, sigma: float, lenses: Array) -> Array:
         for i in range(bodies)
         for _ in range(6)
     ]
-    _check_determined(_equations(linear, linear.shared_columns[..., :count])[1], names)
-    information = arrow_information(_equations(linear, linear.shared_columns)[1])[0]
+    _check_determined(_arrow_equations(linear, linear.shared_columns[..., :count])[1], names)
+    information = arrow_information(_arrow_equations(linear, linear.shared_columns)[1])[0]
     information[count:, count:] += sigma**2 * lenses
     scale = np.sqrt(np.diag(information))
     inverse = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
@@ -315,7 +315,7 @@ class Adjustment:
         else:
             # A column of zeros leaves its parameter where it is.
             shared = linear.shared_columns * self._moving
-        return self._with_prior(state, *_equations(linear, shared))
+        return self._with_prior(state, *_arrow_equations(linear, shared))
 
     def _empty_equations(self) -> Arrays:
         frames, count = self._data.frames, len(self._moving)
@@ -362,7 +362,7 @@ def _pose_rows(prior: PosePrior, pose: Pose) -> tuple[Array, Array]:
     return (prior.root @ change[..., None])[..., 0], columns
 
 
-def _equations(linear: Linearization, shared: Array) -> tuple[Array, Arrays]:
+def _arrow_equations(linear: Linearization, shared: Array) -> tuple[Array, Arrays]:
     """Return cost (1,) and arrow of a linearization with shared columns (F, M, K)."""
     residual, block = linear.residual, linear.frame_columns
     cost = linear.sum_of_squares

@@ -42,7 +42,7 @@ def initial_state(data: RigViews, lens: Lens, others: Sequence[Lens] = ()) -> Ri
         identity(data.frames), identity(data.cameras), bare[0], terms, tuple(bare[1:]), labels
     )
     solved = localize_cameras(state.model, data.views)
-    rig = _rig(data, state.model, solved)
+    rig = _rig_from_frames(data, state.model, solved)
     return replace(state, rig=rig, pose=data.poses or _frame_poses(data, solved, rig))
 
 
@@ -81,7 +81,7 @@ def _camera_terms(labels: Sequence[str], models: Sequence[ForwardModel]) -> list
     return list(held.values())
 
 
-def _rig(data: RigViews, model: ForwardModel, solved: Pose) -> Pose:
+def _rig_from_frames(data: RigViews, model: ForwardModel, solved: Pose) -> Pose:
     """Return the cameras (C,) in the first one, each from the frame that suits most others."""
     rig, placed = identity(data.cameras), np.zeros(data.frames, dtype=bool)
     body = identity(data.frames) if data.poses is None else data.poses

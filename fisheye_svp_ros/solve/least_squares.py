@@ -85,8 +85,8 @@ def levenberg_marquardt(
         if not active.size:
             break
         iterations[active] += 1
-        step, moved = problem.step(_rows(normal, active), damping[active])
-        trial = problem.retract(_rows(state, active), step)
+        step, moved = problem.step(_take_rows(normal, active), damping[active])
+        trial = problem.retract(_take_rows(state, active), step)
         before = total[active]
         done = is_last(moved, moved_before[active], before, damping[active])
         if np.count_nonzero(done):
@@ -111,7 +111,7 @@ def levenberg_marquardt(
     rest = np.flatnonzero(~converged & np.isfinite(total))
     if rest.size:
         # Some effects have derivatives that are not exact: no step keeps what it promises.
-        _, moved = problem.step(_rows(normal, rest), np.zeros(len(rest)))
+        _, moved = problem.step(_take_rows(normal, rest), np.zeros(len(rest)))
         converged[rest] = moved <= _STALL_TOLERANCE * total[rest]
     return Minimum(state, total, converged, iterations, normal)
 
@@ -169,7 +169,7 @@ def dense_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
     return (step,), moved
 
 
-def _rows(arrays: Arrays, index: Index) -> Arrays:
+def _take_rows(arrays: Arrays, index: Index) -> Arrays:
     """Return the rows at ascending places; all of them are not copied."""
     if len(index) == len(arrays[0]):
         return arrays
@@ -232,7 +232,7 @@ def arrow_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
     depends on stays where it is.
     """
     equations = ArrowEquations(*normal)
-    scaled, block_scale, shared_scale = _scale(equations, damping)
+    scaled, block_scale, shared_scale = _scale_arrow(equations, damping)
     eliminated, reduced = _eliminate(scaled)
     right = scaled.shared_gradient - np.einsum(
         'svbk,svb->sk', eliminated[..., :-1], scaled.block_gradient
@@ -248,7 +248,7 @@ def arrow_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
 def arrow_information(normal: Arrays) -> Array:
     """Return the information (S, K, K) about the shared parameters, the blocks being unknown."""
     equations = ArrowEquations(*normal)
-    scaled, _, shared_scale = _scale(equations, np.zeros(len(equations.shared)))
+    scaled, _, shared_scale = _scale_arrow(equations, np.zeros(len(equations.shared)))
     _, reduced = _eliminate(scaled)
     return np.asarray(reduced * shared_scale[:, :, None] * shared_scale[:, None, :])
 
@@ -259,7 +259,7 @@ def arrow_covariance(normal: Arrays) -> ArrowCovariance:
     A direction that the rows do not determine is left out of it: check `arrow_information` first.
     """
     equations = ArrowEquations(*normal)
-    scaled, block_scale, shared_scale = _scale(equations, np.zeros(len(equations.shared)))
+    scaled, block_scale, shared_scale = _scale_arrow(equations, np.zeros(len(equations.shared)))
     eliminated, reduced = _eliminate(scaled)
     shared = _inverse(reduced)
     leverage = eliminated[..., :-1]
@@ -270,7 +270,7 @@ def arrow_covariance(normal: Arrays) -> ArrowCovariance:
     )
 
 
-def _scale(equations: ArrowEquations, damping: Array) -> tuple[ArrowEquations, Array, Array]:
+def _scale_arrow(equations: ArrowEquations, damping: Array) -> tuple[ArrowEquations, Array, Array]:
     """Scale to a unit diagonal and damp it; return also the scales (S, V, B) and (S, K)."""
     blocks, block_scale = with_unit_diagonal(equations.blocks, damping[:, None])
     shared, shared_scale = with_unit_diagonal(equations.shared, damping)

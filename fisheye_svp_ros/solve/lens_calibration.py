@@ -89,10 +89,10 @@ def calibrate(
     start = replace(start_lens(model, image_size, free or (), name), port=port)
     names = (*INTRINSICS, *start.image_height.coefficient_names) if free is None else tuple(free)
     names += tuple(n for n in placed_names(start) if n not in names)
-    _check_names(start, names)
-    _check_inside(observations, image_size)
+    _check_free_names(start, names)
+    _check_image_size(observations, image_size)
     views, left_out = posable_views(observations)
-    _check_rows(observations.source, views, names)
+    _check_row_count(observations.source, views, names)
     try:
         return _as_calibration(observations, fit_lens(start, views, names), views, left_out)
     except GeometryError:
@@ -100,7 +100,7 @@ def calibrate(
         if not lost.any():
             raise
     views = views.take(np.flatnonzero(~lost))
-    _check_rows(observations.source, views, names)
+    _check_row_count(observations.source, views, names)
     return _as_calibration(observations, fit_lens(start, views, names), views, left_out)
 
 
@@ -112,12 +112,12 @@ def calibrate_port(
     free: parameters to fit in place of those, `port_medium_index` and intrinsics among them if
     asked for.  Raises as `calibrate` does.
     """
-    _check_inside(observations, (lens.width, lens.height))
+    _check_image_size(observations, (lens.width, lens.height))
     lens = replace(lens, port=port)
     names = placed_names(lens) if free is None else tuple(free)
     _check_known(lens, names)
     views, left_out = posable_views(observations)
-    _check_rows(observations.source, views, names)
+    _check_row_count(observations.source, views, names)
     adjusted = _fit_port(lens, select_points(views), views, names)
     return _as_calibration(observations, adjusted, views, left_out)
 
@@ -172,13 +172,15 @@ def with_values(found: Calibration, values: Sequence[float], **figures: Any) -> 
     moved = _with_figures(found, adjusted, **figures)
     return moved._replace(
         adjusted=moved.adjusted._replace(lens=check_lens(moved.adjusted.lens, lens.name)),
-        beyond=int((_angles(adjusted, found.views) > moved.adjusted.lens.max_incidence).sum()),
+        beyond=int(
+            (_incidence_angles(adjusted, found.views) > moved.adjusted.lens.max_incidence).sum()
+        ),
     )
 
 
 def _with_figures(found: Calibration, adjusted: AdjustedLens, **more: Any) -> Calibration:
     """Return a calibration with another fit of its views, and the figures of that."""
-    theta = _angles(adjusted, found.views)
+    theta = _incidence_angles(adjusted, found.views)
     block = {
         **(adjusted.lens.calibration or {}),
         'rms_px': rms_px(adjusted.residual),
@@ -206,7 +208,7 @@ def placed_names(lens: Lens) -> tuple[str, ...]:
     return () if lens.port is None else tuple(f'{PORT}_{name}' for name in lens.port.placed)
 
 
-def _check_rows(source: str, views: Views, names: Sequence[str]) -> None:
+def _check_row_count(source: str, views: Views, names: Sequence[str]) -> None:
     rows, unknowns = _counts(views, names)
     if rows <= unknowns:
         raise GeometryError(
@@ -232,7 +234,7 @@ def _as_calibration(
             pose_covariance=adjusted.pose_covariance * sigma**2,
         )
     _check_focal(adjusted, observations.source)
-    theta = _angles(adjusted, views)
+    theta = _incidence_angles(adjusted, views)
     lens = _with_field(adjusted, theta)
     block = {
         'rms_px': rms_px(adjusted.residual),
@@ -247,7 +249,7 @@ def _as_calibration(
     return Calibration(adjusted, sigma, views, left_out, beyond, float(theta.max()))
 
 
-def _angles(adjusted: AdjustedLens, views: Views) -> Array:
+def _incidence_angles(adjusted: AdjustedLens, views: Views) -> Array:
     """Return the incidence angles (P,) of all observations, rad."""
     local = adjusted.pose.into_body(views.points)
     return incidence(adjusted.lens, local, limited=False).theta[views.used]
@@ -280,7 +282,7 @@ def start_lens(model: str, image_size: tuple[int, int], free: Sequence[str], nam
     return _with_corner(lens)
 
 
-def _check_names(lens: Lens, names: tuple[str, ...]) -> None:
+def _check_free_names(lens: Lens, names: tuple[str, ...]) -> None:
     _check_known(lens, names)
     if ('f' in names) == ('fx' in names) or ('fx' in names) != ('fy' in names):
         raise LensError('free must name f, or fx and fy: a calibration starts without them')
@@ -292,7 +294,7 @@ def _check_known(lens: Lens, names: tuple[str, ...]) -> None:
         raise LensError(f'free names a parameter twice: {", ".join(names)}')
 
 
-def _check_inside(table: Observations, image_size: tuple[int, int]) -> None:
+def _check_image_size(table: Observations, image_size: tuple[int, int]) -> None:
     """Raise ObservationError for rows far outside the image, or an image that is not theirs."""
     outside = (np.maximum(-table.uv, table.uv - image_size) / image_size).max(axis=1)
     rows = np.flatnonzero(outside > MAX_OUTSIDE)
@@ -407,7 +409,7 @@ def focal_candidates(lens: Lens, views: Views, keep: int) -> tuple[Array, Pose]:
     The image height is that of `lens` with the coefficients it has (kannala_brandt without any is
     equidistant), the center is the lens's.  Candidates are ranked by what their poses leave over.
     """
-    focals, pose, rms = _scan(lens, views)
+    focals, pose, rms = _scan_focal_lengths(lens, views)
     # A sum of root mean squares forgives one lost view.
     best = np.argsort(rms.sum(axis=1))[:keep]
     return focals[best], pose.take(best)
@@ -419,7 +421,7 @@ def lost_views(lens: Lens, views: Views) -> Mask:
     No pose goes with their points, as those are in another order, say.  None where a fifth or
     more of the views are: then it is another lens that is wanted.
     """
-    rms = _scan(lens, views)[2]
+    rms = _scan_focal_lengths(lens, views)[2]
     middle = np.median(rms, axis=1)
     best = int(np.argmin(middle))
     lost: Mask = rms[best] > _LOST * middle[best]
@@ -435,7 +437,7 @@ def _focal_lengths(lens: Lens) -> Array:
     return np.unique(corner / heights)
 
 
-def _scan(lens: Lens, views: Views) -> tuple[Array, Pose, Array]:
+def _scan_focal_lengths(lens: Lens, views: Views) -> tuple[Array, Pose, Array]:
     """Return focal lengths (C,), px, the poses (C, V) under each, and rms of each view, px."""
     focals = _focal_lengths(lens)
     lenses = [replace(lens, fx=focal, fy=focal) for focal in focals.tolist()]

@@ -71,14 +71,14 @@ def _median_rms(lens: Lens, views: Views) -> float:
 def _are_all_from_behind(views: Views) -> bool:
     """Whether boards with x to the right and y down are seen from behind by all views."""
     sides = [
-        _side(points[used], uv[used])
+        _handedness(points[used], uv[used])
         for points, uv, used in zip(views.points, views.uv, views.used, strict=True)
     ]
     told = [side for side in sides if side]
     return bool(told) and max(told) < 0
 
 
-def _side(points: Array, uv: Array) -> int:
+def _handedness(points: Array, uv: Array) -> int:
     """Return 1 for a board (N, 3) in whose picture (N, 2) y is right of x, -1 where it is left.
 
     0 where that cannot be told: of what is not flat, or seen edge on.

@@ -316,7 +316,7 @@ def start_rig(table: Observations, lenses: Mapping[str, Lens], cameras: Sequence
     ordered = [lenses[name] for name in order]
     rows = select_cameras(table, order)
     placed = place_boards(select_shared(rows), ordered, int(rows.landmark.max()))
-    rows, torn = _without_outliers(placed)
+    rows, torn = _reject_outliers(placed)
     data, state = _fit_rig(rows, ordered, placed.boards)
     if _freedom(Linearization(data, state, ())) < 1:
         raise GeometryError(f'{rows.source}: too few points for a rig of {len(order)} cameras')
@@ -357,7 +357,7 @@ def _freedom(linear: Linearization) -> int:
     return int(linear.row_mask.sum()) - unknown
 
 
-def _without_outliers(placed: PlacedBoards) -> tuple[Observations, tuple[int, ...]]:
+def _reject_outliers(placed: PlacedBoards) -> tuple[Observations, tuple[int, ...]]:
     """Return the rows without outliers, and the frames that no rig explains."""
     rows = placed.rows
     _, found = find_outliers(placed.data, placed.state)

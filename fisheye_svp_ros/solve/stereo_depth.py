@@ -91,7 +91,7 @@ def epipolar_offset(
     pairs = _Pairs(rig, uv_left, uv_right)
     origin, direction = pairs.ray_in_left(right)
     samples = origin[:, None] + direction[:, None] / _STARTS[:, None]
-    seen = _linearize(left, samples.reshape(-1, 3)).uv.reshape(*samples.shape[:2], 2)
+    seen = _linearize_points(left, samples.reshape(-1, 3)).uv.reshape(*samples.shape[:2], 2)
     off = np.nan_to_num(np.linalg.norm(seen - pairs.left[:, None], axis=-1), nan=np.inf)
     start = (_STARTS[np.argmin(off, axis=1)][:, None],)
     curve = _Curve(left, origin, direction, pairs.left, column_only=False)
@@ -216,11 +216,11 @@ class _Curve:
     def image(self, inverse: Array) -> Array:
         """Return the image points (M, 2) of all rays at inverse distances (M, 1)."""
         points = self._origin + self._direction / inverse
-        return np.asarray(_linearize(self._model, points).uv[0])
+        return np.asarray(_linearize_points(self._model, points).uv[0])
 
     def linearize(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         direction, inverse = self._direction[index], state[0]
-        linear = _linearize(self._model, self._origin[index] + direction / inverse)
+        linear = _linearize_points(self._model, self._origin[index] + direction / inverse)
         views = self._views.take(index)
         uv, jacobian = views.uv.copy(), np.zeros((len(index), 1, 2, 1))
         slope = -(linear.d_target[0] @ direction[..., None])[..., 0] / inverse**2
@@ -252,8 +252,8 @@ class _Depth:
     def image(self, points: Array, index: Index) -> tuple[Array, Array]:
         """Return image points (A, 2, 2), left and right, and their derivatives (A, 2, 2, 3)."""
         rig = self._left_in_right.take(index)
-        left = _linearize(self._models[0], rig.into_body(points[:, None])[:, 0])
-        right = _linearize(self._models[1], points)
+        left = _linearize_points(self._models[0], rig.into_body(points[:, None])[:, 0])
+        right = _linearize_points(self._models[1], points)
         turned = left.d_target[0] @ np.swapaxes(rig.rotation, -1, -2)
         uv = np.stack([left.uv[0], right.uv[0]], axis=1)
         return uv, np.stack([turned, right.d_target[0]], axis=1)
@@ -265,7 +265,7 @@ class _Depth:
         return (state[0] + step[0],)
 
 
-def _linearize(model: ForwardModel, points: Array) -> LinearViews:
+def _linearize_points(model: ForwardModel, points: Array) -> LinearViews:
     """Linearize image points of points (M, 3) in the camera's own frame, as one view."""
     views = views_of(points)
     linear = model.linearize(identity(1), views)

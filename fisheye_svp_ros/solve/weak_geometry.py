@@ -148,7 +148,7 @@ def _integrate(
     weight /= weight.sum(axis=1, keepdims=True)
     change = flat.difference(minima[0].take(repeated)).reshape(systems, count, 6)
     own = rest @ inverse @ turned * scale[repeated, None, None] ** 2
-    return _scatter(weight, change, own.reshape(systems, count, 6, 6))
+    return _mixture_scatter(weight, change, own.reshape(systems, count, 6, 6))
 
 
 def _tilted_poses(
@@ -185,7 +185,7 @@ def _tilted_poses(
     return node, np.maximum(density, 1e-300)
 
 
-def _scatter(weight: Array, change: Array, own: Array) -> Array:
+def _mixture_scatter(weight: Array, change: Array, own: Array) -> Array:
     """Return scatter matrices (S, 6, 6) of mixtures of normal distributions around zero.
 
     weight (S, K), change (S, K, 6), own (S, K, 6, 6): of the parts.  Between the second moments

@@ -57,7 +57,7 @@ def find_wrong_landmarks(
     rows, or raises GeometryError; starts: further models, rough ones, to start from where what
     that model leads to is worse than any detector.
     """
-    landmarks = _Landmarks.from_table(table)
+    landmarks = _LandmarkTable.from_table(table)
     if len(landmarks.ids) < _MIN_LANDMARKS:
         return ()
     if model is not None and not landmarks.is_suspicious(model):
@@ -90,7 +90,7 @@ class _Agreement(NamedTuple):
         return float(np.median(self.scale))
 
 
-class _Landmarks(NamedTuple):
+class _LandmarkTable(NamedTuple):
     """Views of a table, and the landmarks (L,) in it that enough of them show.
 
     slot (S, N): place of each point's landmark among ids, L for others; xyz (L, 3), m.
@@ -103,7 +103,7 @@ class _Landmarks(NamedTuple):
     xyz: Array
 
     @classmethod
-    def from_table(cls, table: Observations) -> _Landmarks:
+    def from_table(cls, table: Observations) -> _LandmarkTable:
         views = group_views(table)
         views = views._replace(weight=np.where(views.used, 1 / relative_sigma(views), 0.0))
         ids, first, count = np.unique(table.landmark, return_index=True, return_counts=True)
@@ -153,10 +153,10 @@ class _Landmarks(NamedTuple):
         wrong = []
         for i in np.flatnonzero(~agreement.kept):
             near = np.argsort(np.linalg.norm(self.xyz - self.xyz[i], axis=1), kind='stable')
-            around = _median(by_landmark[:, near[1 : 1 + _NEIGHBORS]], axis=1)
+            around = _finite_median(by_landmark[:, near[1 : 1 + _NEIGHBORS]], axis=1)
             mine = by_landmark[:, i]
             own = np.linalg.norm(mine - np.nan_to_num(around), axis=-1)
-            if _median(own) > _OWN_SHARE * _median(np.linalg.norm(mine, axis=-1)):
+            if _finite_median(own) > _OWN_SHARE * _finite_median(np.linalg.norm(mine, axis=-1)):
                 landmark = self._describe(int(i), agreement)
                 far = agreement.scale[i] > _MISMATCH_RATIO * OUTLIER_SIGMAS * agreement.typical
                 wrong += [landmark] if landmark.is_displaced or far else []
@@ -172,7 +172,7 @@ class _Landmarks(NamedTuple):
                 points=np.where(mine[..., None], meeting, self.views.points)
             )
             left = prediction_distances(agreement.model, agreement.pose, moved)[mine]
-            if _median(left) / MEDIAN_NORM < _MAX_REMAINDER * agreement.scale[i]:
+            if _finite_median(left) / MEDIAN_NORM < _MAX_REMAINDER * agreement.scale[i]:
                 offset = meeting - self.xyz[i]
         points = int((self.table.landmark == self.ids[i]).sum())
         return WrongLandmark(
@@ -265,7 +265,7 @@ def _meeting_point(model: ForwardModel, pose: Pose, views: Views, mine: Mask) ->
     return np.asarray(np.linalg.solve(normal, right), dtype=float) if met else None
 
 
-def _median(values: Array, axis: int | None = None) -> Array:
+def _finite_median(values: Array, axis: int | None = None) -> Array:
     """Return medians of what is finite; NaN where nothing is."""
     finite = np.isfinite(values)
     some = finite.any(axis=axis, keepdims=True)

@@ -147,7 +147,7 @@ def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
     )
     own = {
         part: {name: values.reshape(shape) for name, values in by.items()}
-        for part, by in _own_errors(setup, flat).items()
+        for part, by in _lens_errors(setup, flat).items()
     }
     return Budget(angle, distance, error, noise, own)
 
@@ -182,7 +182,8 @@ def at_point(
             for part in _LENS_PARTS
         ]
         caused, noisy, most, parameters, misfit = (
-            _value(budget, table, spread, working_range) for table in (error, noise, allowed, *own)
+            _table_value(budget, table, spread, working_range)
+            for table in (error, noise, allowed, *own)
         )
         logs = np.log(budget.ranges)
         rows.append(
@@ -241,7 +242,7 @@ def _stereo_errors(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
     return [(epipolar, epipolar_noise), (depth, depth_noise)]
 
 
-def _own_errors(setup: Setup, points: Array) -> dict[str, dict[str, Array]]:
+def _lens_errors(setup: Setup, points: Array) -> dict[str, dict[str, Array]]:
     """Return what the lens's own errors do to caps (S, N, 3): (S,) by part and quantity."""
     if setup.lens.uncertainty is None:
         return {}
@@ -287,7 +288,7 @@ def _interpolate_rows(places: Array, table: Array, place: float) -> Array:
     return np.array([np.interp(place, places, column) for column in table.T])
 
 
-def _value(budget: Budget, table: Array, spread: float, working_range: float) -> float:
+def _table_value(budget: Budget, table: Array, spread: float, working_range: float) -> float:
     with np.errstate(divide='ignore'):
         by_range = _interpolate_rows(budget.spreads, np.log(table), spread)
     logs = np.log(budget.ranges)

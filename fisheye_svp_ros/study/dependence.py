@@ -67,7 +67,7 @@ def is_number(table: DataFrame, name: str) -> bool:
 
 def curves(table: DataFrame, metric: str, x: str, by: Sequence[str]) -> list[ErrorCurve]:
     """Return an error over parameter x, a curve a combination of the parameters `by`."""
-    values, places = _numbers(table, metric), _slots(table, x)
+    values, places = _metric_column(table, metric), _slots(table, x)
     groups: dict[tuple[Any, ...], Any] = {(): np.arange(len(values))}
     for name in by:
         groups = {
@@ -90,7 +90,11 @@ def curves(table: DataFrame, metric: str, x: str, by: Sequence[str]) -> list[Err
 
 def grid(table: DataFrame, metric: str, x: str, y: str) -> Grid:
     """Return the median of the magnitude of an error over two parameters."""
-    values, columns, lines = np.abs(_numbers(table, metric)), _slots(table, x), _slots(table, y)
+    values, columns, lines = (
+        np.abs(_metric_column(table, metric)),
+        _slots(table, x),
+        _slots(table, y),
+    )
     median = np.full((len(lines), len(columns)), np.nan)
     for i, line in enumerate(lines.values()):
         for j, column in enumerate(columns.values()):
@@ -106,8 +110,8 @@ def noise_spreads(table: DataFrame, by: str | None) -> list[ResidualRatio]:
     N image points of noise sigma in u and in v leave, after a pose is fitted to them, a sum of
     squares of sigma^2 chi^2 with 2 N - 6 degrees of freedom.
     """
-    sigma, rms = _numbers(table, 'noise_px'), _numbers(table, 'localizer.rms_px')
-    points = _numbers(table, 'localizer.points')
+    sigma, rms = _metric_column(table, 'noise_px'), _metric_column(table, 'localizer.rms_px')
+    points = _metric_column(table, 'localizer.points')
     groups = _slots(table, by) if by else {'': np.arange(len(rms))}
     found = []
     for label, rows in groups.items():
@@ -133,7 +137,7 @@ def _density_of_chi2(x: Array, freedom: float) -> Array:
     return np.asarray(np.exp(logs))
 
 
-def _numbers(table: DataFrame, name: str) -> Array:
+def _metric_column(table: DataFrame, name: str) -> Array:
     """Return a column, NaN = empty; of calibrations only those from all sets of a scenario."""
     cells: Array = table[name].to_numpy(float, na_value=np.nan, copy=True)
     if name.startswith('stereo_calibrator.') and {'set', 'sets'} <= {*table}:

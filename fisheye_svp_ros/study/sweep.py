@@ -116,7 +116,7 @@ def _sets(batch: ScenarioBatch) -> _Sets:
     return _Sets(batch.landmark[of], batch.points[of], tuple(poses), tuple(uv))
 
 
-def _model(batch: ScenarioBatch, settings: SolverSettings) -> ForwardModel:
+def _solver_model(batch: ScenarioBatch, settings: SolverSettings) -> ForwardModel:
     if settings.lens:
         return model_of(settings.lens, 1.0, settings.solves_svp)
     return model_of(batch.lens, batch.shift_scale, settings.solves_svp)
@@ -128,7 +128,7 @@ def _chunks(index: Index) -> list[Index]:
 
 def localizer(batch: ScenarioBatch, settings: LocalizerSettings) -> Outcome:
     """Localize the camera of every set, as the localizer does."""
-    sets, model = _sets(batch), _model(batch, settings)
+    sets, model = _sets(batch), _solver_model(batch, settings)
     outcome = Outcome(len(sets.landmark), LOCALIZATION_METRICS)
 
     def solve(index: Index) -> SetSolutions[Any]:
@@ -145,7 +145,7 @@ def stereo_calibrator(batch: ScenarioBatch, settings: StereoCalibratorSettings) 
 
     A set that cannot be used is left out of those that come after it.
     """
-    sets, model, rig = _sets(batch), _model(batch, settings), batch.rig
+    sets, model, rig = _sets(batch), _solver_model(batch, settings), batch.rig
     assert rig is not None
     scenarios, per_scenario = batch.uv[0].shape[:2]
     outcome = Outcome(len(sets.landmark), STEREO_CALIBRATION_METRICS)
@@ -171,9 +171,9 @@ def stereo_calibrator(batch: ScenarioBatch, settings: StereoCalibratorSettings) 
     return outcome
 
 
-def stereo_depth(batch: ScenarioBatch, settings: StereoDepthSettings) -> Outcome:
+def solve_stereo_depth(batch: ScenarioBatch, settings: StereoDepthSettings) -> Outcome:
     """Measure every set with the true rig, as stereo depth does."""
-    sets, model, rig = _sets(batch), _model(batch, settings), batch.rig
+    sets, model, rig = _sets(batch), _solver_model(batch, settings), batch.rig
     assert rig is not None
     per_scenario = batch.uv[0].shape[1]
     outcome = Outcome(len(sets.landmark), STEREO_DEPTH_METRICS)
@@ -202,7 +202,7 @@ SOLVERS: Mapping[str, Solver] = {
     'stereo_calibrator': Solver(
         StereoCalibratorSettings, STEREO_CALIBRATION_METRICS, stereo_calibrator
     ),
-    'stereo_depth': Solver(StereoDepthSettings, STEREO_DEPTH_METRICS, stereo_depth),
+    'stereo_depth': Solver(StereoDepthSettings, STEREO_DEPTH_METRICS, solve_stereo_depth),
 }
 TABLES: Mapping[str, type[Any]] = {
     CAMERA: SyntheticCameraSettings,
@@ -318,7 +318,7 @@ def sweep_rows(plan: Plan, numbers: range) -> DataFrame:
 
     scenarios = [_scenario(plan, number) for number in numbers]
     parts = [
-        _rows(plan, scenarios, numbers.start, batch)
+        _batch_rows(plan, scenarios, numbers.start, batch)
         for batch in simulate_batches(scenarios, numbers.start)
     ]
     whole = concat(parts) if len(parts) > 1 else parts[0]
@@ -358,7 +358,9 @@ def _scenario(plan: Plan, number: int) -> Scenario:
     return replace(plan.base, **plan.sweep.point(number))
 
 
-def _rows(plan: Plan, scenarios: list[Scenario], first: int, batch: ScenarioBatch) -> DataFrame:
+def _batch_rows(
+    plan: Plan, scenarios: list[Scenario], first: int, batch: ScenarioBatch
+) -> DataFrame:
     from pandas import DataFrame
 
     kinds, sets = column_types(plan), batch.uv[0].shape[1]

@@ -382,24 +382,24 @@ def _first_camera(data: RigViews) -> Index:
     return np.flatnonzero(data.camera_of == 0)
 
 
-def _true_poses(data: RigViews) -> Pose:
+def _known_poses(data: RigViews) -> Pose:
     assert data.poses is not None
     return data.poses.take(data.frame_of[_first_camera(data)])
 
 
 def _position_errors(held_out: RigViews, state: RigState) -> Array:
-    off = state.pose.position - _true_poses(held_out).position
+    off = state.pose.position - _known_poses(held_out).position
     return np.asarray(np.linalg.norm(off, axis=-1))
 
 
 def _axis_errors(held_out: RigViews, state: RigState) -> Array:
-    return axis_angle_between(state.pose, _true_poses(held_out))
+    return axis_angle_between(state.pose, _known_poses(held_out))
 
 
 def _depth_errors(held_out: RigViews, state: RigState) -> Array:
     """Return the mean error of each frame, m; NaN where the cameras share no landmark."""
     first, second = (state.model.camera(camera) for camera in (0, 1))
-    place = state.pose if held_out.poses is None else _true_poses(held_out)
+    place = state.pose if held_out.poses is None else _known_poses(held_out)
     right_pose = place.compose(state.rig.take(1))
     rig = state.rig.take(1).inverse()
     errors = []

@@ -16,7 +16,7 @@ import fisheye_svp_ros as fsvp
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.diagnosis import LensErrors
 from fisheye_svp_ros.effects.forward import back_project_corrected, project_corrected
-from fisheye_svp_ros.effects.resizing import ImageChange, resize_lens
+from fisheye_svp_ros.effects.resizing import ImageChange, transform_lens
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.lens_files import lens_from_dict, lens_to_dict, load_lens, save_lens
 from fisheye_svp_ros.io.lens_formats import WRITABLE
@@ -60,7 +60,7 @@ def change_of(lens: Lens, **given: object) -> ImageChange:
 @pytest.mark.parametrize('lens', EVERY)
 def test_points_go_where_pixels_go(lens: Lens, given: dict) -> None:
     change = change_of(lens, **given)
-    resized, lost = resize_lens(lens, change)
+    resized, lost = transform_lens(lens, change)
     assert not lost and (resized.width, resized.height) == change.size
     points = points_on_rays(
         replace(lens, corrections={}, port=None), np.random.default_rng(1), 200, 0.5, 3.0, 0.8
@@ -98,8 +98,8 @@ def test_principal_point_of_half_the_size() -> None:
 
 def test_the_rows_of_a_part_are_read_in_less_time() -> None:
     lens = replace(FRONT, corrections={'rolling_shutter': {'parameters': {'readout': 0.02}}})
-    half, _ = resize_lens(lens, change_of(lens, scale=0.5))
-    part, _ = resize_lens(lens, change_of(lens, crop=(0, 200, 848, 400), scale=0.5))
+    half, _ = transform_lens(lens, change_of(lens, scale=0.5))
+    part, _ = transform_lens(lens, change_of(lens, crop=(0, 200, 848, 400), scale=0.5))
     for one, readout in ((half, 0.02), (part, 0.01)):
         assert one.corrections['rolling_shutter']['parameters']['readout'] == readout
 

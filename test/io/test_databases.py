@@ -76,10 +76,10 @@ def test_a_recording_is_read_however_it_is_stored_and_without_its_metadata(
 def test_a_compressed_file_is_not_unpacked_to_list_topics_that_its_metadata_lists(
     write: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, metadata: str, times: int
 ) -> None:
-    file, unpack = write(StoragePlugin.MCAP, CompressionMode.FILE), bags._unpack
+    file, unpack = write(StoragePlugin.MCAP, CompressionMode.FILE), bags._decompress
     unpacked: list[Path] = []
     monkeypatch.setattr(
-        bags, '_unpack', lambda packed, whole: (unpacked.append(packed), unpack(packed, whole))
+        bags, '_decompress', lambda packed, whole: (unpacked.append(packed), unpack(packed, whole))
     )
     if metadata:
         (file.parent / 'metadata.yaml').write_text(metadata)

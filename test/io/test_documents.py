@@ -11,7 +11,7 @@ import pytest
 
 from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError
 from fisheye_svp_ros.io.files import dump_yaml, parse_json, parse_yaml, read_bytes, read_yaml
-from fisheye_svp_ros.io.parameters import parameters_of, read_parameter_file
+from fisheye_svp_ros.io.parameters import node_parameters, read_parameter_file
 
 BOMB = 'a: &a [1, 1]\n' + ''.join(
     f'{n}: &{n} [*{m}, *{m}, *{m}, *{m}]\n' for m, n in zip('abcdefgh', 'bcdefghi', strict=True)
@@ -165,14 +165,14 @@ def test_values_have_the_type_that_rcl_gives_them(
 ) -> None:
     file = tmp_path / 'a.yaml'
     file.write_text(f'/**: {{ros__parameters: {{x: {text}}}}}\n')
-    read = parameters_of('/node', read_parameter_file(file))['x']
+    read = node_parameters('/node', read_parameter_file(file))['x']
     assert read == value and type(read) is type(value)
 
 
 def test_patterns_of_node_names() -> None:
     given = {'/**/localizer': {'a': 1}, '/*': {'b': 2}}
-    assert parameters_of('/x/y/localizer', given) == {'a': 1}
-    assert parameters_of('/localizer', given) == {'a': 1, 'b': 2}
+    assert node_parameters('/x/y/localizer', given) == {'a': 1}
+    assert node_parameters('/localizer', given) == {'a': 1, 'b': 2}
 
 
 def test_files_have_bounds(tmp_path: Path) -> None:

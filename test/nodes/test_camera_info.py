@@ -21,7 +21,7 @@ from fisheye_svp_ros.errors import FisheyeSvpError, LensError, ObservationError
 from fisheye_svp_ros.io.decoding import read_camera_info, read_key_values, stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
-from fisheye_svp_ros.io.lens_formats.ros import camera_info_text, lens_of
+from fisheye_svp_ros.io.lens_formats.ros import camera_info_text, distortion_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.localizer import Localizer
@@ -226,7 +226,9 @@ def test_a_localizer_takes_points_of_rectified_images(graphs: list[Graph]) -> No
 )
 def test_a_model_of_no_lens_is_refused(model: str, d: tuple[float, ...], reason: str) -> None:
     with pytest.raises(LensError, match=reason):
-        lens_of(model, (640, 480), (380.0, 380.0, 320.0, 240.0), d, 'camera', 'camera_info')
+        distortion_lens(
+            model, (640, 480), (380.0, 380.0, 320.0, 240.0), d, 'camera', 'camera_info'
+        )
 
 
 @pytest.mark.parametrize(
@@ -242,7 +244,7 @@ def test_a_model_of_no_lens_is_refused(model: str, d: tuple[float, ...], reason:
     ],
 )
 def test_every_model_as_opencv_projects_it(model: str, d: tuple[float, ...]) -> None:
-    lens = lens_of(model, (640, 480), K, d, 'camera', 'camera_info')
+    lens = distortion_lens(model, (640, 480), K, d, 'camera', 'camera_info')
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 12), np.linspace(-0.4, 0.4, 12))
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
     matrix = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1.0]])
@@ -256,7 +258,7 @@ def test_every_model_as_opencv_projects_it(model: str, d: tuple[float, ...]) -> 
 @pytest.mark.parametrize('d', [(), (0.0,) * 5])
 def test_a_wide_pinhole_is_taken_as_it_is(d: tuple[float, ...]) -> None:
     """Of 137 degrees over the diagonal, as a rectified image has it."""
-    lens = lens_of('plumb_bob', (1280, 800), (300.0, 300.0, 640.0, 400.0), d, 'c', 'info')
+    lens = distortion_lens('plumb_bob', (1280, 800), (300.0, 300.0, 640.0, 400.0), d, 'c', 'info')
     rays = np.array([[2.1, 1.3, 1.0], [-2.0, 1.2, 1.0], [0.0, 0.0, 1.0]])
     seen = forward.project_corrected(lens, rays)
     assert seen.valid.all()
@@ -278,5 +280,5 @@ def test_a_skew_is_taken_over_from_message_and_file(
         rays[:, None], np.zeros(3), np.zeros(3), np.eye(3), np.array(d[:4])
     )
     wanted = plane[:, 0] @ matrix[:2, :2].T + matrix[:2, 2]
-    for lens in (lens_of(*model, 'camera', 'camera_info'), load_lens(file)):
+    for lens in (distortion_lens(*model, 'camera', 'camera_info'), load_lens(file)):
         assert forward.project_corrected(lens, rays).uv == pytest.approx(wanted, abs=1e-5)

@@ -16,7 +16,7 @@ from sensor_msgs.msg import PointCloud2  # isort: skip
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.io.csv_files import CsvTable, write_table
+from fisheye_svp_ros.io.csv_files import CsvTable, write_columns
 from fisheye_svp_ros.io.decoding import read_pose
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses
@@ -42,7 +42,7 @@ def flat(tmp_path: Path) -> Scenario:
     target, rng = plane(), np.random.default_rng(3)
     poses = poses_around(target, SETS, rng, widest=0.2, distance=(8.0, 20.0))
     x, y, z = target.points.T
-    write_table(tmp_path / 'board.csv', {'landmark': target.ids, 'x': x, 'y': y, 'z': z})
+    write_columns(tmp_path / 'board.csv', {'landmark': target.ids, 'x': x, 'y': y, 'z': z})
     write_poses(tmp_path / 'poses.csv', np.arange(SETS), poses)
     return Scenario(
         lens=f'{tmp_path}/tele.yaml',

@@ -214,7 +214,7 @@ def test_flat_targets_are_told_by_the_eigenvalues_of_their_spread(compiled):
 
 
 def test_an_information_is_inverted_whatever_its_units_unless_it_is_nearly_singular(compiled):
-    from fisheye_svp_ros.optics.engines.entries import _inverse
+    from fisheye_svp_ros.optics.engines.entries import _invert
 
     rng, found = np.random.default_rng(99), np.empty((6, 6))
     scale = 10.0 ** np.array([-7.0, 7.0, -3.0, 0.0, 2.0, 5.0])
@@ -222,7 +222,7 @@ def test_an_information_is_inverted_whatever_its_units_unless_it_is_nearly_singu
     for likeness, determined in ((1.0, True), (1e-4, True), (1e-7, False)):
         columns[:, 1] = columns[:, 0] + likeness * rng.normal(size=20)
         hessian = columns.T @ columns * scale * scale[:, None]
-        assert _inverse(hessian, np.empty((6, 6)), found) == determined
+        assert _invert(hessian, np.empty((6, 6)), found) == determined
         if determined:
             np.testing.assert_allclose(
                 found @ hessian * scale[:, None] / scale, np.eye(6), atol=1e-6

@@ -11,7 +11,7 @@ from helpers.differences import derivative
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import lens_from_dict, lens_to_dict
-from fisheye_svp_ros.io.lens_formats.ros import lens_of
+from fisheye_svp_ros.io.lens_formats.ros import distortion_lens
 from fisheye_svp_ros.optics.camera import (
     back_project,
     lens_columns,
@@ -42,7 +42,7 @@ def model(request: pytest.FixtureRequest) -> tuple[str, tuple[float, ...]]:
 
 
 def lens(model: tuple[str, tuple[float, ...]]) -> Lens:
-    return lens_of(model[0], (1280, 960), K, model[1], 'camera', 'camera_info')
+    return distortion_lens(model[0], (1280, 960), K, model[1], 'camera', 'camera_info')
 
 
 def points(count: int = 300) -> np.ndarray:

@@ -122,7 +122,7 @@ def test_real_boards_lose_no_landmark_even_where_it_is_asked_for(name, monkeypat
     if not path.exists():
         pytest.skip(NO_DATA)
     monkeypatch.setattr(
-        'fisheye_svp_ros.solve.wrong_landmarks._Landmarks.is_suspicious', lambda *_: True
+        'fisheye_svp_ros.solve.wrong_landmarks._LandmarkTable.is_suspicious', lambda *_: True
     )
     table = read_observations(path)
 

@@ -41,14 +41,16 @@ def read(text: str, where: str) -> Foreign:
             f'the {len(cameras)} cameras of intrinsics is needed'
         )
     lenses = {
-        f'cam{i}': _lens(f'cam{i}', camera, size, f'{where}: camera {i}')
+        f'cam{i}': _basalt_lens(f'cam{i}', camera, size, f'{where}: camera {i}')
         for i, (camera, size) in enumerate(zip(cameras, sizes, strict=True))
     }
     rigs = _rigs(fields.sections({'T_imu_cam': [], **document}, 'T_imu_cam', where), where)
     return Foreign.from_lenses('Basalt', lenses, rigs)
 
 
-def _lens(name: str, camera: Mapping[str, Any], size: Any, where: str) -> tuple[Lens, float]:
+def _basalt_lens(
+    name: str, camera: Mapping[str, Any], size: Any, where: str
+) -> tuple[Lens, float]:
     kind = str(camera.get('camera_type')).lower()
     if kind not in _MODELS:
         raise LensError(

@@ -68,11 +68,11 @@ _MODELS: dict[str, tuple[str, Callable[[Values], models.Distortion]]] = {
 
 def recognises(text: str) -> bool:
     """Say whether a text is such a file."""
-    lines = _lines(text)
+    lines = _uncommented_lines(text)
     return bool(lines) and all(map(_ROW.fullmatch, lines))
 
 
-def _lines(text: str) -> list[str]:
+def _uncommented_lines(text: str) -> list[str]:
     """Return the lines without comments."""
     lines = (line.partition('#')[0].strip() for line in text.splitlines())
     return [line for line in lines if line]
@@ -81,7 +81,7 @@ def _lines(text: str) -> list[str]:
 def read(text: str, where: str) -> Foreign:
     """Read all cameras, by their ids; raises LensError, naming camera and model."""
     lenses = {}
-    for row in filter(None, map(_ROW.fullmatch, _lines(text))):
+    for row in filter(None, map(_ROW.fullmatch, _uncommented_lines(text))):
         camera, model, rest = row.groups()
         place = f'{where}: camera {camera}'
         try:
@@ -92,11 +92,11 @@ def read(text: str, where: str) -> Foreign:
             raise LensError(
                 f'{place}: width, height and the parameters of {model} must be numbers ({cause})'
             ) from cause
-        lenses[camera] = _lens(f'camera{camera}', model, (width, height), values, place)
+        lenses[camera] = _colmap_lens(f'camera{camera}', model, (width, height), values, place)
     return Foreign.from_lenses('COLMAP', lenses)
 
 
-def _lens(
+def _colmap_lens(
     name: str, model: str, size: Sequence[float], given: Sequence[float], where: str
 ) -> tuple[Lens, float]:
     if model not in _MODELS:

@@ -40,7 +40,8 @@ def read(text: str, where: str) -> Foreign:
     if not names:
         raise LensError(f'{where}: cameraData holds no camera that is calibrated')
     lenses = {
-        name: _lens(name, cameras[socket], f'{where}: {name}') for socket, name in names.items()
+        name: _depthai_lens(name, cameras[socket], f'{where}: {name}')
+        for socket, name in names.items()
     }
     poses = [_in_root(socket, cameras, where) for socket in names]
     connected = len({root for root, _ in poses}) == 1
@@ -48,7 +49,7 @@ def read(text: str, where: str) -> Foreign:
     return Foreign.from_lenses('DepthAI', lenses, rigs if connected else ())
 
 
-def _lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float]:
+def _depthai_lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float]:
     kind = camera.get('cameraType', _PERSPECTIVE)
     if kind not in (_PERSPECTIVE, _FISHEYE):
         raise LensError(

@@ -24,10 +24,10 @@ def read(text: str, where: str) -> Foreign:
         raise LensError(f'{where}: camera_model is {model!r}; pinhole can be read')
     name, stated = 'distortion_coefficients', models.stated_model(kind)
     if stated == 'equidistant':
-        k = fields.coefficients(document, name, (4,), where)
+        k = fields.coefficient_list(document, name, (4,), where)
         distortion = models.Distortion(models.EQUIDISTANT, k)
     elif stated == 'plumb_bob' or kind.lower() == 'none':
-        d = fields.coefficients(document, name, (4, 5), where) if stated else ()
+        d = fields.coefficient_list(document, name, (4, 5), where) if stated else ()
         distortion = models.opencv_distortion(d)
     else:
         raise LensError(

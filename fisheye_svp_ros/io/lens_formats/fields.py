@@ -76,7 +76,7 @@ def values(mapping: Mapping[str, Any], names: Sequence[str], where: str) -> list
     return [float(mapping[name]) for name in names]
 
 
-def coefficients(
+def coefficient_list(
     mapping: Mapping[str, Any], name: str, counts: Sequence[int], where: str
 ) -> list[float]:
     """Return as many numbers of a list as one of `counts`, or raise LensError; zeros follow."""

@@ -36,10 +36,12 @@ def read(text: str, where: str) -> Foreign:
         key=lambda name: (len(name), name),
     )
     cameras = {name: fields.section(document, name, where) for name in names}
-    lenses = {name: _lens(name, camera, f'{where}: {name}') for name, camera in cameras.items()}
+    lenses = {
+        name: _kalibr_lens(name, camera, f'{where}: {name}') for name, camera in cameras.items()
+    }
     rigs: list[Pose] = []
     for number, (before, name) in enumerate(pairwise(names)):
-        step = _step(cameras, before, name, where)
+        step = _neighbor_pose(cameras, before, name, where)
         if step is None:
             continue
         if len(rigs) < number:
@@ -51,23 +53,23 @@ def read(text: str, where: str) -> Foreign:
     return Foreign.from_lenses('Kalibr', lenses, rigs)
 
 
-def _lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float]:
+def _kalibr_lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float]:
     model = str(camera.get('camera_model')).lower()
     if model not in _INTRINSICS:
         raise LensError(f'{where}: camera_model is {model!r}; known are {", ".join(_INTRINSICS)}')
     *own, fx, fy, cx, cy = fields.numbers(camera, 'intrinsics', _INTRINSICS[model], where)
     size = fields.numbers(camera, 'resolution', 2, where)
-    distortion = _distortion(camera, model, own, where)
+    distortion = _kalibr_distortion(camera, model, own, where)
     return models.nearest_lens(name, size, (fx, fy, cx, cy), distortion, where)
 
 
-def _distortion(
+def _kalibr_distortion(
     camera: Mapping[str, Any], model: str, own: Sequence[float], where: str
 ) -> models.Distortion:
     """Return what the image is distorted by; own: numbers of the model beside the intrinsics."""
     kind = str(camera.get('distortion_model', 'none')).lower()
     d = (
-        fields.coefficients(camera, 'distortion_coeffs', (_COEFFICIENTS[kind],), where)
+        fields.coefficient_list(camera, 'distortion_coeffs', (_COEFFICIENTS[kind],), where)
         if (_COEFFICIENTS.get(kind))
         else []
     )
@@ -90,7 +92,7 @@ def _distortion(
     )
 
 
-def _step(
+def _neighbor_pose(
     cameras: Mapping[str, Mapping[str, Any]], before: str, name: str, where: str
 ) -> Pose | None:
     """Return a camera's neighbor in it: as stated, or through the IMU of both; None: not known."""

@@ -45,13 +45,13 @@ def read(text: str, where: str) -> Foreign:
     return Foreign.from_lenses(
         'Metashape',
         {
-            name: _lens(name, one, f'{where}: {name}' if len(values) > 1 else where)
+            name: _metashape_lens(name, one, f'{where}: {name}' if len(values) > 1 else where)
             for name, one in zip(names, values, strict=True)
         },
     )
 
 
-def _lens(name: str, calibration: Element, where: str) -> tuple[Lens, float]:
+def _metashape_lens(name: str, calibration: Element, where: str) -> tuple[Lens, float]:
     projection = calibration.findtext('projection') or calibration.get('type', '')
     if projection not in _BASES:
         raise LensError(

@@ -155,7 +155,9 @@ class Distortion:
     def height(self, theta: Array) -> Array:
         """Return the image height for unit focal length, of incidence angles, rad."""
         height = self.base.height(theta)
-        above, below = (1 + _powers(one, height * height) for one in (self.stretch, self.below))
+        above, below = (
+            1 + _polynomial(one, height * height) for one in (self.stretch, self.below)
+        )
         return np.asarray(height * (above / below))
 
     def image_points(self, theta: Array, azimuth: Array) -> Array:
@@ -165,8 +167,8 @@ class Distortion:
         plane = stretched if self.late else self.base.height(theta)[..., None] * around
         x, y = np.moveaxis(plane, -1, 0)
         z, (p1, p2) = x * x + y * y, self.tangential
-        along_u, along_v = (_powers(coefficients, z) for coefficients in self.prism)
-        grown = 1 + _powers(self.growth, z)
+        along_u, along_v = (_polynomial(coefficients, z) for coefficients in self.prism)
+        grown = 1 + _polynomial(self.growth, z)
         return np.asarray(
             stretched
             + np.stack(
@@ -179,7 +181,7 @@ class Distortion:
         )
 
 
-def _powers(coefficients: Sequence[float], z: Array) -> Array:
+def _polynomial(coefficients: Sequence[float], z: Array) -> Array:
     """Return c1 z + c2 z^2 + ..."""
     return np.asarray(sum((c * z**i for i, c in enumerate(coefficients, start=1)), 0.0 * z))
 
@@ -243,7 +245,7 @@ def nearest_lens(
     fx, fy, cx, cy, skew = (*intrinsics, 0.0)[:5]
     if distortion.is_kannala_brandt:
         k = (*distortion.stretch, *[0.0] * RADIAL_TERMS)[:RADIAL_TERMS]
-        lens, worst = kannala_brandt(name, size, (fx, fy, cx, cy), k, where), 0.0
+        lens, worst = kannala_brandt_lens(name, size, (fx, fy, cx, cy), k, where), 0.0
     elif distortion.is_opencv:
         lens, worst = _opencv_lens(name, size, (fx, fy, cx, cy), distortion, where), 0.0
     elif any(distortion.tilt):
@@ -272,7 +274,7 @@ def _opencv_lens(
     curve: ImageHeight = RationalPolynomial(*_pad(above), *_pad(below))
     if not any(below):
         curve = BrownConrady(*above) if any(above) else Perspective()
-    bare = kannala_brandt(name, size, intrinsics, [0.0] * RADIAL_TERMS, where)
+    bare = kannala_brandt_lens(name, size, intrinsics, [0.0] * RADIAL_TERMS, where)
     lens = replace(bare, image_height=curve)
     if distortion.sideways:
         along_u, along_v = (_pad(part, _PRISM_TERMS) for part in distortion.prism)
@@ -330,7 +332,7 @@ def _fit_corrections(
     return lens, float(np.abs(project_corrected(lens, points).uv - uv).max())
 
 
-def kannala_brandt(
+def kannala_brandt_lens(
     name: str,
     size: Sequence[float],
     intrinsics: Sequence[float],
@@ -401,7 +403,7 @@ def fit_curve(
         raise LensError(f'{where}: no fisheye curve fits the projection')
     off = scale * fitted.value_and_slope(theta)[0] - heights
     worst = float(np.abs(off).max() * max(fx, fy))
-    lens = kannala_brandt(
+    lens = kannala_brandt_lens(
         name,
         size,
         (scale * fx, scale * fy, cx, cy),

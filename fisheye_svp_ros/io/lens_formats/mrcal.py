@@ -141,7 +141,7 @@ def write(lens: Lens) -> str:
     # Of a lens with a shift that CAHVORE has not, the curve is written.
     shift = lens.viewpoint_shift if isinstance(lens.viewpoint_shift, Gennery) else None
     if shift is None and (lens.image_field is not None or worst > _TOLERANCE):
-        return _document(*_fit_splined_model(lens), (0.0, 0.0, 0.0), lens)
+        return _model_text(*_fit_splined_model(lens), (0.0, 0.0, 0.0), lens)
     e = [shift.e0, shift.e1, shift.e2] if shift is not None else [0.0] * 3
     intrinsics = [
         lens.fx,
@@ -156,10 +156,10 @@ def write(lens: Lens) -> str:
     ]
     # A constant part of the shift is where the camera stands.
     place = (0.0, 0.0, -shift.s0 if shift is not None else 0.0)
-    return _document('LENSMODEL_CAHVORE_linearity=0', intrinsics, place, lens)
+    return _model_text('LENSMODEL_CAHVORE_linearity=0', intrinsics, place, lens)
 
 
-def _document(model: str, intrinsics: list[float], place: tuple[float, ...], lens: Lens) -> str:
+def _model_text(model: str, intrinsics: list[float], place: tuple[float, ...], lens: Lens) -> str:
     return (
         '{\n'
         + ''.join(

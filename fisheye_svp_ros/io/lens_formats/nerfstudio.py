@@ -34,16 +34,16 @@ def read(text: str, where: str) -> Foreign:
     ]
     different = list({json.dumps(one): one for one in given}.values()) or [shared]
     if len(different) == 1:
-        lenses = {'camera': _lens('camera', different[0], where)}
+        lenses = {'camera': _nerfstudio_lens('camera', different[0], where)}
     else:
         lenses = {
-            f'camera{i}': _lens(f'camera{i}', one, f'{where}: camera{i}')
+            f'camera{i}': _nerfstudio_lens(f'camera{i}', one, f'{where}: camera{i}')
             for i, one in enumerate(different, start=1)
         }
     return Foreign.from_lenses('nerfstudio', lenses)
 
 
-def _lens(name: str, given: Mapping[str, Any], where: str) -> tuple[Lens, float]:
+def _nerfstudio_lens(name: str, given: Mapping[str, Any], where: str) -> tuple[Lens, float]:
     model = str(given.get('camera_model', _FISHEYE if given.get('is_fisheye') else 'OPENCV'))
     model = model.upper()
     if model != _FISHEYE and model not in _PERSPECTIVE:

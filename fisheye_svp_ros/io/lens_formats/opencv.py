@@ -87,9 +87,11 @@ def read(text: str, where: str) -> Foreign:
     named = {re.sub('[^a-z0-9]', '', str(name).lower()): value for name, value in document.items()}
 
     def lens(name: str, side: str) -> tuple[Lens, float]:
-        k = _matrix(_value(named, _names_of_side(_MATRIX, side), where), ((3, 3),), where)
-        coefficients = _matrix(
-            _value(named, _names_of_side(_COEFFICIENTS, side), where), _COUNTS, where
+        k = _matrix_numbers(
+            _named_value(named, _names_of_side(_MATRIX, side), where), ((3, 3),), where
+        )
+        coefficients = _matrix_numbers(
+            _named_value(named, _names_of_side(_COEFFICIENTS, side), where), _COUNTS, where
         )
         distortion = _distortion(coefficients, named, where)
         return models.nearest_lens(
@@ -107,8 +109,10 @@ def read(text: str, where: str) -> Foreign:
         lenses = {'camera': lens('camera', _only_side(named))}
     rigs: tuple[Pose, ...] = ()
     if any(name in named for name in (*_ROTATION, *_TRANSLATION)):
-        turn = np.reshape(_matrix(_value(named, _ROTATION, where), ((3, 3),), where), (3, 3))
-        place = _matrix(_value(named, _TRANSLATION, where), ((3, 1), (1, 3)), where)
+        turn = np.reshape(
+            _matrix_numbers(_named_value(named, _ROTATION, where), ((3, 3),), where), (3, 3)
+        )
+        place = _matrix_numbers(_named_value(named, _TRANSLATION, where), ((3, 1), (1, 3)), where)
         rigs = (fields.pose(place, turn, f'{where}: R, T'),)
     given = Foreign.from_lenses('OpenCV', lenses, rigs)
     assumed = not {_XI, *_IS_FISHEYE} & {*named} and not any(
@@ -157,7 +161,7 @@ def _has_four(named: Mapping[str, Any]) -> bool:
     return any(np.size(value) == _OF_FISHEYE for value in lists if isinstance(value, list))
 
 
-def _value(named: Mapping[str, Any], names: Sequence[str], where: str) -> Any:
+def _named_value(named: Mapping[str, Any], names: Sequence[str], where: str) -> Any:
     """Return the value under the first of some names; raise LensError for none."""
     for name in names:
         if name in named:
@@ -196,7 +200,7 @@ def _distortion(d: Sequence[float], named: Mapping[str, Any], where: str) -> mod
     if _XI in named:
         given = named[_XI]
         xi = (
-            _matrix(given, ((1, 1),), where)[0]
+            _matrix_numbers(given, ((1, 1),), where)[0]
             if isinstance(given, dict)
             else (fields.values(named, (_XI,), where)[0])
         )
@@ -206,7 +210,7 @@ def _distortion(d: Sequence[float], named: Mapping[str, Any], where: str) -> mod
     return models.opencv_distortion(d)
 
 
-def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[float]:
+def _matrix_numbers(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[float]:
     """Return the numbers of a matrix of one of some shapes, row by row.
 
     OpenCV 5 writes arrays of one dimension by their `sizes`; lists are those of other programs.

@@ -30,17 +30,21 @@ def read(text: str, where: str) -> Foreign:
     }
     if not prefixes['right']:
         return Foreign.from_lenses(
-            'ORB-SLAM3', {'camera': _lens('camera', prefixes['left'], document, where)}
+            'ORB-SLAM3', {'camera': _orbslam_lens('camera', prefixes['left'], document, where)}
         )
     lenses = {
-        camera: _lens(camera, prefix, document, f'{where}: {prefix.rstrip(".")}')
+        camera: _orbslam_lens(camera, prefix, document, f'{where}: {prefix.rstrip(".")}')
         for camera, prefix in prefixes.items()
     }
-    rigs = tuple(_rig(document[name], f'{where}: {name}') for name in _STEREO if name in document)
+    rigs = tuple(
+        _stereo_pose(document[name], f'{where}: {name}') for name in _STEREO if name in document
+    )
     return Foreign.from_lenses('ORB-SLAM3', lenses, rigs[:1])
 
 
-def _lens(name: str, prefix: str, document: Mapping[str, Any], where: str) -> tuple[Lens, float]:
+def _orbslam_lens(
+    name: str, prefix: str, document: Mapping[str, Any], where: str
+) -> tuple[Lens, float]:
     def values(*names: str) -> list[float]:
         return fields.values(document, [f'{prefix}{name}' for name in names], where)
 
@@ -61,7 +65,7 @@ def _lens(name: str, prefix: str, document: Mapping[str, Any], where: str) -> tu
     return models.nearest_lens(name, size, intrinsics, distortion, where)
 
 
-def _rig(matrix: Any, where: str) -> Pose:
+def _stereo_pose(matrix: Any, where: str) -> Pose:
     """Return the first camera in the second one."""
     data = matrix.get('data') if isinstance(matrix, dict) else None
     if not isinstance(data, list) or len(data) not in (12, 16):

@@ -58,7 +58,14 @@ def read(text: str, where: str) -> Foreign:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
     given = Foreign.from_lenses(
         'ROS',
-        {name: (lens_of(model, size, (k[0], k[4], k[2], k[5], k[1]), tuple(d), name, where), 0.0)},
+        {
+            name: (
+                distortion_lens(
+                    model, size, (k[0], k[4], k[2], k[5], k[1]), tuple(d), name, where
+                ),
+                0.0,
+            )
+        },
     )
     r, p = (
         fields.section({key: {}, **document}, key, where).get('data')
@@ -79,12 +86,12 @@ def _read_message(text: str, where: str) -> Foreign:
         raise LensError(str(cause)) from cause
     except (LookupError, TypeError, ValueError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
-    given = Foreign.from_lenses('ROS', {name: (lens_of(*model, name, where), 0.0)})
+    given = Foreign.from_lenses('ROS', {name: (distortion_lens(*model, name, where), 0.0)})
     return given._replace(rectified=fields.rectified(told.get('r'), told.get('p'), where))
 
 
 @lru_cache(maxsize=64)
-def lens_of(
+def distortion_lens(
     model: str,
     size: tuple[int, int],
     intrinsics: tuple[float, ...],

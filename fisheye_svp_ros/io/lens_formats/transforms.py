@@ -35,14 +35,14 @@ def recognises(text: str) -> bool:
 def read(text: str, where: str) -> Foreign:
     """Read the rig: the left camera in the right one; raises LensError, naming what is missing."""
     joints = list(_urdf(text, where) if '<robot' in text else _messages(text, where))
-    left, right = (_camera(side, joints, where) for side in ('left', 'right'))
+    left, right = (_joint_camera(side, joints, where) for side in ('left', 'right'))
     (root, mine), (other, theirs) = _pose_in_root(left, joints), _pose_in_root(right, joints)
     if root != other:
         raise LensError(f'{where}: no fixed transforms lead from {left} to {right}')
     return Foreign('transforms', {}, (theirs.inverse().compose(mine),), {})
 
 
-def _camera(side: str, joints: list[_Joint], where: str) -> str:
+def _joint_camera(side: str, joints: list[_Joint], where: str) -> str:
     frames = list(dict.fromkeys(itertools.chain.from_iterable(j[:2] for j in joints)))
     named = [frame for frame in frames if side in frame]
     named = [frame for frame in named if _OPTICAL in frame] or named
@@ -73,7 +73,7 @@ def _urdf(text: str, where: str) -> Iterator[_Joint]:
             origin = joint.find('origin')
             given = {} if origin is None else origin.attrib
             place, turn = (
-                _numbers(given.get(name, '0 0 0'), f'{where}: {joint.get("name")}')
+                _split_numbers(given.get(name, '0 0 0'), f'{where}: {joint.get("name")}')
                 for name in ('xyz', 'rpy')
             )
             roll, pitch, yaw = rotation_from_vector(np.diag(turn))  # about fixed axes
@@ -84,7 +84,7 @@ def _urdf(text: str, where: str) -> Iterator[_Joint]:
             )
 
 
-def _numbers(text: str, where: str) -> Array:
+def _split_numbers(text: str, where: str) -> Array:
     words: list[Any] = text.split()
     with suppress(ValueError):
         words = [parse_number(word) for word in words]

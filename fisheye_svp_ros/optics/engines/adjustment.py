@@ -65,7 +65,7 @@ def copy(source, target):
 
 
 @njit(**BARE)
-def _equations(w, left, right, cameras, state, normal, room):
+def _rig_equations(w, left, right, cameras, state, normal, room):
     """Write the normal equations; return the cost, inf outside the domain, nan if left."""
     points, uv, weight, lens = right
     views, total = len(points), 0.0
@@ -92,7 +92,7 @@ def _left_equations(w, seen, v, state, normal, room):
     hessian, _, gradient = normal_of(equations)
     own, mixed, own_gradient = normal_of(normal[v])
     rig, _, rig_gradient = normal_of(normal[len(points)])
-    _left_pose(pose_of(state[v]), pose_of(state[len(points)]), rotation, position, change)
+    _write_left_pose(pose_of(state[v]), pose_of(state[len(points)]), rotation, position, change)
     cost = view_equations(
         w, points[v], uv[v], weight[v], lens, rotation, position, hessian, gradient
     )
@@ -114,7 +114,7 @@ def _left_equations(w, seen, v, state, normal, room):
 
 
 @njit(**BARE)
-def _left_pose(right, rig, rotation, position, change):
+def _write_left_pose(right, rig, rotation, position, change):
     """Write the left camera's pose, and its change (6, 12) by those of right camera and rig."""
     for i in range(3):
         position[i] = 0.0
@@ -134,7 +134,7 @@ def _left_pose(right, rig, rotation, position, change):
 
 
 @njit(**BARE)
-def _solve(normal, cameras, damping, step, eliminated, lower):
+def _solve_damped(normal, cameras, damping, step, eliminated, lower):
     """Solve (H + damping diag H) d = -g; return |J d|^2, nan for a singular system."""
     views, columns = len(eliminated), 7 if cameras == 2 else 1
     # What the poses leave of the rig's equations has its place beside them.
@@ -194,12 +194,12 @@ def minimize(w, left, right, cameras, work, limit):
     states, normals, step, eliminated, lower, room = work
     damping, growth, moved_before = FIRST_DAMPING, FIRST_GROWTH, 0.0
     iteration = ended = at = known = 0
-    total = _equations(w, left, right, cameras, states[at], normals[known], room)
+    total = _rig_equations(w, left, right, cameras, states[at], normals[known], room)
     if not np.isfinite(total):
         return total, 0, -1 if np.isnan(total) else 0, at, known
     while iteration < limit:
         iteration += 1
-        moved = _solve(normals[known], cameras, damping, step, eliminated, lower)
+        moved = _solve_damped(normals[known], cameras, damping, step, eliminated, lower)
         if np.isnan(moved):
             ended = -1
             break
@@ -208,7 +208,7 @@ def minimize(w, left, right, cameras, work, limit):
         if marquardt.is_last(moved, moved_before, total, damping):
             at, total, ended = 1 - at, max(total - moved, 0.0), 1
             break
-        cost = _equations(w, left, right, cameras, states[1 - at], normals[1 - known], room)
+        cost = _rig_equations(w, left, right, cameras, states[1 - at], normals[1 - known], room)
         if np.isnan(cost):
             ended = -1
             break

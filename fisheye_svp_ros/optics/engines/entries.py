@@ -31,7 +31,7 @@ from fisheye_svp_ros.optics.engines.kernels import (
     factor,
     image,
     load,
-    solve_incidence,
+    solve_rays,
     substitute,
 )
 from fisheye_svp_ros.optics.engines.marquardt import MAX_ITERATIONS
@@ -48,7 +48,7 @@ def _take(w, n, points):
 
 
 @njit(**BARE)
-def _write(w, n, uv, state):
+def _write_image(w, n, uv, state):
     for i in range(n):
         uv[i, 0] = w[U + i] if w[STATE + i] == VALID else np.nan
         uv[i, 1] = w[V + i] if w[STATE + i] == VALID else np.nan
@@ -56,7 +56,7 @@ def _write(w, n, uv, state):
 
 
 @njit(**BARE)
-def _inverse(hessian, lower, out):
+def _invert(hessian, lower, out):
     """Write the inverse of an information (6, 6); return whether it is determined."""
     trace = 0.0
     if not factor(hessian, SINGULAR, lower):
@@ -75,7 +75,7 @@ def _residual(w, points, uv, row, lens, pose, out):
     for start in range(0, len(points), B):
         n, rows, measured = min(B, len(points) - start), row[start:], uv[start:]
         load(w, n, points[start:], *pose)
-        solve_incidence(w, n, lens, BACKWARD_ANGLE)
+        solve_rays(w, n, lens, BACKWARD_ANGLE)
         image(w, n, lens)
         remaining, off = 0, out[start:]
         for i in range(n):
@@ -125,7 +125,7 @@ def _dest(dimensions: int, kind: Any = types.float64) -> types.Array:
     return types.Array(kind, dimensions, 'C')
 
 
-def _entry(result: Any, *arguments: Any) -> Any:
+def _compiled_entry(result: Any, *arguments: Any) -> Any:
     """Compile for these types only, and keep it in the engine's own folder."""
 
     def compile_entry(function: Any) -> Any:
@@ -141,19 +141,19 @@ def _entry(result: Any, *arguments: Any) -> Any:
 _LENS = (_arg(1), types.float64)
 
 
-@_entry(types.void, _arg(2), *_LENS, _dest(2), _dest(1))
+@_compiled_entry(types.void, _arg(2), *_LENS, _dest(2), _dest(1))
 def project(points, lens, edge, uv, state):
     """Write image points (M, 2) and states (M)."""
     w = np.empty(SCRATCH)
     for start in range(0, len(points), B):
         n = min(B, len(points) - start)
         _take(w, n, points[start:])
-        solve_incidence(w, n, lens, edge)
+        solve_rays(w, n, lens, edge)
         image(w, n, lens)
-        _write(w, n, uv[start:], state[start:])
+        _write_image(w, n, uv[start:], state[start:])
 
 
-@_entry(types.void, _arg(3), _arg(2), _arg(3), *_LENS, _dest(3), _dest(2), _dest(4))
+@_compiled_entry(types.void, _arg(3), _arg(2), _arg(3), *_LENS, _dest(3), _dest(2), _dest(4))
 def linearize_views(rotation, position, points, lens, edge, uv, state, d_pose):
     """Write image points (S, N, 2), states (S, N) and derivatives (S, 2, 6, N)."""
     w = np.empty(SCRATCH)
@@ -162,10 +162,10 @@ def linearize_views(rotation, position, points, lens, edge, uv, state, d_pose):
         for start in range(0, points.shape[1], B):
             n = min(B, points.shape[1] - start)
             load(w, n, points[s, start:], r, position[s])
-            solve_incidence(w, n, lens, edge)
+            solve_rays(w, n, lens, edge)
             image(w, n, lens)
             derivatives(w, n, lens)
-            _write(w, n, uv[s, start:], state[s, start:])
+            _write_image(w, n, uv[s, start:], state[s, start:])
             for row in range(4):
                 # By place and by turn, of u and of v; the camera moves, not the point.
                 at = ROW + (row // 2) * ROWS + (row % 2) * 3 * B
@@ -181,7 +181,7 @@ def linearize_views(rotation, position, points, lens, edge, uv, state, d_pose):
 _VIEW_ARRAYS = (_arg(3), _arg(3), _arg(2))
 
 
-@_entry(
+@_compiled_entry(
     types.UniTuple(types.int64, 2),
     _arg(1),
     types.int64,
@@ -230,7 +230,7 @@ def localize(
             copy(pose[1], position[s])
             solved[s] = (
                 ended == 1
-                and _inverse(normal_of(normals[known, 0])[0], lower, covariance[s])
+                and _invert(normal_of(normals[known, 0])[0], lower, covariance[s])
                 and _residual(w, points[s], uv[s], row[s], lens, pose, residual[s])
             )
         remaining += not solved[s]
@@ -238,7 +238,7 @@ def localize(
     return remaining, flat
 
 
-@_entry(
+@_compiled_entry(
     types.int64,
     *_VIEW_ARRAYS,
     _arg(1),

@@ -114,7 +114,7 @@ def _rotate_sin_cos(sin, cos, turn):
 
 
 @njit(**BARE)
-def solve_incidence(w, n, lens, edge):
+def solve_rays(w, n, lens, edge):
     """Solve the ray equation of n points in the rows X, Y, Z; STATE says how it went."""
     for i in range(n):
         x, y, z = w[X + i] + AXIS_EPS, w[Y + i], w[Z + i]
@@ -127,7 +127,7 @@ def solve_incidence(w, n, lens, edge):
         w[COS0 + i] = w[COS + i] = z * inverse
         w[R + i], w[CLEARANCE + i] = r, d
     if lens[SHIFT_KIND] >= 0:
-        _shifted_rays(w, n, lens)
+        _shift_rays(w, n, lens)
     for i in range(n):
         seen = (w[CLEARANCE + i] > ZERO_CLEARANCE) & (w[THETA + i] <= edge)
         w[STATE + i] = VALID if seen else INVALID
@@ -139,7 +139,7 @@ def solve_incidence(w, n, lens, edge):
 
 
 @njit(**BARE)
-def _shifted_rays(w, n, lens):
+def _shift_rays(w, n, lens):
     for i in range(n):
         w[TURN + i] = 0.0
     late = 0
@@ -264,7 +264,7 @@ def add_view(w, points, uv, weight, lens, rotation, position, gram):
             w[X + i] = 0.0 if unused else w[X + i]
             w[Y + i] = 0.0 if unused else w[Y + i]
             w[Z + i] = 1.0 if unused else w[Z + i]
-        solve_incidence(w, n, lens, BACKWARD_ANGLE)
+        solve_rays(w, n, lens, BACKWARD_ANGLE)
         image(w, n, lens)
         derivatives(w, n, lens)
         failed = 0

@@ -47,8 +47,8 @@ def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
     """See `engines.incidence`."""
     theta, valid = np.empty(len(points)), np.empty(len(points), dtype=bool)
     unit = np.empty((2, len(points)))
-    for part in _blocks(len(points)):
-        met = _solved_incidence(lens, _rows(points[part]), limited)
+    for part in _point_blocks(len(points)):
+        met = _solved_incidence(lens, _point_rows(points[part]), limited)
         theta[part], valid[part] = met.theta, met.valid
         np.divide((met.x, met.y), met.r, out=unit[:, part])
     return Incidence(theta, unit, valid)
@@ -58,13 +58,13 @@ def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
 def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     """See `engines.project`."""
     uv, valid = np.empty((2, len(points))), np.empty(len(points), dtype=bool)
-    for part in _blocks(len(points)):
-        met = _solved_incidence(lens, _rows(points[part]), limited)
+    for part in _point_blocks(len(points)):
+        met = _solved_incidence(lens, _point_rows(points[part]), limited)
         ratio, _ = met.height(lens.image_height)
         ratio /= met.r
         np.multiply(met.x, ratio, out=uv[0, part])
         np.multiply(met.y, ratio, out=uv[1, part])
-        uv[:, part] *= _pair(lens.fx, lens.fy, 2)
+        uv[:, part] *= _number_pair(lens.fx, lens.fy, 2)
         _center(lens, met.valid, uv[:, part])
         valid[part] = met.valid
     return uv.T, valid
@@ -78,7 +78,7 @@ def linearize_views(
     shape = points.shape[:2]
     uv, valid = np.empty((2, *shape)), np.empty(shape, dtype=bool)
     d_pose, sums = np.empty((12, *shape)), _sums(lens, rotation)
-    for part in _tiles(*shape):
+    for part in _point_tiles(*shape):
         local = _to_cameras(rotation, position, points, part)
         met = _solved_incidence(lens, local, limited)
         out = (rows[:, *part].swapaxes(0, 1) for rows in (d_pose, uv))
@@ -101,8 +101,8 @@ def pose_equations(
     points, uv, weight = seen
     systems, count = weight.shape
     cost, gram = np.zeros(systems), np.zeros((systems, 6, 7))
-    sums, center = _sums(lens, rotation), _pair(lens.cx, lens.cy, 3)
-    for part in _tiles(systems, count):
+    sums, center = _sums(lens, rotation), _number_pair(lens.cx, lens.cy, 3)
+    for part in _point_tiles(systems, count):
         own, weights = part[0], weight[part]
         local = _to_cameras(rotation, position, points, part)
         if np.count_nonzero(weights) < weights.size:
@@ -135,20 +135,20 @@ def adjust_rigs(*_: object) -> None:
     """Leave it to `solve.stereo_calibration`."""
 
 
-def _blocks(count: int) -> Iterator[slice]:
+def _point_blocks(count: int) -> Iterator[slice]:
     for start in range(0, max(count, 1), _BLOCK):
         yield slice(start, start + _BLOCK)
 
 
-def _tiles(systems: int, count: int) -> Iterator[tuple[slice, slice]]:
+def _point_tiles(systems: int, count: int) -> Iterator[tuple[slice, slice]]:
     """Blocks of whole systems or, where one alone is larger, of its points."""
     many = max(1, _BLOCK // max(count, 1))
     for first in range(0, systems, many):
-        for part in _blocks(count):
+        for part in _point_blocks(count):
             yield slice(first, first + many), part
 
 
-def _rows(points: Array) -> Array:
+def _point_rows(points: Array) -> Array:
     """Return a copy of points (M, 3) as rows (3, M), in which NumPy is faster."""
     return np.array(points.T, order='C')
 
@@ -173,7 +173,7 @@ def _to_cameras(
 
 def _center(lens: Lens, valid: Mask, uv: Array) -> None:
     """Move image points (2, ...), px, from around the origin; NaN where there is none."""
-    uv += _pair(lens.cx, lens.cy, uv.ndim)
+    uv += _number_pair(lens.cx, lens.cy, uv.ndim)
     if np.count_nonzero(valid) < valid.size:
         uv[:, ~valid] = np.nan
 
@@ -213,7 +213,7 @@ def _sums(lens: Lens, rotation: Array) -> Array:
 
     By place: by x of u, of v, by y, ...; then by turn; then u, v themselves.
     """
-    focal = _pair(lens.fx, lens.fy, 2)
+    focal = _number_pair(lens.fx, lens.fy, 2)
     sums = np.empty((len(rotation), 14, 6))
     turned = rotation[:, None] @ (_BY_CAMERA * focal).reshape(2, 3, 12)
     sums[:, :12] = turned.reshape(-1, 12, 6)
@@ -221,6 +221,6 @@ def _sums(lens: Lens, rotation: Array) -> Array:
     return sums
 
 
-def _pair(u: float, v: float, dimensions: int) -> Array:
+def _number_pair(u: float, v: float, dimensions: int) -> Array:
     """Return two numbers to be applied to rows (2, ...) of some dimensions."""
     return np.array((u, v)).reshape(2, *(1,) * (dimensions - 1))

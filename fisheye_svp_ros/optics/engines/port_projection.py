@@ -84,12 +84,12 @@ def met(lens: Lens, sight: Sight, limited: bool) -> Incidence:
     return found._replace(valid=found.valid & sight.valid)
 
 
-def columns(lens: Lens, sight: Sight) -> tuple[Array, Array]:
+def port_columns(lens: Lens, sight: Sight) -> tuple[Array, Array]:
     """Return derivatives of image points by the lens's viewpoint shift (M, 2), px/m.
 
     And by the coefficients of its port (M, 2, K).
     """
-    _, _, by_direction = _image(lens, sight, False)
+    _, _, by_direction = _image_by_direction(lens, sight, False)
     return (by_direction @ sight.d_shift[..., None])[..., 0], by_direction @ sight.d_port
 
 
@@ -100,14 +100,14 @@ def linearize_views(
     shape = points.shape[:2]
     arm = points - position[:, None]
     seen = sight(lens, (arm @ rotation).reshape(-1, 3))
-    uv, valid, by_direction = _image(lens, seen, limited)
+    uv, valid, by_direction = _image_by_direction(lens, seen, limited)
     by_point = (by_direction @ seen.d_point).reshape(*shape, 2, 3)
     by_place = by_point @ np.swapaxes(rotation, -1, -2)[:, None]
     d_pose = np.concatenate([-by_place, by_place @ cross_matrix(arm)], axis=-1)
     return uv.reshape(*shape, 2), valid.reshape(shape), d_pose
 
 
-def _image(lens: Lens, sight: Sight, limited: bool) -> tuple[Array, Mask, Array]:
+def _image_by_direction(lens: Lens, sight: Sight, limited: bool) -> tuple[Array, Mask, Array]:
     """Return image points (M, 2), validity, and derivatives (M, 2, 3) by the direction."""
     still = np.eye(3)[None], np.zeros((1, 3))
     uv, valid, d_pose = numpy_engine.linearize_views(

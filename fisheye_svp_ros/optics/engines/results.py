@@ -26,7 +26,7 @@ class Incidence(NamedTuple):
     valid: Mask
 
 
-class _Localization(NamedTuple):
+class _PoseFields(NamedTuple):
     pose: Pose
     covariance: Array
     residual: Array
@@ -38,7 +38,7 @@ class _Localization(NamedTuple):
     added: Array
 
 
-class Localization(_Localization, Batch):
+class Localization(_PoseFields, Batch):
     """Solved poses of S views.
 
     pose: camera in the world; covariance (S, 6, 6), m and rad, of the change in `Pose.retract`;
