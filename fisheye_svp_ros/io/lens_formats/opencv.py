@@ -87,10 +87,10 @@ def read(text: str, where: str) -> Foreign:
     named = {re.sub('[^a-z0-9]', '', str(name).lower()): value for name, value in document.items()}
 
     def lens(name: str, side: str) -> tuple[Lens, float]:
-        k = _matrix_numbers(
+        k = _read_matrix(
             _named_value(named, _names_of_side(_MATRIX, side), where), ((3, 3),), where
         )
-        coefficients = _matrix_numbers(
+        coefficients = _read_matrix(
             _named_value(named, _names_of_side(_COEFFICIENTS, side), where), _COUNTS, where
         )
         distortion = _distortion(coefficients, named, where)
@@ -110,9 +110,9 @@ def read(text: str, where: str) -> Foreign:
     rigs: tuple[Pose, ...] = ()
     if any(name in named for name in (*_ROTATION, *_TRANSLATION)):
         turn = np.reshape(
-            _matrix_numbers(_named_value(named, _ROTATION, where), ((3, 3),), where), (3, 3)
+            _read_matrix(_named_value(named, _ROTATION, where), ((3, 3),), where), (3, 3)
         )
-        place = _matrix_numbers(_named_value(named, _TRANSLATION, where), ((3, 1), (1, 3)), where)
+        place = _read_matrix(_named_value(named, _TRANSLATION, where), ((3, 1), (1, 3)), where)
         rigs = (fields.pose(place, turn, f'{where}: R, T'),)
     given = Foreign.from_lenses('OpenCV', lenses, rigs)
     assumed = not {_XI, *_IS_FISHEYE} & {*named} and not any(
@@ -200,7 +200,7 @@ def _distortion(d: Sequence[float], named: Mapping[str, Any], where: str) -> mod
     if _XI in named:
         given = named[_XI]
         xi = (
-            _matrix_numbers(given, ((1, 1),), where)[0]
+            _read_matrix(given, ((1, 1),), where)[0]
             if isinstance(given, dict)
             else (fields.values(named, (_XI,), where)[0])
         )
@@ -210,7 +210,7 @@ def _distortion(d: Sequence[float], named: Mapping[str, Any], where: str) -> mod
     return models.opencv_distortion(d)
 
 
-def _matrix_numbers(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[float]:
+def _read_matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[float]:
     """Return the numbers of a matrix of one of some shapes, row by row.
 
     OpenCV 5 writes arrays of one dimension by their `sizes`; lists are those of other programs.
