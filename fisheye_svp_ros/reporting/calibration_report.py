@@ -84,7 +84,7 @@ def _camera_section(name: str, camera: CalibratedCamera) -> dict[str, Any]:
         'coverage': _picture_uris('coverage', 2, _draw_coverage, camera),
         'residuals': _picture_uris('residuals', 2, _residuals, camera),
         'frames_picture': _picture_uris('residuals by frame', 1, _frames, camera),
-        'uncertainty': _picture_uris('uncertainty', 2, _uncertainty, ray_map),
+        'uncertainty': _picture_uris('uncertainty', 2, _uncertainty, ray_map, tight=False),
     }
 
 
@@ -107,17 +107,20 @@ def _rays(camera: CalibratedCamera) -> tuple[RayModel, RayMap]:
     return model, map_rays(rays_of, uv, (camera.lens.width, camera.lens.height))
 
 
-def _picture_uris(name: str, count: int, draw: Any, *arguments: Any) -> tuple[str, str]:
+def _picture_uris(
+    name: str, count: int, draw: Any, *arguments: Any, tight: bool = True
+) -> tuple[str, str]:
     """Return a picture as part of the page, wide and narrow; '' where it cannot be drawn.
 
-    count: of its panels; draw: takes a figure, the arguments, and whether the figure is narrow.
+    count: of its panels; draw: takes a figure, the arguments, and whether the figure is narrow;
+    tight: see `drawing`.
     """
     wide, narrow = BytesIO(), BytesIO()
 
     def draw_figures(_: Path) -> None:
-        with drawing(wide, _WIDTH, 3.6) as figure:
+        with drawing(wide, _WIDTH, 3.6, tight=tight) as figure:
             draw(figure, *arguments, False)
-        with drawing(narrow, NARROW, 3.3 * count) as figure:
+        with drawing(narrow, NARROW, 3.3 * count, tight=tight) as figure:
             draw(figure, *arguments, True)
 
     if not draw_or_note(Path(name), draw_figures):
