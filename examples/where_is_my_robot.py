@@ -29,7 +29,7 @@ from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, carried_pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import views_of
-from fisheye_svp_ros.study.solutions import localize_sets
+from fisheye_svp_ros.solve.poses import solve_poses
 
 LENS = Lens(
     'robot',
@@ -203,7 +203,7 @@ def localize_bases(
     views = views_of(points, uv, np.full(uv.shape[:2], 1 / SIGMA))
     landmark = np.tile((4 * tags.ids[:, None] + np.arange(4)).ravel(), (len(posed), 1))
     views = views._replace(landmark_covariance=tags.landmark_covariance(landmark))
-    solution = localize_sets(ForwardModel(LENS), views, examined=True).solution
+    solution = solve_poses(ForwardModel(LENS), views)
     carried = [
         carried_pose(solution.pose.take(i), solution.covariance[i], MOUNT.inverse())
         for i in range(len(posed))

@@ -38,7 +38,8 @@ from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.simulate.render import Exposure, Field, Print, render
 from fisheye_svp_ros.simulate.targets import board_views
 from fisheye_svp_ros.solve.lens_calibration import calibrate
-from fisheye_svp_ros.solve.measured_poses import localize_measured, rms_px
+from fisheye_svp_ros.solve.measured_poses import rms_px
+from fisheye_svp_ros.solve.table_poses import solve_table
 
 KEPT = study.RESULTS / 'blind' / 'images.jsonl'
 BOARD = 'chessboard:9x6:25mm'
@@ -239,7 +240,7 @@ def _amount(make: Callable[[float], World], swung: Swing, size: float) -> float:
     frame, corner = np.nonzero(np.isfinite(uv).all(axis=-1))
     table = make_observations(frame, corner, uv[frame, corner], PLAIN.corners[corner])
     if world.bumped:
-        residual = localize_measured(ForwardModel(LENS), table).result.residual
+        residual = solve_table(table, ForwardModel(LENS)).result.residual
     else:
         residual = calibrate(table, 'kannala_brandt', (640, 600)).adjusted.residual
     return float(size * NOISE * np.sqrt(2) / rms_px(residual))

@@ -119,7 +119,7 @@ def tried(case: str, kind: str, count: int, rng: np.random.Generator) -> Outcome
         size, error = (np.linalg.norm(x[:, part], axis=1) for x in (deviation, off))
         wrong |= error > FAR_OFF * size
     passed = found.converged & np.array([not reason for reason in checked.reasons])
-    cleaned = found.converged & checked.gross.any(axis=1)
+    cleaned = found.converged & checked.outliers.any(axis=1)
     return Outcome(
         count,
         int((~seen).sum()),

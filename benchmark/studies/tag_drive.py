@@ -31,10 +31,10 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, carried_pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Views, views_of
 from fisheye_svp_ros.scene.pose_priors import PlanarPrior
-from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.solve.pose_gate import GatedPose, GateLimits, OdometryGate, weakness
-from fisheye_svp_ros.solve.weak_geometry import CHI2_999
-from fisheye_svp_ros.study.solutions import SetSolutions, localize_sets
+from fisheye_svp_ros.solve.poses import solve_poses
+from fisheye_svp_ros.solve.solved_poses import SolvedPoses
+from fisheye_svp_ros.solve.weak_geometry import CHI2_999, is_ambiguous
 
 IMAGES, SIGMA = 300, 0.2  # a drive; px
 TAGS, HALF = 16, (3.5, 2.5)  # m, half the sides of the room
@@ -160,18 +160,16 @@ def drive(number: int, planar: bool = False) -> Drive:
             views = views._replace(prior=prior)
         solved = _localize(views)
         counts[kind, 'images'] += 1
-        if solved is None or not solved.solved[0]:
+        if solved is None or not solved.result.converged[0]:
             counts[kind, 'no pose'] += 1
             continue
-        pose, covariance = carried_pose(
-            solved.solution.pose.take(0), solved.solution.covariance[0], mount.inverse()
-        )
+        pose, covariance = carried_pose(solved.pose.take(0), solved.covariance[0], mount.inverse())
         change = pose.difference(base_at(image))
         wrong = not change @ np.linalg.solve(covariance, change) < CHI2_999
         gated = GatedPose(
             pose,
             covariance,
-            bool(solved.metrics['ambiguous'][0]),
+            bool(is_ambiguous(solved.result)[0]),
             float(solved.sigmas[0]),
             solved.suspects[0],
         )
@@ -179,10 +177,10 @@ def drive(number: int, planar: bool = False) -> Drive:
     return Drive(counts)
 
 
-def _localize(views: Views) -> SetSolutions[Localization] | None:
+def _localize(views: Views) -> SolvedPoses | None:
     """Return the pose of an image, None where its points fix none."""
     try:
-        return localize_sets(MODEL, views, examined=True, tags=True)
+        return solve_poses(MODEL, views, tags=True)
     except GeometryError:  # three corners in the field of view of the lens
         return None
 

@@ -75,7 +75,7 @@ RULES = (
     Rule(
         ('localize',),
         ('--tag-map',),
-        lambda args: (args.board or '').startswith(f'{LOOSE_TAGS}:'),
+        lambda args: not _has_photographs(args) or (args.board or '').startswith(f'{LOOSE_TAGS}:'),
         'belongs to photographs of loose tags; add --board tags:36h11',
     ),
     Rule(

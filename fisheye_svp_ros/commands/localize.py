@@ -6,12 +6,13 @@ Of one camera, of each of several, or with `--rig` of the first camera of a rig 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.commands.detect import (
     add_observation_arguments,
     note_side_by_side,
@@ -28,12 +29,13 @@ from fisheye_svp_ros.commands.notes import (
     say,
 )
 from fisheye_svp_ros.commands.outputs import add_output_folder
-from fisheye_svp_ros.detect.patterns import LOOSE_TAGS
+from fisheye_svp_ros.detect.patterns import LOOSE_TAGS, parse_pattern
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_files import write_columns
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.readers import check_sizes, write_poses
 from fisheye_svp_ros.io.rig_files import load_cameras
+from fisheye_svp_ros.io.tag_maps import TagMap, read_tag_map
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.terminal import noise_text, print_table, progress
@@ -46,8 +48,10 @@ from fisheye_svp_ros.scene.observations import (
     photograph_entry,
 )
 from fisheye_svp_ros.solve.localization import sight
-from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measured, rms_px
-from fisheye_svp_ros.solve.rig_localization import RigLocalization, localize_rig
+from fisheye_svp_ros.solve.measured_poses import rms_px
+from fisheye_svp_ros.solve.outliers import FAR_POINT
+from fisheye_svp_ros.solve.solved_poses import SolvedPoses
+from fisheye_svp_ros.solve.table_poses import solve_rig_table, solve_table
 from fisheye_svp_ros.solve.weak_geometry import is_ambiguous, pose_odds
 
 _Parts = dict[str, dict[str, float]]  # root mean squares by quantity and part
@@ -88,7 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Localize every frame, print the poses, write the results."""
-    tags = _name_tag_map(args)
+    tags = _tag_map_of(args)
     given = load_lenses(args.lens)
     observations, sizes = read_input(args.observations, args)
     lenses = lenses_of(observations.cameras, given)
@@ -98,66 +102,84 @@ def run(args: argparse.Namespace) -> None:
             observations, {name: (one.width, one.height) for name, one in lenses.items()}
         )
     if args.rig:
-        _localize_rig(observations, lenses, args)
+        _localize_rig(observations, lenses, tags, args)
         return
     for camera, (name, lens) in enumerate(lenses.items()):
-        model, uncertainty = ForwardModel(lens), None
+        uncertainty = None
         table = observations.take(observations.camera == camera)
         with progress('localizing'):
             if args.model_error:
                 from fisheye_svp_ros.diagnosis import LensErrors, pose_summary
                 from fisheye_svp_ros.study.trust import localize_with_errors
 
-                measured, parts = localize_with_errors(LensErrors.from_lens(lens), table)
+                solved, parts = localize_with_errors(LensErrors.from_lens(lens), table, tags)
                 uncertainty = pose_summary(parts)
             else:
-                measured = localize_measured(model, table, tags)
-        note_extrapolated(name or 'image points', lens, measured.views.uv[measured.views.used])
+                solved = solve_table(table, ForwardModel(lens), tags)
+        note_extrapolated(name or 'image points', lens, solved.views.uv[solved.views.used])
         note_mirrored(name or 'image points', lens, table)
         title = ' '.join(filter(None, (args.observations, name)))
-        _print(table, measured, uncertainty, title)
-        note_wrong_landmarks(measured.landmarks)
-        note_left_out(table, measured.left_out)
-        note_doubtful(table, measured.views.frame.tolist(), measured.reasons)
-        if frames := measured.views.frame[is_ambiguous(measured.result)].tolist():
-            say(second_pose_note(list_frames(table, frames), len(frames)))
+        _print(table, solved, uncertainty, title)
+        note_wrong_landmarks(solved.landmarks, tags is not None)
+        _note_frames(table, solved)
         if args.output:
             with write_together():
-                _write(args.output / name, model, table, measured, uncertainty)
+                _write(args.output / name, table, solved, uncertainty)
 
 
-def _name_tag_map(args: argparse.Namespace) -> bool:
-    """Add the map of tags to the board; say whether there are loose tags in photographs."""
+def _tag_map_of(args: argparse.Namespace) -> TagMap | None:
+    """Return the map of loose tags, and add it to the board of photographs."""
+    if not args.board:
+        return read_tag_map(args.tag_map) if args.tag_map else None
     if args.tag_map:
         args.board = f'{args.board.rstrip(":")}:{args.tag_map}'
-    return (args.board or '').startswith(f'{LOOSE_TAGS}:')
+    kind, *words = args.board.split(':')
+    if kind != LOOSE_TAGS:
+        return None
+    from fisheye_svp_ros.detect.tags import tags_of_board  # with OpenCV, seldom
+
+    parse_pattern(args.board)  # which says what is wrong with it
+    return tags_of_board(args.board, words)
+
+
+def _note_frames(table: Observations, solved: SolvedPoses) -> None:
+    """Say which frames are left out, and whose poses should not be relied on."""
+    note_left_out(table, solved.left_out)
+    note_doubtful(table, solved.frame.tolist(), solved.reasons)
+    if frames := solved.frame[is_ambiguous(solved.result)].tolist():
+        say(second_pose_note(list_frames(table, frames), len(frames)))
 
 
 def _localize_rig(
-    table: Observations, lenses: Mapping[str, Lens], args: argparse.Namespace
+    table: Observations,
+    lenses: Mapping[str, Lens],
+    tags: TagMap | None,
+    args: argparse.Namespace,
 ) -> None:
     """Localize every frame of a rig, print the poses of its first camera, write the results."""
     cameras, places = load_cameras(args.rig)
     with progress('localizing'):
-        solution = localize_rig(table, lenses, cameras, places)
+        solved = solve_rig_table(table, lenses, cameras, places, tags)
     for camera, (name, lens) in enumerate(lenses.items()):
         mine = table.take(table.camera == camera)
         note_extrapolated(name, lens, mine.uv)
         note_mirrored(name, lens, mine)
-    note_left_out(table, solution.left_out)
-    note_gross_errors(solution.table, solution.outliers)
-    if solution.contradicted:
+    note_wrong_landmarks(solved.landmarks, tags is not None)
+    if solved.rejected is not None:
+        note_gross_errors(table, solved.rejected)
+    _note_frames(table, solved)
+    if solved.contradicted:
         say(f'{args.rig}: the relative poses of the cameras differ; calibrate the rig again')
     if args.output:
         with write_together():
-            _write_rig(args.output, cameras, solution)
-    _print_rig(table, cameras, solution)
+            _write_rig(args.output, cameras, table, solved)
+    _print_rig(table, cameras, solved)
 
 
 def _print(
-    table: Observations, measured: MeasuredPoses, uncertainty: _Parts | None, source: str
+    table: Observations, solved: SolvedPoses, uncertainty: _Parts | None, source: str
 ) -> None:
-    views, residual = measured.views, measured.inlier_residual
+    views, residual = solved.views, solved.residual
     labels = [
         (frame_name(table, frame).removeprefix('frame '), str(count))
         for frame, count in zip(
@@ -169,30 +191,27 @@ def _print(
         f'rms {rms_px(residual):.4f} px',
         labels,
         [rms_px(one) for one in residual[:_MAX_ROWS]],
-        measured.result.pose,
-        measured.result.covariance,
-        noise_text(measured.sigma) if uncertainty is None else _parts_text(uncertainty),
+        solved.pose,
+        solved.covariance,
+        noise_text(solved.sigma) if uncertainty is None else _parts_text(uncertainty),
     )
 
 
-def _print_rig(
-    table: Observations, cameras: tuple[str, ...], localization: RigLocalization
-) -> None:
-    data, labels, rms = localization.data, [], []
-    for i, frame in enumerate(localization.frame[:_MAX_ROWS].tolist()):
-        mine = data.frame_of == i
-        names = [localization.table.cameras[camera] for camera in data.camera_of[mine]]
-        labels.append((str(frame), ' '.join(names), str(int(data.views.used[mine].sum()))))
-        rms.append(rms_px(localization.residual[mine]))
+def _print_rig(table: Observations, cameras: tuple[str, ...], solved: SolvedPoses) -> None:
+    views, kept, labels = solved.views, solved.views.used & ~solved.outliers, []
+    for frame, row, used in zip(views.frame[:_MAX_ROWS].tolist(), views.row, kept, strict=False):
+        names = sorted({table.cameras[i] for i in table.camera[row[used]]}, key=cameras.index)
+        labels.append((str(frame), ' '.join(names), str(int(used.sum()))))
+    seen = np.unique(table.camera[views.row[kept]])
     _print_poses(
-        f'{table.source}: {cameras[0]} in the world, from {int(data.views.used.sum())} points of '
-        f'{len(localization.table.cameras)} cameras in {len(localization.frame)} frames, rms '
-        f'{rms_px(localization.residual):.4f} px',
+        f'{table.source}: {cameras[0]} in the world, from {int(kept.sum())} points of '
+        f'{len(seen)} cameras in {len(views.frame)} frames, rms '
+        f'{rms_px(solved.residual):.4f} px',
         labels,
-        rms,
-        localization.pose,
-        localization.covariance,
-        noise_text(localization.sigma),
+        [rms_px(one) for one in solved.residual[:_MAX_ROWS]],
+        solved.pose,
+        solved.covariance,
+        noise_text(solved.sigma),
     )
 
 
@@ -272,26 +291,18 @@ def _write_poses(
 
 
 def _write(
-    folder: Path,
-    model: ForwardModel,
-    table: Observations,
-    measured: MeasuredPoses,
-    uncertainty: _Parts | None,
+    folder: Path, table: Observations, solved: SolvedPoses, uncertainty: _Parts | None
 ) -> None:
-    views, result = measured.views, measured.result
+    views, result = solved.views, solved.result
     _write_poses(folder, table, views.frame, result.pose, result.covariance)
     used = views.used
     frame = np.broadcast_to(views.frame[:, None], used.shape)
-    theta, distance = sight(model, result.pose, views)
+    theta, distance = sight(solved.model, result.pose, views)
     write_columns(
         folder / 'residuals.csv',
         {
             'frame': frame[used],
-            'landmark': views.landmark[used],
-            'u': views.uv[used][:, 0],
-            'v': views.uv[used][:, 1],
-            'du': result.residual[used][:, 0],
-            'dv': result.residual[used][:, 1],
+            **_residual_columns(solved, used),
             'theta': theta[used],
             'range': distance[used],
             **photograph_column(table, frame[used]),
@@ -300,22 +311,8 @@ def _write(
     write_json(
         folder / 'localize.json',
         {
-            'rms_px': rms_px(measured.inlier_residual),
-            'frames': len(views.frame),
+            **_summary(table, solved),
             'observations': int(used.sum()),
-            'left_out': measured.left_out,
-            'sigma_px': measured.sigma,
-            'poses': [
-                {
-                    'frame': int(frame),
-                    **photograph_entry(table, int(frame)),
-                    'ambiguous': bool(second),
-                    'odds': float(odds),
-                }
-                for frame, second, odds in zip(
-                    views.frame, is_ambiguous(result), pose_odds(result), strict=True
-                )
-            ],
             'gross': [
                 {
                     'frame': int(views.frame[i]),
@@ -323,70 +320,100 @@ def _write(
                     'landmark': int(views.landmark[i, j]),
                     'px': float(np.linalg.norm(result.residual[i, j])),
                 }
-                for i, j in np.argwhere(measured.gross)
-            ],
-            'wrong_landmarks': [landmark.to_dict() for landmark in measured.landmarks],
-            'doubtful': [
-                {'frame': int(frame), **photograph_entry(table, int(frame)), 'reason': reason}
-                for frame, reason in zip(views.frame, measured.reasons, strict=True)
-                if reason
+                for i, j in np.argwhere(solved.outliers)
             ],
             **({} if uncertainty is None else {'uncertainty': uncertainty}),
         },
     )
 
 
-def _write_rig(folder: Path, cameras: tuple[str, ...], localization: RigLocalization) -> None:
-    data, views, residual = localization.data, localization.data.views, localization.residual
-    table, names = localization.table, localization.table.cameras
-    _write_poses(folder, table, localization.frame, localization.pose, localization.covariance)
-    used = views.used
-    frame, camera = (
-        np.broadcast_to(part[:, None], used.shape)[used] for part in (views.frame, data.camera_of)
-    )
+def _residual_columns(solved: SolvedPoses, shown: Mask) -> dict[str, Array | Index]:
+    (u, v), (du, dv) = solved.views.uv[shown].T, solved.result.residual[shown].T
+    return {'landmark': solved.views.landmark[shown], 'u': u, 'v': v, 'du': du, 'dv': dv}
+
+
+def _summary(table: Observations, solved: SolvedPoses) -> dict[str, Any]:
+    """Return what localize.json holds of one camera and of a rig."""
+    return {
+        'rms_px': rms_px(solved.residual),
+        'frames': len(solved.frame),
+        'left_out': solved.left_out,
+        'sigma_px': solved.sigma,
+        'poses': [
+            {
+                'frame': int(frame),
+                **photograph_entry(table, int(frame)),
+                'ambiguous': bool(second),
+                'odds': float(odds),
+            }
+            for frame, second, odds in zip(
+                solved.frame, is_ambiguous(solved.result), pose_odds(solved.result), strict=True
+            )
+        ],
+        'wrong_landmarks': [landmark.to_dict() for landmark in solved.landmarks],
+        'doubtful': [
+            {'frame': int(frame), **photograph_entry(table, int(frame)), 'reason': reason}
+            for frame, reason in zip(solved.frame, solved.reasons, strict=True)
+            if reason
+        ],
+    }
+
+
+def _write_rig(
+    folder: Path, cameras: tuple[str, ...], table: Observations, solved: SolvedPoses
+) -> None:
+    views, residual = solved.views, solved.residual
+    _write_poses(folder, table, views.frame, solved.pose, solved.covariance)
+    kept = views.used & ~solved.outliers
+    row, names = views.row[kept], np.array(table.cameras)
+    frame, camera = table.frame[row], table.camera[row]
     write_columns(
         folder / 'residuals.csv',
         {
             'frame': frame,
-            'camera': np.array(names)[camera],
-            'landmark': views.landmark[used],
-            'u': views.uv[used][:, 0],
-            'v': views.uv[used][:, 1],
-            'du': residual[used][:, 0],
-            'dv': residual[used][:, 1],
-            **photograph_column(table, frame, [names[one] for one in camera]),
+            'camera': names[camera],
+            **_residual_columns(solved, kept),
+            **photograph_column(table, frame, names[camera].tolist()),
         },
     )
     write_json(
         folder / 'localize.json',
         {
-            'rms_px': rms_px(residual),
-            'frames': len(localization.frame),
-            'observations': int(used.sum()),
-            'left_out': localization.left_out,
-            'sigma_px': localization.sigma,
+            **_summary(table, solved),
+            'observations': int(kept.sum()),
             'frame_id': cameras[0],
-            'rig_contradicted': localization.contradicted,
+            'rig_contradicted': solved.contradicted,
             'cameras': {
-                name: {
-                    'rms_px': rms_px(residual[data.camera_of == i]),
-                    'frames': int((data.camera_of == i).sum()),
+                str(names[i]): {
+                    'rms_px': rms_px(residual[kept][camera == i]),
+                    'frames': len(np.unique(frame[camera == i])),
                 }
-                for i, name in enumerate(localization.table.cameras)
+                for i in np.unique(camera)
             },
             'gross': [
                 {
-                    'frame': int(localization.table.frame[row]),
-                    **photograph_entry(localization.table, int(localization.table.frame[row])),
-                    'camera': localization.table.cameras[localization.table.camera[row]],
-                    'landmark': int(localization.table.landmark[row]),
-                    'px': float(px),
+                    'frame': int(table.frame[row]),
+                    **photograph_entry(table, int(table.frame[row])),
+                    'camera': table.cameras[table.camera[row]],
+                    'landmark': int(table.landmark[row]),
+                    'px': px,
                     'why': why,
                 }
-                for row, px, why in zip(*localization.outliers[:3], strict=True)
-            ],
-            'wrong_landmarks': [
-                landmark.to_dict() for landmark in localization.outliers.landmarks
+                for row, px, why in _rig_outliers(solved)
             ],
         },
     )
+
+
+def _rig_outliers(solved: SolvedPoses) -> Iterator[tuple[int, float, str]]:
+    """Yield the rows of the outliers of a rig, how far off they are, px, and why they are some."""
+    known = set[int]()
+    if solved.rejected is not None:
+        known |= set(solved.rejected.rows.tolist())
+        rows, px, why = solved.rejected[:3]
+        yield from zip(rows.tolist(), px.tolist(), why, strict=True)
+    views = solved.views
+    wrong = [landmark.number for landmark in solved.landmarks]
+    for i, j in np.argwhere(solved.outliers & ~np.isin(views.landmark, wrong)):
+        if (row := int(views.row[i, j])) not in known:
+            yield row, float(np.linalg.norm(solved.result.residual[i, j])), FAR_POINT

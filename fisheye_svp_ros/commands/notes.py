@@ -111,9 +111,9 @@ def note_huge(table: Observations) -> None:
         say(f'the target is {across:.0f} m across; x, y, z must be in m, not in mm')
 
 
-def note_wrong_landmarks(landmarks: Sequence[WrongLandmark]) -> None:
-    """Name landmarks that are not where they are said to be."""
-    for note in wrong_landmark_notes(landmarks):
+def note_wrong_landmarks(landmarks: Sequence[WrongLandmark], of_tags: bool = False) -> None:
+    """Name landmarks, or tags, that are not where they are said to be."""
+    for note in wrong_landmark_notes(landmarks, of_tags):
         say(note)
 
 

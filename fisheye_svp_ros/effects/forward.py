@@ -34,6 +34,14 @@ _STEP = 1e-6  # px
 _PUPIL_STEPS = 3  # of the angle at which a ray comes, each nearer by the motion over the range
 
 
+class ModelPart(NamedTuple):
+    """What one camera of a rig sees: its model, its place in the body, its points as views."""
+
+    model: ForwardModel
+    place: Pose
+    views: Views
+
+
 class CameraViews(NamedTuple):
     """The views (rows of all) of one camera of a rig, linearized."""
 
@@ -116,6 +124,14 @@ class ForwardModel:
             return
         for number in np.unique(views.camera).tolist():
             yield np.flatnonzero(views.camera == number), number, self.cameras[number]
+
+    def parts(self, views: Views) -> list[ModelPart]:
+        """Return what each camera sees of views whose poses are those of one body."""
+        return [ModelPart(self, identity(), views)]
+
+    def neglecting(self) -> ForwardModel | None:
+        """Return the model with what its lens leaves out; None where that is nothing known."""
+        return None if self.lens.neglected is None else ForwardModel(self.lens.neglected)
 
     @property
     def is_lens_only(self) -> bool:

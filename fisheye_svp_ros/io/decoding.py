@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.tag_maps import are_of_tags
 from fisheye_svp_ros.pose import Pose, rotation_from_quaternion
 from fisheye_svp_ros.scene.observations import Landmarks
 
@@ -45,26 +46,19 @@ def structured_array(layout: np.dtype[np.void], landmark: Index, *columns: Array
     return points
 
 
-class UsablePoints(NamedTuple):
-    """Points (N,) of a cloud; `rejected` others hold a value that cannot be used: the reason."""
-
-    points: Points
-    rejected: int
-    reason: str
-
-
 def unpack(cloud: Any, layout: np.dtype[np.void], what: str) -> Points:
     """Return the points (N,) of a PointCloud2 as `layout`, whatever their order and widths.
 
     what: topic or file, for the error.  Raises ObservationError where a field is missing, of the
     wrong kind, not finite, or where a landmark stands twice.
     """
-    return _unpack(cloud, layout, what, strict=True).points
+    return _unpack(cloud, layout, what, strict=True)[0]
 
 
-def unpack_usable(cloud: Any, layout: np.dtype[np.void], what: str) -> UsablePoints:
+def unpack_usable(cloud: Any, layout: np.dtype[np.void], what: str) -> tuple[Points, int, str]:
     """Return the usable points of a PointCloud2, as `unpack` does.
 
+    Also how many others hold a value that cannot be used, and the reason.
     Raises ObservationError where none of several points is usable.
     """
     raw = _raw_points(cloud, what)
@@ -88,7 +82,7 @@ def unpack_usable(cloud: Any, layout: np.dtype[np.void], what: str) -> UsablePoi
     if len(set(points['landmark'].tolist())) < len(points):
         ids, counts = np.unique(points['landmark'], return_counts=True)
         raise ObservationError(f'{what}: landmark {ids[counts > 1][0]} is listed twice')
-    return UsablePoints(points, len(usable) - len(points), reason)
+    return points, len(usable) - len(points), reason
 
 
 def _check_field(given: np.dtype[Any], layout: np.dtype[np.void], name: str, what: str) -> None:
@@ -150,19 +144,24 @@ def _layout(
 
 
 class LandmarkSet(NamedTuple):
-    """Landmarks and the frame_id of the world they stand in; others cannot be used: the reason."""
+    """Landmarks and the frame_id of the world they stand in; others cannot be used: the reason.
+
+    of_tags: whether they are corners and middles of tags, numbered as those of a map of tags.
+    """
 
     landmarks: Landmarks
     frame: str
     rejected: int = 0
     reason: str = ''
+    of_tags: bool = False
 
 
 class ImagePoints(NamedTuple):
     """landmark (N,); uv (N, 2), px; frame: the camera's frame_id; rejected: as in LandmarkSet.
 
     tag (N,): that each belongs to, None where landmarks belong to none; doubtful_tags: how many
-    tags the detector itself doubts, which are left out.
+    tags the detector itself doubts, which are left out; xyz (N, 3), m: where the landmarks are,
+    once that is known.
     """
 
     landmark: Index
@@ -172,6 +171,12 @@ class ImagePoints(NamedTuple):
     reason: str = ''
     tag: Index | None = None
     doubtful_tags: int = 0
+    xyz: Array = np.zeros((0, 3))
+
+    def take(self, kept: Mask) -> ImagePoints:
+        """Return some of the points (N,), whose landmarks are not looked up yet."""
+        tag = None if self.tag is None else self.tag[kept]
+        return self._replace(landmark=self.landmark[kept], uv=self.uv[kept], tag=tag)
 
 
 class FramedPose(NamedTuple):
@@ -232,7 +237,8 @@ def read_landmarks(message: Any, topic: str = 'landmarks', strict: bool = True) 
     if not len(points):
         raise ObservationError(f'{topic}: no landmark in it; at least one is needed')
     landmarks = Landmarks(points['landmark'].astype(np.int64), columns(points, 'xyz'))
-    return LandmarkSet(landmarks, str(message.header.frame_id), rejected, reason)
+    frame, of_tags = str(message.header.frame_id), are_of_tags(landmarks.ids)
+    return LandmarkSet(landmarks, frame, rejected, reason, of_tags)
 
 
 def read_image_points(
@@ -245,11 +251,13 @@ def read_image_points(
     return ImagePoints(landmark, uv, frame, rejected, reason)
 
 
-def _unpack(message: Any, layout: np.dtype[np.void], topic: str, strict: bool) -> UsablePoints:
-    found = unpack_usable(message, layout, topic)
-    if strict and found.rejected:
-        raise ObservationError(found.reason)
-    return found
+def _unpack(
+    message: Any, layout: np.dtype[np.void], topic: str, strict: bool
+) -> tuple[Points, int, str]:
+    points, rejected, reason = unpack_usable(message, layout, topic)
+    if strict and rejected:
+        raise ObservationError(reason)
+    return points, rejected, reason
 
 
 def read_residuals(message: Any, topic: str = 'residuals') -> Points:

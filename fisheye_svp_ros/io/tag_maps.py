@@ -107,6 +107,17 @@ def tags_of(landmarks: Index) -> Index:
     return np.asarray(np.where(corner, landmarks // CORNERS, landmarks - CENTER_OFFSET))
 
 
+def are_of_tags(landmarks: Index) -> bool:
+    """Say whether landmarks (N,) are those of a map: all corners of some tags, and their middles.
+
+    Those of other targets have no numbers as high as the middles of tags.
+    """
+    if landmarks.max(initial=0) < CENTER_OFFSET:
+        return False
+    tags, counts = np.unique(tags_of(landmarks), return_counts=True)
+    return bool((counts == CORNERS + 1).all() and np.isin(CENTER_OFFSET + tags, landmarks).all())
+
+
 def map_of_size(
     ids: Index, size: float, poses: Pose, family: str = '', covariance: Array | None = None
 ) -> TagMap:

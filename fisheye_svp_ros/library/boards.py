@@ -27,20 +27,23 @@ from fisheye_svp_ros.library.checks import (
 from fisheye_svp_ros.library.functions import (
     AnyLens,
     AnyObservations,
+    AnyTagMap,
     check_images,
     load_lens,
     save_lens,
     table_of,
+    tag_map_of,
 )
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.planning import MAX_VIEWS
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.process import limit_threads
 from fisheye_svp_ros.scene.observations import Observations, make_observations
-from fisheye_svp_ros.solve import rig_calibration, rig_localization
+from fisheye_svp_ros.solve import rig_calibration
 from fisheye_svp_ros.solve.measured_poses import posable_observations, rig_lenses
 from fisheye_svp_ros.solve.rig_calibration import RigCalibration
-from fisheye_svp_ros.solve.rig_localization import RigLocalization
+from fisheye_svp_ros.solve.solved_poses import SolvedPoses
+from fisheye_svp_ros.solve.table_poses import solve_rig_table
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.planning.plan import PhotographPlan
@@ -183,10 +186,13 @@ def localize_rig(
     observations: AnyObservations,
     lenses: Mapping[str, AnyLens],
     rig: RigCalibration | str | Path,
-) -> RigLocalization:
+    *,
+    tag_map: AnyTagMap | None = None,
+) -> SolvedPoses:
     """Pose every frame from all cameras of a rig at once: its first camera in the world.
 
-    rig: from `calibrate_rig`, or a file or folder that `calibrate` has written.
+    rig: from `calibrate_rig`, or a file or folder that `calibrate` has written; tag_map: as of
+    `localize`.
     Raises ObservationError for a camera without a lens, or that the rig does not have, and
     GeometryError where no frame can be posed.
     """
@@ -194,7 +200,7 @@ def localize_rig(
     names, places = (
         (rig.cameras, rig.rig) if isinstance(rig, RigCalibration) else load_cameras(rig)
     )
-    return rig_localization.localize_rig(table, known, names, places)
+    return solve_rig_table(table, known, names, places, tag_map_of(tag_map))
 
 
 def _inputs(

@@ -31,6 +31,7 @@ from fisheye_svp_ros.io.readers import (
 )
 from fisheye_svp_ros.io.rig_files import load_pair
 from fisheye_svp_ros.io.share import typed_lens_path
+from fisheye_svp_ros.io.tag_maps import TagMap, read_tag_map
 from fisheye_svp_ros.library import calibration
 from fisheye_svp_ros.library.calibration import CalibratedCameras, LensOptions
 from fisheye_svp_ros.library.checks import (
@@ -67,9 +68,10 @@ from fisheye_svp_ros.scene.table_checks import check_sigma
 from fisheye_svp_ros.simulate import scenario as scenarios
 from fisheye_svp_ros.simulate.scenario import Scenario
 from fisheye_svp_ros.solve import stereo_calibration
-from fisheye_svp_ros.solve.measured_poses import localize_measured, rms_px, sigma_known
+from fisheye_svp_ros.solve.measured_poses import rms_px, sigma_known
 from fisheye_svp_ros.solve.reliability import noise_sigma
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate
+from fisheye_svp_ros.solve.table_poses import solve_table
 from fisheye_svp_ros.study import budget as budgets
 from fisheye_svp_ros.study import sweep as sweeps
 
@@ -80,6 +82,7 @@ AnyLens = Lens | str | Path
 AnyObservations = Observations | str | Path
 AnyPoses = FramePoses | str | Path
 AnyRig = Pose | str | Path
+AnyTagMap = TagMap | str | Path
 _ROBUST_SIGMA = 1.4826  # standard deviation over the median absolute value, of normal errors
 _MAX_DISTANCE = 1e50  # m
 # Called with a stage of long work and the share (0 to 1) that is done.
@@ -141,37 +144,32 @@ def _check_last_axis(size: int, values: Array, name: str) -> Array:
 
 @limit_threads
 def localize(
-    observations: AnyObservations, lens: AnyLens, *, model_error: bool = False
+    observations: AnyObservations,
+    lens: AnyLens,
+    *,
+    model_error: bool = False,
+    tag_map: AnyTagMap | None = None,
 ) -> Localized:
     """Pose every frame of one camera that can be posed; no start values are needed.
 
     Returns frame, pose, rms_px, reasons (F,), covariance (F, 6, 6), residual (N, 2), see
     `Localized`.
     model_error: covariances with what the lens says of its own errors (`uncertainty`).
+    tag_map: `tags` of `map`, or its file: where tags hang whose corners (4 id + 0 to 3) are the
+    landmarks; its errors are in the covariances, and tags are rejected as wholes.
     Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed,
     LensError for a lens that does not know its errors.
     """
     table, known = table_and_lens(observations, lens)
+    tags = tag_map_of(tag_map)
     if model_error:
         from fisheye_svp_ros.diagnosis import LensErrors
         from fisheye_svp_ros.study.trust import localize_with_errors
 
-        measured, _ = localize_with_errors(LensErrors.from_lens(known), table)
+        solved, _ = localize_with_errors(LensErrors.from_lens(known), table, tags)
     else:
-        measured = localize_measured(ForwardModel(known), table)
-    views, result, fitted = measured.views, measured.result, measured.inlier_residual
-    residual = np.full((len(table), 2), np.nan)
-    residual[views.row[views.used]] = fitted[views.used]
-    return Localized(
-        views.frame,
-        result.pose,
-        result.covariance,
-        np.array([*map(rms_px, fitted)]),
-        residual,
-        measured.sigma,
-        measured.left_out,
-        measured.reasons,
-    )
+        solved = solve_table(table, ForwardModel(known), tags)
+    return Localized.from_solved(solved, len(table))
 
 
 @limit_threads
@@ -588,6 +586,17 @@ def table_of(given: AnyObservations) -> Observations:
             f'observations are of type {type(given).__name__}; a table or a path is needed'
         )
     return check_sigma(given) if isinstance(given, Observations) else read_observations(given)
+
+
+def tag_map_of(given: AnyTagMap | None) -> TagMap | None:
+    """Return a map of tags, read where a path is given."""
+    if given is None or isinstance(given, TagMap):
+        return given
+    if not isinstance(given, str | Path):
+        raise ParameterError(
+            f'tag_map is of type {type(given).__name__}; a map of tags or its file is needed'
+        )
+    return read_tag_map(given)
 
 
 def check_images(given: AnyObservations, lenses: Mapping[str, Lens]) -> None:

@@ -18,9 +18,12 @@ from fisheye_svp_ros.io.lens_files import lens_from_dict, lens_to_dict
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.solve.measured_poses import rms_px
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+    from fisheye_svp_ros.solve.solved_poses import SolvedPoses
 
 _BAND = np.radians(10.0)
 _BRIEF = 60  # characters of a value in a repr
@@ -176,6 +179,23 @@ class Localized(Result):
     sigma_px: float | None
     left_out: tuple[int, ...]
     reasons: tuple[str, ...]
+
+    @classmethod
+    def from_solved(cls, solved: SolvedPoses, rows: int) -> Localized:
+        """Return what was solved of a table of so many rows."""
+        used = solved.views.used
+        residual = np.full((rows, 2), np.nan)
+        residual[solved.views.row[used]] = solved.residual[used]
+        return cls(
+            solved.frame,
+            solved.pose,
+            solved.covariance,
+            np.array([*map(rms_px, solved.residual)]),
+            residual,
+            solved.sigma,
+            solved.left_out,
+            solved.reasons,
+        )
 
     def table(self) -> Columns:
         """Return one row a frame, as poses.csv has it, with the rms."""

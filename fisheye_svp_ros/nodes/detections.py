@@ -36,15 +36,18 @@ DEFAULT_LIMITS = TagLimits()
 
 
 def detections_reader(
-    package: str, limits: TagLimits
+    package: str, limits: TagLimits, may_be_empty: bool = False
 ) -> tuple[Any, Callable[[Any, str], ImagePoints]]:
     """Return the message class of detections, and what decodes one.
 
-    package: apriltag_msgs or vision_msgs.  Raises ParameterError where it is not installed.
+    package: apriltag_msgs or vision_msgs; may_be_empty: a message without a tag is a set, too.
+    Raises ParameterError where the package is not installed.
     """
+    tags = partial(read_apriltags, limits=limits, may_be_empty=may_be_empty)
+    middles = partial(read_detections, may_be_empty=may_be_empty)
     kinds: dict[str, tuple[str, Callable[[Any, str], ImagePoints]]] = {
-        'apriltag_msgs': ('AprilTagDetectionArray', partial(read_apriltags, limits=limits)),
-        'vision_msgs': ('Detection2DArray', read_detections),
+        'apriltag_msgs': ('AprilTagDetectionArray', tags),
+        'vision_msgs': ('Detection2DArray', middles),
     }
     name, read = kinds[package]
     try:
@@ -57,7 +60,10 @@ def detections_reader(
 
 
 def read_apriltags(
-    message: Any, topic: str = 'detections', limits: TagLimits = DEFAULT_LIMITS
+    message: Any,
+    topic: str = 'detections',
+    limits: TagLimits = DEFAULT_LIMITS,
+    may_be_empty: bool = False,
 ) -> ImagePoints:
     """Return the corners of tags; libapriltag puts pixel centers at a half.
 
@@ -70,12 +76,15 @@ def read_apriltags(
     ids = [CORNERS * int(tag.id) + corner for tag in tags for corner in range(CORNERS)]
     uv = [(corner.x - 0.5, corner.y - 0.5) for tag in tags for corner in tag.corners]
     doubtful = len(message.detections) - len(tags)
-    if doubtful and not tags:
+    if doubtful and not (tags or may_be_empty):
         raise ObservationError(f'{topic}: {wording.doubtful_tags(doubtful, doubtful)}')
-    return _image_points(ids, uv, message, topic)._replace(doubtful_tags=doubtful)
+    found = _image_points(ids, uv, message, topic, may_be_empty)
+    return found._replace(doubtful_tags=doubtful)
 
 
-def read_detections(message: Any, topic: str = 'detections') -> ImagePoints:
+def read_detections(
+    message: Any, topic: str = 'detections', may_be_empty: bool = False
+) -> ImagePoints:
     """Return the middles of tags; those whose id has no number are left out."""
     ids, uv = [], []
     for detection in message.detections:
@@ -85,17 +94,21 @@ def read_detections(message: Any, topic: str = 'detections') -> ImagePoints:
             ids.append(CENTER_OFFSET + int(number))
             center = getattr(detection.bbox.center, 'position', detection.bbox.center)
             uv.append((center.x, center.y))
-    return _image_points(ids, uv, message, topic)
+    return _image_points(ids, uv, message, topic, may_be_empty)
 
 
 def _image_points(
-    ids: list[int], uv: list[tuple[float, float]], message: Any, topic: str
+    ids: list[int],
+    uv: list[tuple[float, float]],
+    message: Any,
+    topic: str,
+    may_be_empty: bool,
 ) -> ImagePoints:
-    if not ids:
+    if not (ids or may_be_empty):
         raise ObservationError(f'{topic}: it holds no tag')
-    points, landmark = np.array(uv, dtype=float), np.array(ids, dtype=np.int64)
+    points, landmark = np.array(uv, dtype=float).reshape(-1, 2), np.array(ids, dtype=np.int64)
     usable = np.isfinite(points).all(axis=1)
-    if not usable.any():
+    if not (usable.any() or may_be_empty):
         raise ObservationError(f'{topic}: no image point is a finite number')
     rejected = int((~usable).sum())
     return ImagePoints(

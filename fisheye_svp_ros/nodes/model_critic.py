@@ -25,7 +25,6 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.set_collection import (
-    CollectedSet,
     Progress,
     is_repeated,
     make_set,
@@ -111,7 +110,7 @@ class ModelCritic(SolverNode):
         self._latest: tuple[int, Items]
         self._asked: tuple[object, ...] = ()
         self._question = 0
-        self._frames: dict[int, CollectedSet] = {}
+        self._frames: dict[int, Observations] = {}
         self._new = 0
         self._repeated = 0
         self._announced: tuple[str, ...] = ()
@@ -219,7 +218,7 @@ class ModelCritic(SolverNode):
 
     def _table(self) -> Observations:
         window = list(self._frames.values())[-self.settings.max_frames :]
-        table = table_of(window, self.cameras)
+        table = table_of(window)
         sigma = self.settings.sigma_px
         return replace(table, sigma=np.full(len(table), sigma)) if sigma else table
 

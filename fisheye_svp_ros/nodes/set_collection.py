@@ -7,46 +7,43 @@ a type of its own, which no package of Python alone can have.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.io.decoding import ImagePoints
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.quality import LATCHED
-from fisheye_svp_ros.nodes.validation import Items, KnownPoints
-from fisheye_svp_ros.scene.observations import Observations, make_observations
+from fisheye_svp_ros.nodes.validation import Items
+from fisheye_svp_ros.scene.observations import Observations, join_tables, make_observations
 
 _MAX_MOTION_PX = 1.0  # px: what image points of a still camera move by at most
 # What tells the sets of one scenario from each other; all else tells scenarios apart.
 _WITHIN_SCENARIO = ('set', 'frame')
 
 
-class CollectedSet(NamedTuple):
-    """What the cameras see in one set; every array has N rows (camera: which of them)."""
+def make_set(stamp: int, items: Items, cameras: Sequence[str]) -> Observations:
+    """Return one set of cameras given by namespace, each with its slash, as a frame of a table.
 
-    stamp: int
-    landmark: Index
-    uv: Array
-    xyz: Array
-    camera: Index
-
-
-def make_set(stamp: int, items: Items, cameras: Sequence[str]) -> CollectedSet:
-    """Return one set of cameras given by namespace, each with its slash."""
-    sets: list[KnownPoints] = [items[f'{camera}image_points'] for camera in cameras]
-    return CollectedSet(
-        stamp,
+    t is the stamp, s.
+    """
+    sets: list[ImagePoints] = [items[f'{camera}image_points'] for camera in cameras]
+    counts = [len(seen.landmark) for seen in sets]
+    return make_observations(
+        np.zeros(sum(counts), dtype=np.int64),
         np.concatenate([seen.landmark for seen in sets]),
         np.concatenate([seen.uv for seen in sets]),
-        np.concatenate([seen.points for seen in sets]),
-        np.repeat(np.arange(len(sets)), [len(seen.landmark) for seen in sets]),
+        np.concatenate([seen.xyz for seen in sets]),
+        camera=np.repeat(np.arange(len(sets)), counts),
+        t=np.full(sum(counts), stamp / 1e9),
+        cameras=tuple(camera.rstrip('/') for camera in cameras),
+        source='image_points',
     )
 
 
-def is_repeated(collected: CollectedSet, earlier: Sequence[CollectedSet]) -> bool:
+def is_repeated(collected: Observations, earlier: Sequence[Observations]) -> bool:
     """Say whether a set is no new view.
 
     It is the last one again, the camera having stood still, or an earlier one to the last digit.
@@ -60,7 +57,7 @@ def is_repeated(collected: CollectedSet, earlier: Sequence[CollectedSet]) -> boo
     return copies or _median_move(collected, earlier[-1]) < _MAX_MOTION_PX
 
 
-def _median_move(collected: CollectedSet, other: CollectedSet) -> float:
+def _median_move(collected: Observations, other: Observations) -> float:
     """Return how far, px, the image points that two sets share moved; infinite for none."""
     mine, theirs = (2**32 * seen.camera + seen.landmark for seen in (collected, other))
     _, mine, theirs = np.intersect1d(mine, theirs, return_indices=True)
@@ -69,21 +66,10 @@ def _median_move(collected: CollectedSet, other: CollectedSet) -> float:
     return float(np.median(np.linalg.norm(collected.uv[mine] - other.uv[theirs], axis=1)))
 
 
-def table_of(window: Sequence[CollectedSet], cameras: Sequence[str]) -> Observations:
-    """Return sets as a table, one frame a set; t is the stamp, s."""
-    landmark, uv, xyz, camera = (
-        np.concatenate(arrays) for arrays in list(zip(*window, strict=True))[1:]
-    )
-    counts = [len(seen.landmark) for seen in window]
-    return make_observations(
-        np.repeat(np.arange(len(window)), counts),
-        landmark,
-        uv,
-        xyz,
-        camera=camera,
-        t=np.repeat([seen.stamp / 1e9 for seen in window], counts),
-        cameras=tuple(camera.rstrip('/') for camera in cameras),
-        source='image_points',
+def table_of(window: Sequence[Observations]) -> Observations:
+    """Return sets as a table, one frame a set."""
+    return join_tables(
+        [replace(seen, frame=np.full(len(seen), i)) for i, seen in enumerate(window)]
     )
 
 

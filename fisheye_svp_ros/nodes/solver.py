@@ -19,6 +19,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.decoding import (
+    ImagePoints,
     LandmarkSet,
     read_framed_camera,
     read_framed_pose,
@@ -37,7 +38,7 @@ from fisheye_svp_ros.nodes.join import LIMIT, LatchedLandmarks, Pending, StampJo
 from fisheye_svp_ros.nodes.quality import INFO_INPUT
 from fisheye_svp_ros.nodes.subscriptions import Unread
 from fisheye_svp_ros.nodes.transforms import FrameListener
-from fisheye_svp_ros.nodes.validation import Items, KnownPoints, SetValidation
+from fisheye_svp_ros.nodes.validation import Items, SetValidation
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -284,11 +285,11 @@ class SolverNode(ManagedNode):
         scale = shift_scale(scenario.get('shift_scale', '1.0'))
         return lens_of(name, scale, self.settings)
 
-    def views(self, stamp: int, seen: KnownPoints) -> Views:
+    def views(self, stamp: int, seen: ImagePoints) -> Views:
         """Return image points as one view."""
-        shape = 1, len(seen.points)
+        shape = 1, len(seen.landmark)
         return Views(
-            points=seen.points[None],
+            points=seen.xyz[None],
             uv=seen.uv[None],
             weight=np.full(shape, 1 / self.settings.sigma_px),
             landmark=seen.landmark[None],
@@ -296,7 +297,7 @@ class SolverNode(ManagedNode):
             t=np.full(shape, stamp / 1e9),
             frame=np.array([stamp]),
             camera=np.zeros(1, dtype=np.int64),
-            row=np.arange(len(seen.points))[None],
+            row=np.arange(len(seen.landmark))[None],
         )
 
     def publish_result(self, stamp: int, metrics: Mapping[str, Array], problem: str = '') -> None:

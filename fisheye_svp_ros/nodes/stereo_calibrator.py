@@ -15,7 +15,6 @@ from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.set_collection import (
-    CollectedSet,
     Progress,
     make_set,
     scenario_of,
@@ -24,7 +23,7 @@ from fisheye_svp_ros.nodes.set_collection import (
 from fisheye_svp_ros.nodes.solver import SolverNode, exchange_reason, true_rig
 from fisheye_svp_ros.nodes.transforms import TransformPublisher
 from fisheye_svp_ros.nodes.validation import Items
-from fisheye_svp_ros.scene.observations import STEREO, stereo_views
+from fisheye_svp_ros.scene.observations import STEREO, Observations, stereo_views
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
 from fisheye_svp_ros.study.settings import StereoCalibratorSettings
 from fisheye_svp_ros.study.solutions import STEREO_CALIBRATION_METRICS, SetSolutions, solve_rigs
@@ -48,7 +47,7 @@ class StereoCalibrator(SolverNode):
         self._transforms = TransformPublisher(self, self.settings.publish_tf, static=True)
         self._progress = Progress(self)
         self._scenario: frozenset[tuple[str, str]] = frozenset()
-        self._window: list[CollectedSet] = []
+        self._window: dict[int, Observations] = {}  # by stamp, ns
         self._found: SetSolutions[StereoCalibration] | None = None  # the latest
         for name, answer in (('~/save', self._save), ('~/reset', self._reset)):
             self.create_service(Trigger, name, self.guard_callback(answer))
@@ -75,14 +74,11 @@ class StereoCalibrator(SolverNode):
         """Calibrate with one more set; raise GeometryError where the views fix no rig."""
         scenario = scenario_of(items)
         # A recording that starts over tells nothing new.
-        known = (
-            [seen for seen in self._window if seen.stamp != stamp]
-            if scenario == self._scenario
-            else []
-        )
-        one = make_set(stamp, items, self.CAMERAS)
-        window = [*known, one][-self.settings.views :]
-        left, right = stereo_views(table_of(window, self.CAMERAS), self.settings.sigma_px)
+        window = dict(self._window) if scenario == self._scenario else {}
+        window.pop(stamp, None)
+        window[stamp] = make_set(stamp, items, self.CAMERAS)
+        window = dict(list(window.items())[-self.settings.views :])
+        left, right = stereo_views(table_of([*window.values()]), self.settings.sigma_px)
         solved = solve_rigs(self.models(stamp, items), left, right, true=true_rig(items)).require(
             self.settings.gate
         )
@@ -112,7 +108,7 @@ class StereoCalibrator(SolverNode):
     def _reset(self, _: Any, response: Any) -> Any:
         """Forget all views: the next set is the first."""
         response.success, response.message = True, f'{len(self._window)} views forgotten'
-        self._window, self._found = [], None
+        self._window, self._found = {}, None
         self._progress.publish(0, 0, self.settings.views, {})
         return response
 

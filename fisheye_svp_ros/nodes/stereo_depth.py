@@ -79,7 +79,7 @@ class StereoDepth(SolverNode):
         )
         uv = left.uv[in_left], right.uv[in_right]
         true: Pose | None = items.get('right/true_pose')
-        known = right.points[in_right]
+        known = right.xyz[in_right]
         solved = measure_points(
             models,
             rig.take(None),

@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.arrays import Mask
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
 from fisheye_svp_ros.io.decoding import FramedPose, ImagePoints, LandmarkSet, are_different_frames
+from fisheye_svp_ros.io.tag_maps import tags_of
 from fisheye_svp_ros.nodes.join import NeighborPair
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.wording import inputs as wording
@@ -21,19 +22,6 @@ Items = Mapping[str, Any]
 
 _UNKNOWN_POINTS = 'points of unknown landmarks'
 _FRAME_HOLDS = 5.0  # s without a message of its frame, after which a topic may have another
-
-
-class KnownPoints(NamedTuple):
-    """Image points of known landmarks; points (N, 3), m; frame: the camera's frame_id.
-
-    tag (N,): that each belongs to, None where landmarks belong to none.
-    """
-
-    landmark: Index
-    uv: Array
-    points: Array
-    frame: str
-    tag: Index | None = None
 
 
 class SetValidation:
@@ -103,8 +91,10 @@ class SetValidation:
 
     def _known_points(
         self, topic: str, seen: ImagePoints, landmarks: LandmarkSet, settings: SolverSettings
-    ) -> tuple[KnownPoints, list[str]]:
-        points, known = landmarks.landmarks.lookup(seen.landmark)
+    ) -> tuple[ImagePoints, list[str]]:
+        if seen.tag is None and landmarks.of_tags:
+            seen = seen._replace(tag=tags_of(seen.landmark))
+        xyz, known = landmarks.landmarks.lookup(seen.landmark)
         texts = []
         if seen.rejected:
             self.rejected[f'{topic}: points without a value'] += seen.rejected
@@ -115,21 +105,19 @@ class SetValidation:
             self.rejected[f'{topic}: tags left out'] += seen.doubtful_tags
             count = len(np.unique(seen.tag)) + seen.doubtful_tags
             texts.append(f'{topic}: {wording.doubtful_tags(seen.doubtful_tags, count)}')
-        if np.count_nonzero(known) == known.size:
-            return KnownPoints(seen.landmark, seen.uv, points, seen.frame, seen.tag), texts
-        texts.append(self._tell_unknown(topic, seen, known, settings.strict))
-        tag = None if seen.tag is None else seen.tag[known]
-        return (
-            KnownPoints(seen.landmark[known], seen.uv[known], points[known], seen.frame, tag),
-            texts,
-        )
+        if np.count_nonzero(known) < known.size:
+            texts.append(self._tell_unknown(topic, seen, known, settings.strict))
+            seen, xyz = seen.take(known), xyz[known]
+        return seen._replace(xyz=xyz), texts
 
     def _tell_unknown(self, topic: str, seen: ImagePoints, known: Mask, strict: bool) -> str:
         """Count and name the points (N,) that are not known; raise ObservationError, see check."""
         tags = seen.tag is not None
         number = seen.landmark if seen.tag is None else seen.tag
         unknown = np.unique(number[~known]).tolist() if tags else number[~known].tolist()
-        if strict or not known.any():
+        # Another camera of a rig may see tags of the map.
+        alone = not (tags and len(self._image_points) > 1)
+        if strict or (alone and not known.any()):
             raise ObservationError(wording.unknown_landmark(topic, unknown[0], tags))
         self.rejected[f'{topic}: {"unknown tags" if tags else _UNKNOWN_POINTS}'] += len(unknown)
         of = len(np.unique(number)) if tags else len(number)

@@ -30,8 +30,9 @@ from fisheye_svp_ros.scene.observations import RADII, SPREADS, group_views
 from fisheye_svp_ros.scene.rigs import rig
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.simulate.scenario import Scenario, model_of, scalars, simulate_scenario
+from fisheye_svp_ros.solve.poses import solve_poses
 from fisheye_svp_ros.study.settings import LocalizerSettings
-from fisheye_svp_ros.study.solutions import localize_sets, residual_points
+from fisheye_svp_ros.study.solutions import residual_points
 from fisheye_svp_ros.study.sweep import CAMERA, plan_sweep, sweep_rows
 
 if TYPE_CHECKING:
@@ -145,7 +146,7 @@ def compute_demo(
 def _residual_field(scenario: Scenario) -> ResidualSet:
     views = group_views(simulate_scenario(scenario).observations)
     model = model_of(scenario.lens, 1.0, LocalizerSettings().solves_svp)
-    points = residual_points(model, views, localize_sets(model, views).require().solution)
+    points = residual_points(solve_poses(model, views, examined=False).require())
     tags = {name: str(value) for name, value in scalars(scenario).items()}
     return ResidualSet('/localization/localizer/residuals', 0, points, tags)
 

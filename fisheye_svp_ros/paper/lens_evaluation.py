@@ -22,8 +22,14 @@ from fisheye_svp_ros.pose import PAPER_FROM_OPTICAL, Pose
 from fisheye_svp_ros.scene.observations import RADII, SPREADS, Views, views_of
 from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
 from fisheye_svp_ros.solve.localization import Localization
+from fisheye_svp_ros.solve.poses import solve_poses
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
-from fisheye_svp_ros.study.solutions import Metrics, localize_sets, measure_points, solve_rigs
+from fisheye_svp_ros.study.solutions import (
+    Metrics,
+    localization_metrics,
+    measure_points,
+    solve_rigs,
+)
 
 
 class LocalizedSpread(NamedTuple):
@@ -102,8 +108,8 @@ def localize_environments(
     true = paper_pose(len(points))
     views = views_of(points, ForwardModel(lens).predict(true, views_of(points)).uv)
     model = ForwardModel(lens.svp() if solver is None else solver)
-    solved = localize_sets(model, views, true, true if start is None else start)
-    return LocalizedSpread(_paper_rows(solved.metrics), solved.solution, views)
+    solved = solve_poses(model, views, true if start is None else start, examined=False)
+    return LocalizedSpread(_paper_rows(localization_metrics(solved, true)), solved.result, views)
 
 
 def localize_spreads(lens: Lens, solver: Lens | None = None) -> tuple[LocalizedSpread, ...]:

@@ -263,6 +263,22 @@ def group_views(observations: Observations) -> Views:
     return _make_views(observations, row, groups[:, 0], groups[:, 1], 1.0)
 
 
+def group_frames(observations: Observations) -> tuple[Views, tuple[int, ...]]:
+    """Group a table by frame, and how many columns (C,) of points each camera has in turn."""
+    views = group_views(observations)
+    frames, frame = np.unique(views.frame, return_inverse=True)
+    counts = views.used.sum(axis=1)
+    cameras = range(len(observations.cameras))
+    widths = [int(counts[views.camera == one].max(initial=0)) for one in cameras]
+    ends = np.cumsum([0, *widths])
+    row = np.full((len(frames), ends[-1]), -1, dtype=np.int64)
+    for camera in cameras:
+        mine = views.camera == camera
+        row[frame[mine], ends[camera] : ends[camera + 1]] = views.row[mine, : widths[camera]]
+    merged = _make_views(observations, row, frames, np.zeros(len(frames), dtype=np.int64), 1.0)
+    return merged, tuple(widths)
+
+
 def select_cameras(table: Observations, cameras: Sequence[str]) -> Observations:
     """Return the rows of some cameras, numbered in their order."""
     number = np.full(len(table.cameras), -1)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.forward import ForwardModel, ModelPart
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.engines.marquardt import MAX_ITERATIONS
@@ -33,6 +35,7 @@ _MIN_AREA = 0.1  # of the largest of the four triangles that four points of a pl
 _MIN_SEPARATION = 0.01  # squared Mahalanobis distance of two minima
 _WEIGHINGS = 2  # steps from a pose by exact landmarks to one by their errors
 _VIEWS_AT_ONCE = 64  # whose noise is a full matrix
+_FAR = 50.0  # px, beyond which a point is as wrong as it can be
 
 
 def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Localization:
@@ -76,7 +79,8 @@ def nearly_localize(model: ForwardModel, views: Views) -> tuple[Pose, Mask]:
     flat, center, normal = _flat_targets(views)
     rows, mirrored = np.append(np.arange(count), flat), np.arange(count, count + len(flat))
     start = rough.take(rows)
-    start.put(mirrored, _mirror_image(rough.take(flat), center, normal))
+    eye = _viewpoints(model, views).take(flat, axis=0)
+    start.put(mirrored, _mirror_image(rough.take(flat), center, normal, eye))
     solved, _ = _solve_from(model, views.take(rows), start, _STARTING_STEPS)
     cost = np.where(solved.converged, solved.cost, np.inf)
     best = np.arange(count)
@@ -104,7 +108,8 @@ def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localiza
     if some_flat:
         flat, center, normal = _flat_targets(views)
         if flat.size:
-            reflected = _mirror_image(found.pose.take(flat), center, normal)
+            eye = _viewpoints(model, views).take(flat, axis=0)
+            reflected = _mirror_image(found.pose.take(flat), center, normal, eye)
             _improve(model, views, found, flat, reflected.reshape(len(flat), 1))
     if anywhere:
         few = np.flatnonzero((views.weight > 0).sum(axis=1) < FEW_POINTS)
@@ -250,8 +255,13 @@ def residuals(model: ForwardModel, pose: Pose, views: Views) -> Array:
 
 def sight(model: ForwardModel, pose: Pose, views: Views) -> tuple[Array, Array]:
     """Return incidence angles, rad, and ranges, m, of points (S, N) from poses (S,), as solved."""
-    image = model.linearize(pose, views).image
-    return image.incidence.theta, np.linalg.norm(image.points, axis=-1)
+    theta, distance = [], []
+    for part in model.parts(views):
+        camera = pose.compose(part.place.broadcast_to(*pose.shape))
+        image = part.model.linearize(camera, part.views).image
+        theta.append(image.incidence.theta)
+        distance.append(np.linalg.norm(image.points, axis=-1))
+    return np.concatenate(theta, axis=1), np.concatenate(distance, axis=1)
 
 
 def start_poses(model: ForwardModel, views: Views) -> Pose:
@@ -270,7 +280,37 @@ def start_poses(model: ForwardModel, views: Views) -> Pose:
         pose = initial_poses(
             views.points - axial @ np.swapaxes(pose.rotation, -1, -2), rays.direction, inside
         )
+    parts = model.parts(views)
+    return pose if len(parts) == 1 else _best_starts(model, views, pose, parts)
+
+
+def _best_starts(
+    model: ForwardModel, views: Views, rough: Pose, parts: Sequence[ModelPart]
+) -> Pose:
+    """Return the starts (S,) of a rig that fit best: rough ones, or by one of its cameras."""
+    off = _capped_costs(model, views, rough)
+    pose = Pose(rough.rotation.copy(), rough.position.copy())
+    for part in parts:
+        inside = (part.views.weight > 0) & part.model.back_project(part.views.uv).valid
+        rows = np.flatnonzero(inside.sum(axis=1) >= MIN_POINTS)
+        if not rows.size:
+            continue
+        alone = localize(part.model.without_motion(), part.views.take(rows))
+        body = part.place.inverse().broadcast_to(len(rows))
+        for camera in (alone.pose, alone.other):
+            start = camera.compose(body)
+            cost = _capped_costs(model, views.take(rows), start)
+            better = alone.converged & (cost < off[rows])
+            pose.put(rows[better], start.take(better))
+            off[rows[better]] = cost[better]
     return pose
+
+
+def _capped_costs(model: ForwardModel, views: Views, pose: Pose) -> Array:
+    """Return sums (S,) of squared offsets, px, none more than _FAR: wrong points count little."""
+    off = np.linalg.norm(views.uv - model.predict(pose, views).uv, axis=-1)
+    off = np.where(np.isfinite(off), np.minimum(off, _FAR), _FAR)
+    return np.asarray(np.where(views.weight > 0, off**2, 0.0).sum(axis=1))
 
 
 def _flat_targets(views: Views) -> tuple[Index, Array, Array]:
@@ -283,13 +323,25 @@ def _flat_targets(views: Views) -> tuple[Index, Array, Array]:
     return flat, center[flat, 0], axes[flat, :, 0]
 
 
-def _mirror_image(pose: Pose, center: Array, normal: Array) -> Pose:
-    """Reflect the target, flat across `normal` (S, 3), by the plane across its line of sight."""
-    sight = pose.inverse().transform(center)
+def _viewpoints(model: ForwardModel, views: Views) -> Array:
+    """Return where the views (S,) are seen from, in the body, (S, 3), m: the mean of the rays."""
+    parts = model.parts(views)
+    count = [(part.views.weight > 0).sum(axis=1)[:, None] for part in parts]
+    total = sum(one * part.place.position for one, part in zip(count, parts, strict=True))
+    return np.asarray(total / np.maximum(sum(count), 1))
+
+
+def _mirror_image(pose: Pose, center: Array, normal: Array, eye: Array) -> Pose:
+    """Reflect the target, flat across `normal` (S, 3), by the plane across its line of sight.
+
+    eye (S, 3), m: where that begins, in the body.
+    """
+    place = pose.inverse().transform(center)
+    sight = place - eye
     along = sight / np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-12)
     to_camera = _mirror(along) @ np.swapaxes(pose.rotation, -1, -2) @ _mirror(normal)
     rotation = np.swapaxes(to_camera, -1, -2)
-    return Pose(rotation, center - (rotation @ sight[..., None])[..., 0])
+    return Pose(rotation, center - (rotation @ place[..., None])[..., 0])
 
 
 def _mirror(normal: Array) -> Array:

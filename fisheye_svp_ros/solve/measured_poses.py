@@ -1,4 +1,4 @@
-"""Measured views: which of them can be posed, where they are, how noisy they are."""
+"""Measured views: which of them can be posed, and by which lenses."""
 
 from __future__ import annotations
 
@@ -14,62 +14,10 @@ from fisheye_svp_ros.optics.lens import Lens, inside_image
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
 from fisheye_svp_ros.scene.table_checks import remove_copies
-from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization, localize
-from fisheye_svp_ros.solve.outliers import WrongLandmark
-from fisheye_svp_ros.solve.reliability import examine
-from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
+from fisheye_svp_ros.solve.localization import MIN_POINTS
 
 _OUTSIDE_SHARE = 0.02  # of the points of a camera: more than single outliers
 _LINE = 1e-6  # width of a point set relative to its length, below which it is a line
-
-
-class MeasuredPoses(NamedTuple):
-    """The views of a table that can be posed, and their poses.
-
-    result: covariances for the noise of the data; sigma: noise of u and of v, px, estimated from
-    the residuals, None where the observations bring their own; left_out: frames whose points do
-    not fix a pose; gross (V, N): observations left out as outliers; reasons (V,): why a pose
-    should not be relied on, '' for a reliable one; landmarks: that are not where they are said to
-    be, their points among the outliers.
-    """
-
-    views: Views
-    result: Localization
-    sigma: float | None
-    left_out: tuple[int, ...]
-    gross: Mask
-    reasons: tuple[str, ...]
-    landmarks: tuple[WrongLandmark, ...] = ()
-
-    @property
-    def inlier_residual(self) -> Array:
-        """Residuals (V, N, 2), px, without those of outliers."""
-        return np.where(self.gross[..., None], np.nan, self.result.residual)
-
-
-def localize_measured(
-    model: ForwardModel, observations: Observations, tags: bool = False
-) -> MeasuredPoses:
-    """Pose every frame of one camera's table that can be posed.
-
-    tags: the boards of the table are loose tags, whose points stand or fall together.
-    Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed.
-    """
-    wrong = find_wrong_landmarks(observations, model, lambda _: model)
-    right = ~np.isin(observations.landmark, [landmark.number for landmark in wrong])
-    views, left_out = posable_views(observations, model, right)
-    solved = localize(model, views)
-    checked = examine(model, views, solved, sigma_known(observations), tags=tags)
-    result, reasons = checked.result, checked.reasons
-    gross = np.asarray(checked.gross | views.used & (views.weight == 0))
-    fixed = result.converged
-    if not fixed.all():
-        left_out = tuple(sorted((*left_out, *views.frame[~fixed].tolist())))
-        views, result, gross = views.take(fixed), result.take(fixed), gross[fixed]
-        reasons = tuple(np.array(reasons, dtype=object)[fixed])
-    if not len(views.frame):
-        raise GeometryError(f'{observations.source}: no frame has points that determine a pose')
-    return MeasuredPoses(views, result, checked.sigma, left_out, gross, reasons, wrong)
 
 
 def posable_views(
@@ -91,6 +39,25 @@ def posable_views(
     if right is not None:
         counts = views.used & right[views.row]
         views = views._replace(weight=np.where(counts, views.weight, 0.0))
+    return take_posable(views, observations.source, model)
+
+
+def take_posable(
+    views: Views, source: str, model: ForwardModel | None = None
+) -> tuple[Views, tuple[int, ...]]:
+    """Return the views that fix a pose, and the frames of the others; see `posable_views`."""
+    posable = _fix_poses(views, model)
+    if not posable.any():
+        where = '' if model is None else f', inside the field of view of lens {model.lens.name!r}'
+        raise GeometryError(
+            f'{source}: no frame can be posed; each needs {MIN_POINTS} points that '
+            f'are not on one line{where}'
+        )
+    return views.take(posable), tuple(views.frame[~posable].tolist())
+
+
+def _fix_poses(views: Views, model: ForwardModel | None = None) -> Mask:
+    """Say which views (S,) have MIN_POINTS points that count, not on one line, and in sight."""
     usable = views.weight > 0
     usable = usable if model is None else usable & model.back_project(views.uv).valid
     count = usable.sum(axis=1)
@@ -98,14 +65,7 @@ def posable_views(
     center = (views.points * inside).sum(axis=1) / np.maximum(count, 1)[:, None]
     centerd = np.where(inside, views.points - center[:, None], 0.0)
     extent = np.linalg.eigvalsh(np.swapaxes(centerd, -1, -2) @ centerd)
-    posable = (count >= MIN_POINTS) & (extent[:, 1] > _LINE**2 * extent[:, 2])
-    if not posable.any():
-        where = '' if model is None else f', inside the field of view of lens {model.lens.name!r}'
-        raise GeometryError(
-            f'{observations.source}: no frame can be posed; each needs {MIN_POINTS} points that '
-            f'are not on one line{where}'
-        )
-    return views.take(posable), tuple(views.frame[~posable].tolist())
+    return np.asarray((count >= MIN_POINTS) & (extent[:, 1] > _LINE**2 * extent[:, 2]))
 
 
 def sigma_known(observations: Observations) -> bool:
@@ -164,14 +124,15 @@ def posable_observations(
     for camera in np.unique(observations.camera):
         mine = observations.camera == camera
         which = int(camera) if len(models) > 1 else 0
-        _check_inside(observations.take(mine), lenses[which])
+        check_inside(observations.take(mine), lenses[which])
         _, frames = posable_views(observations.take(mine), models[which])
         kept[mine & np.isin(observations.frame, frames)] = False
         left_out.update(frames)
     return observations.take(kept), tuple(sorted(left_out))
 
 
-def _check_inside(observations: Observations, lens: Lens) -> None:
+def check_inside(observations: Observations, lens: Lens) -> None:
+    """Raise ObservationError where image points lie outside the images that a lens is of."""
     if np.mean(~inside_image(lens, observations.uv)) > _OUTSIDE_SHARE:
         raise ObservationError(
             f'{observations.source}: image points lie outside the {lens.width}x{lens.height} px '

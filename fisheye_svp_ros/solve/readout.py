@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.least_squares import never_singular, with_unit_diagonal
+from fisheye_svp_ros.solve.solved_poses import SolvedPoses
 from fisheye_svp_ros.solve.weak_geometry import CHI2_999
 
 _MAX_INTERVAL = 0.5  # s between poses that follow each other
@@ -34,18 +33,20 @@ def steady_velocity(times: Sequence[float], poses: Sequence[Pose]) -> Array | No
     return kept if kept.any() else None
 
 
-def readout_bias(
-    model: ForwardModel, views: Views, pose: Pose, velocity: Array, seconds: float
-) -> Array:
+def readout_bias(solved: SolvedPoses, velocity: Array, seconds: float) -> Array:
     """Return what rows that are read one after the other move poses (S,) by, (S, 6), m and rad.
 
     velocity (6,): of the changes in `Pose.retract`; seconds: from the first row to the last, the
     stamp being that of the middle row.
     """
-    linear = model.linearize(pose, views)
-    seen = (views.weight > 0)[..., None, None]
+    model, views = solved.model, solved.views
+    linear = model.linearize(solved.pose, views)
+    seen = ((views.weight > 0) & ~solved.outliers)[..., None, None]
     jacobian = np.where(seen, model.d_pose(linear, views) * views.weight[..., None, None], 0.0)
-    late = seconds * (views.uv[..., 1] / model.lens.height - 0.5)
+    late = seconds * np.concatenate(
+        [part.views.uv[..., 1] / part.model.lens.height - 0.5 for part in model.parts(views)],
+        axis=1,
+    )
     moved = (jacobian @ velocity) * late[..., None]
     gradient = np.einsum('snup,snu->sp', jacobian, moved)
     hessian = np.einsum('snup,snuq->spq', jacobian, jacobian)

@@ -9,8 +9,6 @@ Kittler, DAGM 2003).  Views that pass pay for no search.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +27,7 @@ from fisheye_svp_ros.solve.localization import (
     localize,
     residuals,
 )
+from fisheye_svp_ros.solve.solved_poses import SolvedPoses
 from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
 from fisheye_svp_ros.solve.tag_units import (
     TagChoices,
@@ -41,7 +40,7 @@ from fisheye_svp_ros.solve.tag_units import (
 from fisheye_svp_ros.solve.weak_geometry import hold_weak_geometry
 
 _MAX_RESIDUAL_RATIO = 3.8  # a residual beside the root mean square of all, which starts a search
-_GROSS = 5.0  # standard deviations
+_OUTLIER_SIGMAS = 5.0  # standard deviations
 _MIN_AGREEMENT = 0.6  # of the points must agree on a pose
 _SPARE_POINTS = 3  # points beyond a minimal set that must agree as well
 _SUBSETS, _SUBSET, _FEW_SUBSETS, _KEPT, _ROUNDS = 120, 6, 30, 6, 8
@@ -56,26 +55,6 @@ _TOLERANCE, _OTHERS, _EXACT = 2.0, 4, 1e-6
 _MAX_NAMES = 5
 
 
-class Examination(NamedTuple):
-    """Solved poses of S views, examined.
-
-    result: covariances for what the residuals show where that is more than sigma; gross (S, N):
-    observations left out as outliers; reasons (S,): why a pose should not be relied on as it
-    is, '' for a reliable one; sigma: noise of u and of v, px, estimated from the
-    views that pass, None where weights are known; excess (S,): factor by which residuals are more
-    than that, where the covariance is scaled by its square; choices: of tags, by view; suspects
-    (S,): tags that may have moved, see `suspect_tags`, where boards are tags.
-    """
-
-    result: Localization
-    gross: Mask
-    reasons: tuple[str, ...]
-    sigma: float | None
-    excess: Array
-    choices: Mapping[int, TagChoices] = MappingProxyType({})
-    suspects: tuple[Mapping[int, float], ...] = ()
-
-
 def examine(
     model: ForwardModel,
     views: Views,
@@ -83,7 +62,7 @@ def examine(
     sigma_known: bool = True,
     searched: bool = True,
     tags: bool = False,
-) -> Examination:
+) -> SolvedPoses:
     """Test the poses that `localize` found, and look for outliers where they fail.
 
     sigma_known: whether weights are 1 / sigma; if not, views are held against each other, a
@@ -92,19 +71,26 @@ def examine(
     the views are tags, whose points stand or fall together.
     """
     model = model.seeing(views)
-    if sigma_known:
-        checked = _examine(model, views, localization, 1.0, 1.0, searched, tags)
-        checked = _hold_covariances(model, views, checked, 1.0)
-        return _with_suspects(model, views, checked) if tags else checked
     freedom = np.maximum(2 * (views.weight > 0).sum(axis=1) - 6, 1)
-    usual = float(np.sqrt(np.median(localization.cost / freedom)))
-    if len(freedom) < _OTHERS:
-        usual = min(usual, float(_noise_from_median(views, localization).max()))
-    checked = _examine(model, views, localization, max(usual, _EXACT), _TOLERANCE)
-    result, passed = checked.result, np.array([not reason for reason in checked.reasons])
-    passed &= result.converged
+    scale, tolerance = 1.0, 1.0
+    if not sigma_known:
+        usual = float(np.sqrt(np.median(localization.cost / freedom)))
+        if len(freedom) < _OTHERS:
+            usual = min(usual, float(_noise_from_median(views, localization).max()))
+        scale, tolerance = max(usual, _EXACT), _TOLERANCE
+    checked, choices = _test(model, views, localization, scale, tolerance, searched, tags)
+    if not sigma_known:
+        checked = _estimate_noise(checked)
+    checked = _hold_covariances(model, checked, choices)
+    return _with_suspects(model, checked) if tags and sigma_known else checked
+
+
+def _estimate_noise(checked: SolvedPoses) -> SolvedPoses:
+    """Return the poses with the noise that the residuals of those show which pass."""
+    result, weight = checked.result, checked.views.weight
+    passed = np.array([not reason for reason in checked.reasons]) & result.converged
     some = passed if passed.any() else result.converged
-    rows = 2 * ((views.weight > 0) & ~checked.gross)[some].sum()
+    rows = 2 * ((weight > 0) & ~checked.outliers)[some].sum()
     sigma = noise_sigma(result.cost[some].sum(), int(rows), 6 * int(some.sum()))
     reasons = checked.reasons
     if sigma > NOISIEST_PX:
@@ -113,12 +99,13 @@ def examine(
             'image size, landmarks and their unit'
         )
         reasons = tuple(_join_reasons(noisy, reason) for reason in reasons)
-    return _hold_covariances(model, views, checked._replace(reasons=reasons, sigma=sigma), sigma)
+    return checked._replace(reasons=reasons, sigma=sigma)
 
 
-def _with_suspects(model: ForwardModel, views: Views, checked: Examination) -> Examination:
+def _with_suspects(model: ForwardModel, checked: SolvedPoses) -> SolvedPoses:
     """Return also which tags, of those that were not left out, may have moved."""
-    inliers = views._replace(weight=np.where(checked.gross, 0.0, views.weight))
+    views = checked.views
+    inliers = views._replace(weight=np.where(checked.outliers, 0.0, views.weight))
     suspects = tuple(
         suspect_tags(model, inliers.take([i]), checked.result.take([i]))
         for i in range(len(checked.reasons))
@@ -127,37 +114,42 @@ def _with_suspects(model: ForwardModel, views: Views, checked: Examination) -> E
 
 
 def _hold_covariances(
-    model: ForwardModel, views: Views, checked: Examination, sigma: float
-) -> Examination:
-    """Return covariances that hold for weak geometry and cover each choice of tags.
+    model: ForwardModel, checked: SolvedPoses, choices: Mapping[int, TagChoices]
+) -> SolvedPoses:
+    """Return covariances that hold for weak geometry and cover each choice of tags (by view).
 
-    sigma: in units of 1 / weight, which they are scaled by.
+    An estimated sigma is in units of 1 / weight, which they are scaled by.
     """
+    sigma = 1.0 if checked.sigma is None else checked.sigma
 
     def hold(seen: Views, solution: Localization, excess: Array) -> Localization:
         if sigma != 1.0:
             solution = solution._replace(covariance=solution.covariance * sigma**2)
         return hold_weak_geometry(model, seen, solution, sigma * excess)
 
-    inliers = views._replace(weight=np.where(checked.gross, 0.0, views.weight))
+    views = checked.views
+    inliers = views._replace(weight=np.where(checked.outliers, 0.0, views.weight))
     result = hold(inliers, checked.result, checked.excess)
-    for i, choices in checked.choices.items():
-        held = hold(choices.views, choices.solution, np.ones(len(choices.odds)))
-        covered = cover_choices(choices, held)
+    for i, choice in choices.items():
+        held = hold(choice.views, choice.solution, np.ones(len(choice.odds)))
+        covered = cover_choices(choice, held)
         result.put([i], covered._replace(residual=result.residual[[i]]))
     return checked._replace(result=result)
 
 
-def _examine(
+def _test(
     model: ForwardModel,
     views: Views,
     localization: Localization,
     sigma: float,
     tolerance: float,
-    searched: bool = True,
-    tags: bool = False,
-) -> Examination:
-    """Examine with a sigma in units of 1 / weight; tolerance: of the misfit, as a factor."""
+    searched: bool,
+    tags: bool,
+) -> tuple[SolvedPoses, dict[int, TagChoices]]:
+    """Return tested poses, and by view the choices of tags; see `examine`.
+
+    sigma: in units of 1 / weight; tolerance: of the misfit, as a factor.
+    """
     freedom = 2 * (views.weight > 0).sum(axis=1) - 6
     allowed = (tolerance * sigma) ** 2
     own = with_own_errors(model, views, localization.pose)
@@ -165,11 +157,10 @@ def _examine(
     if tags:
         suspect |= ~tags_agree(model, views, localization, allowed)
     result, reasons = localization, _place_reasons(views, localization)
-    gross = np.zeros(views.used.shape, dtype=bool)
-    if not suspect.any():
-        return Examination(result, gross, tuple(reasons), None, np.ones(len(freedom)))
-    result, excess = Localization.concatenate([localization]), np.ones(len(freedom))  # a copy
+    outliers, excess = np.zeros(views.used.shape, dtype=bool), np.ones(len(freedom))
     choices: dict[int, TagChoices] = {}
+    if suspect.any():
+        result = Localization.concatenate([localization])  # a copy
     for i in np.flatnonzero(suspect):
         view, other = views.take([i]), None
         if searched and tags and holds_tags(view):
@@ -181,12 +172,12 @@ def _examine(
             )
         if other is not None:
             result.put([i], other)
-            gross[i] = (view.weight[0] > 0) & np.isnan(other.residual[0, :, 0])
+            outliers[i] = (view.weight[0] > 0) & np.isnan(other.residual[0, :, 0])
             result.residual[i] = residuals(model, other.pose, view)[0]
             why = (
                 _tags_reason(choices[int(i)], result.residual[i])
                 if int(i) in choices
-                else _gross_reason(view, gross[i], result.residual[i], tags)
+                else _outliers_reason(view, outliers[i], result.residual[i], tags)
             )
             reasons[i] = _join_reasons(why, reasons[i])
         elif result.converged[i] and misfit_fails(result.cost[i] / allowed, freedom[i]):
@@ -197,7 +188,7 @@ def _examine(
                 f'{misfit_reason(variance, int(freedom[i]))}; the covariance is scaled by it',
                 reasons[i],
             )
-    return Examination(result, gross, tuple(reasons), None, excess, choices)
+    return SolvedPoses(model, views, result, outliers, tuple(reasons), None, excess), choices
 
 
 def doubt_of_pairs(
@@ -221,7 +212,7 @@ def doubt_of_pairs(
         )
     cost = np.square(np.stack([best.left_residual, best.right_residual])).sum(axis=(0, -1))
     cost, ids = cost[best.valid] / sigma**2, landmark[best.valid]
-    gross = cost > _GROSS**2
+    gross = cost > _OUTLIER_SIGMAS**2
     fails = misfit_fails(cost.sum(), np.asarray(len(cost)))
     if not gross.any() and not fails:
         return ''
@@ -263,14 +254,15 @@ def _consensus_pose(
     enough = max(MIN_POINTS + _SPARE_POINTS, _MIN_AGREEMENT * used.sum())
     if (used & model.back_project(view.uv).valid).sum() < enough:
         return None
+    limit = _OUTLIER_SIGMAS * tolerance * sigma
     start = consensus_pose(model, own, localization, sigma)
     for _ in range(_ROUNDS):
-        inside = _lengths(model, start, own) < _GROSS * tolerance * sigma
+        inside = _lengths(model, start, own) < limit
         if inside.sum() < enough:
             return None
         kept = view._replace(weight=np.where(inside, view.weight, 0.0))
         solved = localize(model, kept, start)
-        if np.array_equal(_lengths(model, solved.pose, own) < _GROSS * tolerance * sigma, inside):
+        if np.array_equal(_lengths(model, solved.pose, own) < limit, inside):
             break
         start = solved.pose
     allowed = (tolerance * sigma) ** 2
@@ -301,19 +293,14 @@ def consensus_pose(
     model: ForwardModel, view: Views, localization: Localization, sigma: float
 ) -> Pose:
     """Return the pose (1,) that the points agree on best, from minimal subsets of them."""
-    rays = model.back_project(view.uv)
-    usable = np.flatnonzero((view.weight[0] > 0) & rays.valid[0])
-    if len(usable) < MIN_POINTS:
+    starts = [
+        start.compose(part.place.inverse().broadcast_to(*start.shape))
+        for part in model.parts(view)
+        if (start := _subset_poses(part.model, part.views)) is not None
+    ]
+    if not starts:
         return localization.pose
-    # Six points fix a pose without a search among turns, which four of few need.
-    enough = len(usable) >= _SUBSET + _SPARE_POINTS
-    many, size = (_SUBSETS, _SUBSET) if enough else (_FEW_SUBSETS, MIN_POINTS)
-    draws = np.random.default_rng(len(usable)).uniform(size=(many, len(usable)))
-    subset = usable[np.argsort(draws, axis=1)[:, :size]]
-    pose = initial_poses(
-        view.points[0, subset], rays.direction[0, subset], np.ones(subset.shape), not enough
-    )
-    pose = Pose.concatenate([pose, localization.pose])
+    pose = Pose.concatenate([*starts, localization.pose])
     views = view.take(np.zeros(len(pose.position), dtype=int))
     off = _median(_lengths(model, pose, views), views)
     best = np.argsort(off, kind='stable')[:_KEPT]
@@ -323,10 +310,26 @@ def consensus_pose(
         scale = np.maximum(sigma, _median(off, views) / _MEDIAN)[:, None]
         fading = 1 / (1 + (off / (_FADE * scale)) ** 2)
         pose = improve_poses(model, views._replace(weight=views.weight * fading), pose)
-    worst = (3 * _GROSS * sigma) ** 2
+    worst = (3 * _OUTLIER_SIGMAS * sigma) ** 2
     squares = np.minimum(_lengths(model, pose, views) ** 2, worst)
     score = np.where(views.weight > 0, squares, 0.0).sum(axis=1)
     return pose.take([int(np.argmin(score))])
+
+
+def _subset_poses(model: ForwardModel, view: Views) -> Pose | None:
+    """Return poses (K,) by subsets of the points that one camera sees; None for too few points."""
+    rays = model.back_project(view.uv)
+    usable = np.flatnonzero((view.weight[0] > 0) & rays.valid[0])
+    if len(usable) < MIN_POINTS:
+        return None
+    # Six points fix a pose without a search among turns, which four of few need.
+    enough = len(usable) >= _SUBSET + _SPARE_POINTS
+    many, size = (_SUBSETS, _SUBSET) if enough else (_FEW_SUBSETS, MIN_POINTS)
+    draws = np.random.default_rng(len(usable)).uniform(size=(many, len(usable)))
+    subset = usable[np.argsort(draws, axis=1)[:, :size]]
+    return initial_poses(
+        view.points[0, subset], rays.direction[0, subset], np.ones(subset.shape), not enough
+    )
 
 
 def _lengths(model: ForwardModel, pose: Pose, views: Views) -> Array:
@@ -366,9 +369,9 @@ def _tags_reason(choices: TagChoices, residual: Array) -> str:
     return f'outliers rejected: {_landmark_names(np.array(each[0]), np.array(largest), "tag")}'
 
 
-def _gross_reason(view: Views, gross: Mask, residual: Array, tags: bool) -> str:
-    size = np.where(gross, np.nan_to_num(np.linalg.norm(residual, axis=-1), nan=np.inf), 0.0)
-    worst = np.argsort(-size, kind='stable')[: gross.sum()]
+def _outliers_reason(view: Views, outliers: Mask, residual: Array, tags: bool) -> str:
+    size = np.where(outliers, np.nan_to_num(np.linalg.norm(residual, axis=-1), nan=np.inf), 0.0)
+    worst = np.argsort(-size, kind='stable')[: outliers.sum()]
     if not len(worst):
         return ''
     number, kind = (view.board, 'tag') if tags else (view.landmark, 'landmark')

@@ -48,7 +48,7 @@ def hold_weak_geometry(
     deviation = np.broadcast_to(np.asarray(scale, dtype=float), localization.cost.shape)
     if not (deviation == 1.0).all():
         localization = localization._replace(gap=localization.gap / deviation**2)
-    covariance, neglected = localization.covariance, model.lens.neglected
+    covariance, neglected = localization.covariance, model.neglecting()
     weak, curvature = _weak_views(views, localization)
     if not weak.size and neglected is None:
         return localization
@@ -67,9 +67,7 @@ def hold_weak_geometry(
                 minima = (some.pose, some.other)[: 1 + two]
                 covariance[rows] = _integrate(model, seen, minima, deviation[rows], nodes)
     if neglected is not None:
-        covariance = covariance + _squared_bias(
-            model, ForwardModel(neglected), views, localization
-        )
+        covariance = covariance + _squared_bias(model, neglected, views, localization)
     return localization._replace(
         covariance=covariance, added=localization.added + covariance - localization.covariance
     )

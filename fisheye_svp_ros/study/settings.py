@@ -244,32 +244,11 @@ class RobotSettings(GateSettings):
         fixed=True,
     )
 
-    @property
-    def from_rectified_images(self) -> bool:
-        """See SolverSettings."""
-        return self.detections_rectified
-
-    @property
-    def most_waiting(self) -> int:
-        """How many sets may wait to be solved."""
-        return self.backlog or (1 if self.base_frame else 100)
-
-
-@dataclass(frozen=True)
-class LocalizerSettings(RobotSettings):
-    """Parameters of the localizer."""
-
-    camera_frame: str = parameter(
-        '',
-        'Frame id of the estimated camera; empty: that of the image points',
-        fixed=True,
-        frame=True,
-    )
     tag_map: str = parameter(
         '',
         'Map of tags (`fisheye-svp map`, or tags.yaml of apriltag_ros): tags on the topic '
-        '`detections` then stand for `image_points`, the map for `landmarks`; its errors are in '
-        'the covariances. Empty: neither',
+        '`detections` (of a rig NAME/detections) then stand for `image_points`, the map for '
+        '`landmarks`; its errors are in the covariances. Empty: neither',
         file=True,
         fixed=True,
     )
@@ -296,11 +275,6 @@ class LocalizerSettings(RobotSettings):
         fixed=True,
     )
     map_frame: str = parameter('map', 'Frame id of the tag map', fixed=True, frame=True)
-    model_error: bool = parameter(
-        False,
-        'Include the errors of the lens in the covariance of the pose, besides `sigma_px`; '
-        'the lens file must state them, as those of `calibrate` and `diagnose` do',
-    )
     readout_time: float = parameter(
         0.03,
         'Time that a rolling shutter takes from the first row to the last, the stamp being that '
@@ -328,6 +302,33 @@ class LocalizerSettings(RobotSettings):
     )
     planar_std_rad: float = parameter(
         0.02, 'Standard deviation of roll and pitch of the base', 'rad', (1e-6, 3.0), fixed=True
+    )
+
+    @property
+    def from_rectified_images(self) -> bool:
+        """See SolverSettings."""
+        return self.detections_rectified
+
+    @property
+    def most_waiting(self) -> int:
+        """How many sets may wait to be solved."""
+        return self.backlog or (1 if self.base_frame else 100)
+
+
+@dataclass(frozen=True)
+class LocalizerSettings(RobotSettings):
+    """Parameters of the localizer."""
+
+    camera_frame: str = parameter(
+        '',
+        'Frame id of the estimated camera; empty: that of the image points',
+        fixed=True,
+        frame=True,
+    )
+    model_error: bool = parameter(
+        False,
+        'Include the errors of the lens in the covariance of the pose, besides `sigma_px`; '
+        'the lens file must state them, as those of `calibrate` and `diagnose` do',
     )
 
 

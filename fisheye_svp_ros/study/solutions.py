@@ -1,13 +1,11 @@
-"""One set, or many at once, to a solution and its metrics: the one way there is.
+"""Metrics of solved sets, one or many at once; rigs and points that stereo cameras measure.
 
-Nodes, sweeps, commands and the paper's evaluation all come by here, so they tell the same numbers.
 Metrics carry their unit in the name, batch first: dictionaries of arrays (S,).  What needs the
 truth is absent without it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -19,16 +17,16 @@ from fisheye_svp_ros.io.decoding import RESIDUALS, Points, structured_array
 from fisheye_svp_ros.pose import Pose, axis_angle_between
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.least_squares import misfit_fails
-from fisheye_svp_ros.solve.localization import Localization, localize, sight
-from fisheye_svp_ros.solve.reliability import examine, misfit_reason
+from fisheye_svp_ros.solve.localization import sight
+from fisheye_svp_ros.solve.reliability import misfit_reason
+from fisheye_svp_ros.solve.solved_poses import SolvedPoses, gate_reason
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate, triangulate_optimally
-from fisheye_svp_ros.solve.weak_geometry import hold_weak_geometry, is_ambiguous, pose_odds
+from fisheye_svp_ros.solve.weak_geometry import is_ambiguous, pose_odds
 
 T = TypeVar('T')
 Pair = tuple[ForwardModel, ForwardModel]  # of the left and the right camera
 
-_NO_POSE = 'image_points: they do not determine a pose (all near one line, or of another lens?)'
 _NO_RIG = 'image_points: they do not determine a rig'
 _NO_PAIR = 'image_points: no landmark is in both images'
 Metrics = dict[str, Array]
@@ -70,12 +68,11 @@ class Measurement(NamedTuple):
 
 
 class SetSolutions(NamedTuple, Generic[T]):
-    """The solution of S sets and its metrics, arrays (S,) by name.
+    """Rigs, or points, of S sets and their metrics, arrays (S,) by name.
 
     solved (S,); unsolved: why the others have no solution; reasons (S,): why a solution should
     not be relied on, '' for a reliable one, all of them where that was not examined; sigmas (S,):
-    root mean square of the residuals, whitened, by degrees of freedom; suspects (S,): tags that
-    may have moved, see `solve.tag_units`, where these were examined.
+    root mean square of the residuals, whitened, by degrees of freedom.
     """
 
     solution: T
@@ -84,7 +81,6 @@ class SetSolutions(NamedTuple, Generic[T]):
     unsolved: str
     reasons: tuple[str, ...] = ('',)
     sigmas: Array = np.zeros(1)
-    suspects: tuple[Mapping[int, float], ...] = ()
 
     def require(self, gate: float = 0.0) -> SetSolutions[T]:
         """Return it as it is; raise GeometryError where a set has no solution.
@@ -102,45 +98,11 @@ class SetSolutions(NamedTuple, Generic[T]):
         return np.asarray(self.sigmas <= gate) if gate else np.ones(self.solved.shape, dtype=bool)
 
 
-def localize_sets(
-    model: ForwardModel,
-    views: Views,
-    true: Pose | None = None,
-    start: Pose | None = None,
-    examined: bool = False,
-    searched: bool = True,
-    tags: bool = False,
-) -> SetSolutions[Localization]:
-    """Localize the camera of every view (S,); true, start: poses (S,) where they are known.
-
-    examined: test the misfit against sigma; searched: leave outliers out where that fails, as
-    `examine` does: not of sets whose errors by the SVP model are to be measured.
-    Raises GeometryError as `localize` does.
-    """
-    localization = localize(model, views, start)
-    residual, reasons = localization.residual, ('',) * len(localization.cost)
-    suspects: tuple[Mapping[int, float], ...] = ()
-    if examined:
-        checked = examine(model, views, localization, searched=searched, tags=tags)
-        localization, reasons, suspects = checked.result, checked.reasons, checked.suspects
-        residual = np.where(checked.gross[..., None], np.nan, localization.residual)
-    else:
-        localization = hold_weak_geometry(model, views, localization)
-    metrics = {
-        **localization_metrics(localization.pose, residual, true),
-        'odds': pose_odds(localization),
-        'ambiguous': is_ambiguous(localization).astype(float),
-    }
-    sigmas = _residual_sigmas(localization.cost, 2 * metrics['points'] - 6)
-    return SetSolutions(
-        localization, metrics, localization.converged, _NO_POSE, reasons, sigmas, suspects
-    )
-
-
-def residual_points(model: ForwardModel, views: Views, solution: Localization) -> Points:
-    """Return the residuals of one view (1,): px; incidence angle, rad, and range, m, as solved."""
-    theta, distance = sight(model, solution.pose, views)
-    columns = (*views.uv[0].T, *solution.residual[0].T, theta[0], distance[0])
+def residual_points(solved: SolvedPoses) -> Points:
+    """Return the residuals of one set (1,): px; incidence angle, rad, and range, m, as solved."""
+    views = solved.views
+    theta, distance = sight(solved.model, solved.pose, views)
+    columns = (*views.uv[0].T, *solved.result.residual[0].T, theta[0], distance[0])
     return structured_array(RESIDUALS, views.landmark[0], *columns)
 
 
@@ -168,26 +130,6 @@ def _residual_sigmas(cost: Array, freedom: Array) -> Array:
     return np.asarray(np.sqrt(cost / np.maximum(freedom, 1)))
 
 
-def residual_sigmas(residual: Array) -> float:
-    """Return the root mean square, by degrees of freedom, of whitened residuals (1, N, 2)."""
-    known = np.isfinite(residual)
-    cost = np.where(known, residual, 0.0) ** 2
-    return float(_residual_sigmas(cost.sum(), known.sum() - 6))
-
-
-def check_gate(residual: Array, gate: float) -> None:
-    """Raise GeometryError where whitened residuals (1, N, 2) of a pose are above a gate."""
-    sigmas = residual_sigmas(residual)
-    if gate and sigmas > gate:
-        raise GeometryError(gate_reason(gate, sigmas))
-
-
-def gate_reason(gate: float, sigmas: float | None = None) -> str:
-    """Say why a set that was solved has no pose; sigmas: its residuals, left out in tables."""
-    size = '' if sigmas is None else f'{sigmas:.3g} sigma_px, '
-    return f'image_points: their residuals are {size}above the gate ({gate:g} sigma_px): no pose'
-
-
 def measure_points(
     models: Pair,
     rig: Pose,
@@ -212,13 +154,18 @@ def measure_points(
     return SetSolutions(measured, metrics, np.asarray(both.any(axis=1)), _NO_PAIR)
 
 
-def localization_metrics(pose: Pose, residual: Array, true: Pose | None = None) -> Metrics:
-    """Return the metrics of poses (S,) and of residuals (S, N, 2), px, NaN = no point.
+def localization_metrics(solved: SolvedPoses, true: Pose | None = None) -> Metrics:
+    """Return LOCALIZATION_METRICS of solved sets (S,), as far as they are known; true (S,).
 
     rms_px: root mean square of the 2-D residual norm; mean_residual_px: mean norm, as Kita's
     tables have it; position errors in the frame of the poses; axis: the viewing axis.
     """
-    return {**_fit_metrics(residual), **_pose_errors(pose, true)}
+    return {
+        **_fit_metrics(solved.residual),
+        **_pose_errors(solved.pose, true),
+        'odds': pose_odds(solved.result),
+        'ambiguous': is_ambiguous(solved.result).astype(float),
+    }
 
 
 def stereo_calibration_metrics(

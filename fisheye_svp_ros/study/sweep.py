@@ -32,6 +32,8 @@ from fisheye_svp_ros.simulate.scenario import (
     simulate_batches,
     true_lens,
 )
+from fisheye_svp_ros.solve.poses import solve_poses
+from fisheye_svp_ros.solve.solved_poses import NO_POSE, gate_reason
 from fisheye_svp_ros.study.settings import (
     LocalizerSettings,
     SolverSettings,
@@ -44,8 +46,7 @@ from fisheye_svp_ros.study.solutions import (
     STEREO_CALIBRATION_METRICS,
     STEREO_DEPTH_METRICS,
     SetSolutions,
-    gate_reason,
-    localize_sets,
+    localization_metrics,
     measure_points,
     solve_rigs,
 )
@@ -133,7 +134,14 @@ def localizer(batch: ScenarioBatch, settings: LocalizerSettings) -> Outcome:
 
     def solve(index: Index) -> SetSolutions[Any]:
         views = sets.views(0, index, settings.sigma_px)
-        return localize_sets(model, views, sets.poses[0].take(index))
+        found = solve_poses(model, views, examined=False)
+        return SetSolutions(
+            found,
+            localization_metrics(found, sets.poses[0].take(index)),
+            found.result.converged,
+            NO_POSE,
+            sigmas=found.sigmas,
+        )
 
     for index in _chunks(np.arange(len(sets.landmark))):
         outcome.attempt(index, solve, settings.gate)

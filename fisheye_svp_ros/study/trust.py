@@ -22,6 +22,7 @@ from fisheye_svp_ros.diagnosis import (
 )
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import FisheyeSvpError
+from fisheye_svp_ros.io.tag_maps import TagMap
 from fisheye_svp_ros.mixed_model import FactoredEquations, factor_equations, pseudo_inverse
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import Pose, axis_angle_between, identity
@@ -29,9 +30,11 @@ from fisheye_svp_ros.scene.observations import Observations, views_of
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import initial_state, localize_cameras
 from fisheye_svp_ros.solve.lens_calibration import Calibration, with_values
-from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measured, rms_px
+from fisheye_svp_ros.solve.measured_poses import rms_px
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
+from fisheye_svp_ros.solve.solved_poses import SolvedPoses
 from fisheye_svp_ros.solve.stereo_depth import triangulate
+from fisheye_svp_ros.solve.table_poses import solve_table
 
 _SHIFT_NAMES = ('s0', 'e0', 'e1', 'e2', 'thickness')
 _INTERVAL_SIGMAS = 2.0  # standard errors of an interval
@@ -280,17 +283,17 @@ def _admissible(name: str, *found: tuple[float, float]) -> Admissible:
 
 
 def localize_with_errors(
-    errors: LensErrors, observations: Observations
-) -> tuple[MeasuredPoses, ErrorParts]:
+    errors: LensErrors, observations: Observations, tag_map: TagMap | None = None
+) -> tuple[SolvedPoses, ErrorParts]:
     """Pose every frame of one camera's table that can be posed, and say how far off each may be.
 
-    Raises ObservationError and GeometryError as `localize_measured` does.
+    Raises ObservationError and GeometryError as `solve_table` does.
     """
     allowed = replace(observations, sigma=np.asarray(errors.inflate_sigma(observations.sigma)))
-    measured = localize_measured(ForwardModel(errors.lens), allowed)
-    kept = measured.views._replace(weight=np.where(measured.gross, 0.0, measured.views.weight))
-    parts = errors.of_solved_poses(kept, measured.result, measured.sigma)
-    return measured._replace(result=measured.result._replace(covariance=parts.total)), parts
+    solved = solve_table(allowed, ForwardModel(errors.lens), tag_map)
+    kept = solved.views._replace(weight=np.where(solved.outliers, 0.0, solved.views.weight))
+    parts = errors.of_solved_poses(kept, solved.result, solved.sigma)
+    return solved._replace(result=solved.result._replace(covariance=parts.total)), parts
 
 
 def depth_errors(

@@ -13,11 +13,13 @@ from fisheye_svp_ros.io.tag_maps import CORNERS, TagMap, map_of_size
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.scene.observations import Views, views_of
+from fisheye_svp_ros.scene.observations import Observations, Views, make_observations, views_of
 
 LENS = Lens('made', 1280, 960, 330.0, 331.0, 640.5, 479.5, KannalaBrandt(0.03, -0.01), 1.5)
 OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # a camera that looks ahead, in its base
 MOUNT = Pose(OPTICAL, np.array([0.15, 0.02, 0.4]))
+# The second camera of a rig, in the first one: it looks to the left, about y, which points down
+LEFT = Pose(rotation_from_vector(np.array([0.0, -1.2, 0.0])), np.array([-0.2, 0.0, 0.0]))
 _MIN_SIDE = 10.0  # px
 _MIN_COSINE = 0.35  # of the angle that a tag is seen under
 
@@ -90,3 +92,20 @@ class TagRoom:
         )
         landmark = (CORNERS * tags[:, None] + np.arange(CORNERS)).reshape(1, -1)
         return views._replace(landmark=landmark, board=landmark // CORNERS)
+
+    def table(self, cameras: int = 1, frames: int = 4, sigma: float = 0.2) -> Observations:
+        """Return what one camera, or two of a rig, see on the way: corners of unknown sigma."""
+        rng, columns = np.random.default_rng(7), []
+        for frame in range(frames):
+            pose = oval(frame / frames)
+            for camera in range(cameras):
+                place = pose.compose(LEFT) if camera else pose
+                tags = self.visible(place)
+                uv = self.project(place, tags)
+                landmark = (CORNERS * tags[:, None] + np.arange(CORNERS)).ravel()
+                here = np.full((len(landmark), 2), [frame, camera])
+                columns.append((*here.T, landmark, uv + sigma * rng.normal(size=uv.shape)))
+        frame_of, camera_of, landmark, uv = map(np.concatenate, zip(*columns, strict=True))
+        names = ('front', 'side') if cameras > 1 else ('',)
+        xyz = self.tags.corners.reshape(-1, 3)[landmark]
+        return make_observations(frame_of, landmark, uv, xyz, camera=camera_of, cameras=names)

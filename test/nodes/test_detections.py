@@ -17,15 +17,16 @@ from geometry_msgs.msg import PoseWithCovarianceStamped  # isort: skip
 
 from fisheye_svp_ros.effects.forward import project_corrected
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.io.decoding import ImagePoints, LandmarkSet, read_pose
+from fisheye_svp_ros.io.decoding import ImagePoints, LandmarkSet, read_landmarks, read_pose
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.io.tag_maps import CENTER_OFFSET, map_of_size, read_tag_map, write_tag_map
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.detections import TagLimits, read_apriltags, read_detections
 from fisheye_svp_ros.nodes.localizer import Localizer
-from fisheye_svp_ros.nodes.validation import KnownPoints, SetValidation
+from fisheye_svp_ros.nodes.validation import SetValidation
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.study.settings import LocalizerSettings
 
 LENS = load_lens(lens_path('fish180'))
@@ -130,7 +131,7 @@ def test_tags_of_another_family_than_the_map_are_refused(tmp_path: Path) -> None
     assert read_apriltags(other).tag is not None, 'the map states none'
 
 
-def validate(points: ImagePoints, strict: bool = False) -> tuple[KnownPoints, list[str]]:
+def validate(points: ImagePoints, strict: bool = False) -> tuple[ImagePoints, list[str]]:
     """Return what is used of image points, and what is told of the others."""
     check = SetValidation(['detections'], [], lambda *_: None, lambda *_: None)
     landmarks = LandmarkSet(TAGS.landmarks(), 'map')
@@ -147,6 +148,41 @@ def test_tags_are_called_by_their_ids() -> None:
     assert texts[1] == 'detections: 1 of 2 tags left out: not in the map 77'
     with pytest.raises(ObservationError, match='tag 77 is not in the tag map'):
         validate(found, strict=True)
+
+
+@pytest.mark.parametrize('of_tags', [True, False])
+def test_landmarks_that_are_those_of_tags_are_called_so(of_tags: bool) -> None:
+    """Of the detector of this package, whose landmarks are a map of tags, corners and middles."""
+    landmarks = TAGS.landmarks()
+    if not of_tags:  # a board has no middles of tags
+        landmarks = Landmarks(landmarks.ids[:12], landmarks.points[:12])
+    message = messages.landmarks_message(landmarks, 0, 'map')
+    known = read_landmarks(message)
+    assert known.of_tags == of_tags
+    check = SetValidation(['image_points'], [], lambda *_: None, lambda *_: None)
+    seen = ImagePoints(np.array([17, 18, 27]), np.zeros((3, 2)), 'cam')
+    items, texts = check.check({'image_points': seen}, known, LocalizerSettings(), 1)
+    used = items['image_points']
+    assert used.landmark.tolist() == [17, 18]
+    if of_tags:
+        assert used.tag is not None and used.tag.tolist() == [4, 4]
+        assert texts == ['image_points: 1 of 2 tags left out: not in the map 6']
+    else:
+        assert used.tag is None and 'unknown landmarks 27' in texts[0]
+
+
+def test_of_a_rig_one_camera_may_see_no_tag_of_the_map() -> None:
+    empty = SimpleNamespace(header=SimpleNamespace(frame_id='cam'), detections=[])
+    topics = ['a/image_points', 'b/image_points']
+    check = SetValidation(topics, [], lambda *_: None, lambda *_: None)
+    none = read_apriltags(empty, may_be_empty=True)
+    other, own = (read_apriltags(found_tags((tag, 0, 50.0))) for tag in (77, 4))
+    landmarks = LandmarkSet(TAGS.landmarks(), 'map')
+    for first in (none, other):
+        items = dict(zip(topics, (first, own), strict=True))
+        checked, _ = check.check(items, landmarks, LocalizerSettings(), 1)
+        assert not len(checked['a/image_points'].landmark)
+        assert checked['b/image_points'].xyz.shape == (4, 3)
 
 
 def test_a_missing_package_is_named(

@@ -28,7 +28,8 @@ from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import group_views, views_of
 from fisheye_svp_ros.scene.rigs import rig
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
-from fisheye_svp_ros.study.solutions import gate_reason, localize_sets
+from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.solve.solved_poses import gate_reason
 from fisheye_svp_ros.study.sweep import plan_sweep, sweep_rows
 
 SEEN = simulate_scenario(Scenario(noise_px=0.3)).observations
@@ -94,7 +95,7 @@ def test_a_rolling_shutter_of_a_camera_that_turns_is_told(
 ) -> None:
     driven = Driven(graph(*SOLVING, f'readout_time:={readout}'))
     model = ForwardModel(load_lens(lens_path('fish214')))
-    start, views = localize_sets(model, group_views(SEEN)).solution.pose, views_of(SEEN.xyz)
+    start, views = localize(model, group_views(SEEN)).pose, views_of(SEEN.xyz)
     texts = []
     for i in range(4):
         turned = start.retract(np.array([[0.0, 0.0, 0.0, 0.0, 0.05 * i, 0.0]]))

@@ -27,7 +27,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, group_views, make_observations
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
-from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.solve.poses import solve_poses
 from fisheye_svp_ros.study.solutions import residual_points
 from fisheye_svp_ros.study.sweep import plan_sweep, sweep_rows
 
@@ -167,7 +167,7 @@ def test_angles_and_ranges_are_those_of_the_corrected_target(tmp_path: Path) -> 
     )
     told = CsvTable(tmp_path / 'out' / 'residuals.csv', ['theta', 'range'])
     model, views = ForwardModel(lens), group_views(table)
-    cloud = residual_points(model, views, localize(model, views))
+    cloud = residual_points(solve_poses(model, views))
     for name, true in (('theta', theta), ('range', away)):
         np.testing.assert_allclose(told.numbers(name)[:, 0], true, atol=1e-8)
         np.testing.assert_allclose(cloud[name], true, atol=1e-8)

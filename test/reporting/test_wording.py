@@ -263,6 +263,21 @@ def test_wrong_landmarks_are_named_with_what_to_do():
     assert moved.to_dict()['offset'] == [0.0, 0.03, 0.04] and lost.to_dict()['offset'] is None
 
 
+def test_wrong_corners_of_tags_are_named_by_the_tag():
+    moved = [
+        WrongLandmark(24 + corner, 20, 25.3, np.array([0.0, 0.03, 0.001 * corner]))
+        for corner in range(4)
+    ]
+    lost = [
+        WrongLandmark(36 + corner, 18, 300.2 - corner, np.full(3, np.nan)) for corner in (0, 1)
+    ]
+    assert list(wrong_landmark_notes([*moved, *lost], of_tags=True)) == [
+        'tag not where the map says: 6 by 30.1 mm; rejected; measure it again',
+        'tag 9: its 36 points are 300 px off and no other place explains them; rejected; check '
+        'its number',
+    ]
+
+
 def test_many_outliers_of_one_view_are_one_row() -> None:
     gross = [
         {

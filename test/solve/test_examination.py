@@ -15,8 +15,8 @@ from fisheye_svp_ros.scene.rigs import rig
 from fisheye_svp_ros.solve.localization import Localization, localize
 from fisheye_svp_ros.solve.reliability import (
     _consensus_pose,
-    _gross_reason,
     _noise_from_median,
+    _outliers_reason,
     _suspect,
     doubt_of_pairs,
     examine,
@@ -148,8 +148,8 @@ def test_points_left_out_are_no_rows_of_the_noise():
     views = views._replace(weight=np.ones(views.weight.shape))
     views.uv[2, [3, 7]] += [[30.0, 0.0], [0.0, -25.0]]
     checked = examine(model, views, localize(model, views), sigma_known=False)
-    assert checked.gross.sum() == 2 and checked.gross[2, [3, 7]].all()
-    kept = views._replace(weight=np.where(checked.gross, 0.0, views.weight))
+    assert checked.outliers.sum() == 2 and checked.outliers[2, [3, 7]].all()
+    kept = views._replace(weight=np.where(checked.outliers, 0.0, views.weight))
     cost = localize(model, kept).cost
     passed = np.arange(5) != 2  # the view with outliers has its reason
     expected = np.sqrt(cost[passed].sum() / (4 * 34))
@@ -162,9 +162,9 @@ def test_three_fifths_of_the_points_must_agree(points, wrong, searched):
     rng = np.random.default_rng(1)
     views.uv[0, :wrong] += rng.uniform(20, 60, (wrong, 2)) * rng.choice([-1, 1], (wrong, 2))
     checked = examine(model, views, localize(model, views))
-    assert bool(checked.gross.any()) == searched
+    assert bool(checked.outliers.any()) == searched
     if searched:
-        assert set(np.flatnonzero(checked.gross[0])) == set(range(wrong))
+        assert set(np.flatnonzero(checked.outliers[0])) == set(range(wrong))
 
 
 @pytest.mark.parametrize(('points', 'found'), [(8, True), (7, False)])
@@ -174,7 +174,7 @@ def test_three_points_beyond_a_minimal_set_must_agree(points, found):
     views = views.take_points(np.arange(points))
     views.uv[0, 2] += [50.0, -20.0]
     checked = examine(model, views, localize(model, views))
-    assert np.flatnonzero(checked.gross[0]).tolist() == ([2] if found else [])
+    assert np.flatnonzero(checked.outliers[0]).tolist() == ([2] if found else [])
     assert checked.reasons[0]
 
 
@@ -204,7 +204,7 @@ def test_outliers_are_named_largest_first_and_no_more_than_five():
 def test_a_point_without_an_image_is_named_before_all_others():
     views = views_of(np.zeros((3, 3)), np.zeros((1, 3, 2)))
     residual = np.array([[3.0, 4.0], [np.nan, np.nan], [30.0, 40.0]])
-    reason = _gross_reason(views, np.array([False, True, True]), residual, False)
+    reason = _outliers_reason(views, np.array([False, True, True]), residual, False)
     assert reason == 'outliers rejected: landmarks 1 (inf px), 2 (50 px)'
 
 

@@ -10,7 +10,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, cross_matrix, rotation_from_vector
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.solve.localization import localize
-from fisheye_svp_ros.study.solutions import localize_sets
+from fisheye_svp_ros.solve.poses import solve_poses
 
 MODEL = ForwardModel(
     Lens('made', 1280, 960, 330.0, 331.0, 640.5, 479.5, KannalaBrandt(0.03, -0.01), 1.5)
@@ -71,12 +71,12 @@ def nees(solution, true):
 @pytest.mark.parametrize('tags', [1, 2, 6])
 def test_covariances_hold_the_errors_of_a_map(tags):
     views, true = seen_by(200, tags, 3 + tags)
-    solved = localize_sets(MODEL, views, examined=True)
-    squares, freedom = nees(solved.solution, true), 8 * tags - 6
+    solved = solve_poses(MODEL, views)
+    squares, freedom = nees(solved.result, true), 8 * tags - 6
     assert 0.91 < (squares < chi2.ppf(0.95, 6)).mean() < 0.99
     assert squares.mean() == pytest.approx(6.0, abs=0.8)
     # The test of residuals knows of them, too: nothing is suspected.
-    assert solved.solution.cost.mean() / freedom == pytest.approx(
+    assert solved.result.cost.mean() / freedom == pytest.approx(
         1.0, abs=3.5 * (200 * freedom / 2) ** -0.5
     )
     assert sum(map(bool, solved.reasons)) <= 1 and solved.passes(3.0).all()
@@ -96,7 +96,7 @@ def test_what_a_whole_map_shares_is_no_noise_of_a_set():
     np.testing.assert_allclose(shared.cost, alone.cost, rtol=0.02)
     assert 4.0 < nees(shared, true).mean() < 8.0 < 100.0 < nees(alone, true).mean()
     views.uv[:, 7, 0] += 4.0  # px, less than the map is off by, and more than a corner is
-    found = localize_sets(MODEL, views, examined=True)
+    found = solve_poses(MODEL, views)
     assert all(reason.startswith('outliers rejected: landmark 7 (') for reason in found.reasons)
 
 
@@ -104,6 +104,6 @@ def test_views_without_a_pose_stay_without():
     views, true = seen_by(3, 2, 6)
     line = views.points[1, :1] + np.arange(8)[:, None] * [0.1, 0.0, 0.0]
     views = views._replace(points=np.stack([views.points[0], line, views.points[2]]))
-    solved = localize_sets(MODEL, views, examined=True)
-    assert solved.solved.tolist() == [True, False, True]
-    assert np.isfinite(nees(solved.solution, true)[[0, 2]]).all()
+    solved = solve_poses(MODEL, views)
+    assert solved.result.converged.tolist() == [True, False, True]
+    assert np.isfinite(nees(solved.result, true)[[0, 2]]).all()

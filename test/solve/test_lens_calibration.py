@@ -20,7 +20,8 @@ from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.bundle_adjustment import adjust_lens
 from fisheye_svp_ros.solve.lens_calibration import _check_focal, calibrate
 from fisheye_svp_ros.solve.localization import localize
-from fisheye_svp_ros.solve.measured_poses import localize_measured, posable_views, rms_px
+from fisheye_svp_ros.solve.measured_poses import posable_views, rms_px
+from fisheye_svp_ros.solve.table_poses import solve_table
 
 OV_PLANE = DATA / 'ov_plane'
 SIZE = (1280, 960)
@@ -344,7 +345,7 @@ class TestMeasuredData:
 
     def test_predicts_the_test_images(self, calibration):
         model = ForwardModel(calibration.adjusted.lens)
-        test = localize_measured(model, read_observations(OV_PLANE / 'test.csv'))
+        test = solve_table(read_observations(OV_PLANE / 'test.csv'), model)
         assert rms_px(test.result.residual) <= 0.475
         assert test.left_out == ()
 
@@ -362,8 +363,8 @@ class TestMeasuredPoses:
 
     def test_estimated_sigma_scales_the_covariance(self, model):
         table = make_table(model.lens, cube, 5, 14, sigma=0.4)
-        estimated = localize_measured(model, table)
-        given = localize_measured(model, replace(table, sigma=np.full(len(table), 0.4)))
+        estimated = solve_table(table, model)
+        given = solve_table(replace(table, sigma=np.full(len(table), 0.4)), model)
         assert given.sigma is None
         assert estimated.sigma == pytest.approx(0.4, rel=0.1)
         ratio = estimated.result.covariance / given.result.covariance
@@ -383,4 +384,4 @@ class TestMeasuredPoses:
     def test_nothing_to_pose(self, model):
         table = make_table(model.lens, plane, 2, 16)
         with pytest.raises(GeometryError, match='inside the field of view of lens'):
-            localize_measured(ForwardModel(replace(model.lens, max_incidence=1e-3)), table)
+            solve_table(table, ForwardModel(replace(model.lens, max_incidence=1e-3)))

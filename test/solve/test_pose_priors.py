@@ -9,8 +9,8 @@ from helpers.tag_room import LENS, MOUNT, TagRoom, oval
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.pose_priors import PlanarPrior
+from fisheye_svp_ros.solve.poses import solve_poses
 from fisheye_svp_ros.solve.weak_geometry import is_ambiguous
-from fisheye_svp_ros.study.solutions import localize_sets
 
 MODEL, ROOM = ForwardModel(LENS), TagRoom(16)
 SIGMA = np.array([[0.02, 0.02]])
@@ -47,11 +47,11 @@ def one_tag_sets(known, count, rng):
         seen = rng.permutation(ROOM.visible(camera))[:1]
         views = ROOM.views(camera, ROOM.project(camera, seen), seen, 0.2, rng)
         views = views._replace(prior=prior() if known else None)
-        solved = localize_sets(MODEL, views, examined=True, tags=True)
+        solved = solve_poses(MODEL, views, tags=True)
         assert not solved.reasons[0]
-        change = solved.solution.pose.difference(camera.take(None))[0]
-        ambiguous.append(bool(is_ambiguous(solved.solution)[0]))
-        off.append(change @ np.linalg.solve(solved.solution.covariance[0], change))
+        change = solved.pose.difference(camera.take(None))[0]
+        ambiguous.append(bool(is_ambiguous(solved.result)[0]))
+        off.append(change @ np.linalg.solve(solved.covariance[0], change))
     return np.array(ambiguous), np.array(off)
 
 
@@ -68,5 +68,5 @@ def test_a_plane_elsewhere_contradicts_the_image():
     camera = oval(0.2)
     seen = ROOM.visible(camera)
     views = ROOM.views(camera, ROOM.project(camera, seen), seen, 0.2, rng)
-    solved = localize_sets(MODEL, views._replace(prior=prior(0.5)), examined=True, tags=True)
+    solved = solve_poses(MODEL, views._replace(prior=prior(0.5)), tags=True)
     assert solved.reasons[0]

@@ -8,7 +8,7 @@ from helpers.tag_room import LENS, TagRoom, oval
 
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.solve.poses import solve_poses
 from fisheye_svp_ros.solve.readout import exceeds, readout_bias, steady_velocity
 from fisheye_svp_ros.solve.weak_geometry import CHI2_999
 
@@ -34,9 +34,9 @@ def test_the_bias_is_that_of_solved_images(pace: float) -> None:
         camera = oval(place)
         uv = rolled(camera, velocity, READOUT)
         views = ROOM.views(camera, uv, ROOM.visible(camera), 0.2, rng)
-        solved = localize(MODEL, views._replace(uv=uv[None]))
+        solved = solve_poses(MODEL, views._replace(uv=uv[None]), examined=False)
         off = solved.pose.difference(camera.take(None))[0]
-        bias = readout_bias(MODEL, views, solved.pose, velocity, READOUT)[0]
+        bias = readout_bias(solved, velocity, READOUT)[0]
         np.testing.assert_allclose(bias, off, atol=0.1 * np.linalg.norm(off))
         covariance = solved.covariance[0]
         outside = off @ np.linalg.solve(covariance, off) > CHI2_999

@@ -20,9 +20,10 @@ from fisheye_svp_ros.solve.initial_pose import (
 )
 from fisheye_svp_ros.solve.least_squares import misfit_fails
 from fisheye_svp_ros.solve.localization import localize
-from fisheye_svp_ros.solve.measured_poses import localize_measured
+from fisheye_svp_ros.solve.poses import solve_poses
 from fisheye_svp_ros.solve.reliability import doubt_of_pairs, examine
-from fisheye_svp_ros.study.solutions import localize_sets
+from fisheye_svp_ros.solve.table_poses import solve_table
+from fisheye_svp_ros.study.solutions import localization_metrics
 
 
 @pytest.mark.parametrize('kind', SCENES)
@@ -54,20 +55,20 @@ def test_gross_errors_are_named_and_change_no_metrics_but_their_own():
     model, views, true = spoilt('clean', 'room', 1, np.random.default_rng(5))
     views.uv[0, [3, 11]] += [[40.0, -5.0], [3.0, 30.0]]
     kept = views._replace(weight=np.where(np.isin(views.landmark, [3, 11]), 0.0, views.weight))
-    found, want = localize_sets(model, views, true, examined=True), localize(model, kept)
-    (reason,) = found.reasons
+    found, want = solve_poses(model, views), localize(model, kept)
+    (reason,), metrics = found.reasons, localization_metrics(found, true)
     assert reason.startswith('outliers rejected: landmarks 3 (4') and ', 11 (3' in reason
-    np.testing.assert_allclose(found.solution.pose.position, want.pose.position, atol=1e-8)
-    np.testing.assert_allclose(found.solution.covariance, want.covariance, rtol=1e-4)
-    assert found.metrics['points'] == 18 and found.metrics['rms_px'] < 3 * SIGMA
-    assert np.linalg.norm(found.solution.residual[0, 3]) > 30
+    np.testing.assert_allclose(found.pose.position, want.pose.position, atol=1e-8)
+    np.testing.assert_allclose(found.covariance, want.covariance, rtol=1e-4)
+    assert metrics['points'] == 18 and metrics['rms_px'] < 3 * SIGMA
+    assert np.linalg.norm(found.result.residual[0, 3]) > 30
 
 
 def test_without_a_search_gross_errors_are_a_misfit():
     model, views, _ = spoilt('clean', 'room', 1, np.random.default_rng(5))
     views.uv[0, 3] += [40.0, -5.0]
     checked = examine(model, views, localize(model, views), searched=False)
-    assert 'times what sigma allows' in checked.reasons[0] and not checked.gross.any()
+    assert 'times what sigma allows' in checked.reasons[0] and not checked.outliers.any()
 
 
 @pytest.mark.parametrize(('off', 'gross'), [(4.5, False), (6.0, True)])
@@ -79,7 +80,7 @@ def test_a_point_is_a_gross_error_beyond_five_standard_deviations(off, gross):
     found = localize(model, views)
     off_now = np.linalg.norm(found.residual[0, 3]) / SIGMA
     assert (off_now > 4) and (off_now > 5) == gross
-    assert examine(model, views, found).gross[0].tolist() == [
+    assert examine(model, views, found).outliers[0].tolist() == [
         gross and i == 3 for i in range(views.uv.shape[1])
     ]
 
@@ -119,10 +120,10 @@ def test_without_sigma_frames_are_held_against_each_other(frames, sigma):
     exact = model.predict(true, views).uv
     views.uv[:] = exact + sigma / SIGMA * (views.uv - exact)
     views.uv[4, [2, 9]] += [[25.0, 0.0], [-10.0, 20.0]]
-    found = localize_measured(model, table_of(views, frames))
+    found = solve_table(table_of(views, frames), model)
     place = frames.index(4)
     assert [bool(reason) for reason in found.reasons] == [frame == 4 for frame in frames]
-    assert set(found.views.landmark[found.gross]) == {2, 9}
+    assert set(found.views.landmark[found.outliers]) == {2, 9}
     assert found.sigma == pytest.approx(sigma, rel=0.3)
     off = found.result.pose.difference(true.take(frames))[place, :3]
     assert np.linalg.norm(off) < 5 * np.sqrt(np.trace(found.result.covariance[place, :3, :3]))
@@ -130,7 +131,7 @@ def test_without_sigma_frames_are_held_against_each_other(frames, sigma):
 
 def test_an_estimated_noise_that_no_detector_has_is_doubted():
     model, views, _ = spoilt('half size', 'room', 6, np.random.default_rng(8))
-    found = localize_measured(model, table_of(views, range(6)))
+    found = solve_table(table_of(views, range(6)), model)
     assert found.sigma > 2
     assert all('more than any detector has' in reason for reason in found.reasons)
 
@@ -141,7 +142,7 @@ def test_another_lens_without_sigma_is_no_warning_of_numpy():
     table = table_of(views, range(12))
     some = np.sort(np.random.default_rng(0).permutation(len(table))[:-3])
     with pytest.raises(GeometryError, match='determine a pose'):
-        localize_measured(model, table.take(some))
+        solve_table(table.take(some), model)
 
 
 @pytest.mark.filterwarnings('error')

@@ -11,7 +11,8 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import make_observations, views_of
 from fisheye_svp_ros.solve.localization import localize
-from fisheye_svp_ros.solve.measured_poses import localize_measured
+from fisheye_svp_ros.solve.poses import solve_poses
+from fisheye_svp_ros.solve.table_poses import solve_table
 from fisheye_svp_ros.solve.weak_geometry import (
     CHI2_999,
     hold_weak_geometry,
@@ -19,7 +20,6 @@ from fisheye_svp_ros.solve.weak_geometry import (
     pose_odds,
     squared_distances,
 )
-from fisheye_svp_ros.study.solutions import localize_sets
 
 SIGMA = 0.5  # px
 KB = KannalaBrandt(0.03, -0.01, 0.002, -0.0005)
@@ -58,7 +58,7 @@ def test_ellipsoids_of_small_flat_targets_hold(points, turn, place, engine):
     views, true = noisy_views(points, turn, place)
     linear = localize(MODEL, views)
     assert outside(linear, true) > 0.3
-    held = localize_sets(MODEL, views, examined=True).solution
+    held = solve_poses(MODEL, views).result
     assert outside(held, true) < 0.04
     np.testing.assert_array_equal(held.pose.position, linear.pose.position)
 
@@ -82,15 +82,15 @@ def test_one_view_and_many_have_the_same_covariances():
 
 def test_a_second_pose_is_reported_with_its_odds():
     views, _ = noisy_views(TAG, (0.4, 0.3, 0), (0.5, 0, 2), 40)
-    found = localize_sets(MODEL, views)
-    assert found.metrics['ambiguous'].mean() > 0.9
-    odds, solution = found.metrics['odds'], found.solution
+    solution = solve_poses(MODEL, views, examined=False).result
+    assert is_ambiguous(solution).mean() > 0.9
+    odds = pose_odds(solution)
     np.testing.assert_allclose(odds, np.exp(-0.5 * solution.gap))
     assert ((odds >= 0) & (odds <= 1)).all() and np.median(odds) > 0.3
     again = localize(MODEL, views, solution.other)
     np.testing.assert_allclose(again.cost, solution.cost, rtol=1e-6)  # the better one, from either
     near, _ = noisy_views(BOARD, (0.5, 0, 0), (0, 0, 0.5), 20)
-    assert not localize_sets(MODEL, near).metrics['ambiguous'].any()
+    assert not is_ambiguous(solve_poses(MODEL, near, examined=False).result).any()
 
 
 def test_unknown_noise_is_taken_from_the_residuals():
@@ -101,8 +101,8 @@ def test_unknown_noise_is_taken_from_the_residuals():
     table = make_observations(
         frame, landmark, views.uv.reshape(-1, 2), views.points.reshape(-1, 3)
     )
-    measured = localize_measured(MODEL, table)
-    known = localize_sets(MODEL, views, examined=True).solution
+    measured = solve_table(table, MODEL)
+    known = solve_poses(MODEL, views).result
     assert outside(measured.result, true) < 0.04
     ratio = np.trace(measured.result.covariance, axis1=1, axis2=2)
     ratio = ratio / np.trace(known.covariance, axis1=1, axis2=2)
@@ -117,7 +117,7 @@ def test_a_neglected_shift_is_in_the_covariance():
     points[:, 2] = np.abs(points[:, 2])
     views, true = noisy_views(points, (0, 0, 0), (0, 0, 0), 3, true_model, 1e-3)
     views = views._replace(weight=np.full_like(views.weight, 1.0))
-    found = localize_sets(svp, views, examined=True, searched=False).solution
+    found = solve_poses(svp, views, searched=False).result
     change = found.pose.difference(true)[:, None]
     assert (squared_distances(change, found.covariance - found.added) > CHI2_999).all()
     assert (squared_distances(change, found.covariance) < 3.0).all()

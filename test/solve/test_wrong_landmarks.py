@@ -14,8 +14,8 @@ from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.lens_calibration import calibrate, rough_lenses
-from fisheye_svp_ros.solve.measured_poses import localize_measured
 from fisheye_svp_ros.solve.robust_calibration import calibrate_without_outliers
+from fisheye_svp_ros.solve.table_poses import solve_table
 from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
 
 SIZE = (LENS.width, LENS.height)
@@ -90,10 +90,10 @@ def test_a_landmark_of_another_point_is_named_without_a_place():
 def test_known_lens_names_them_too(target):
     moves = moved_at_random(range(2, 50, 5), 0.01, 0.08, 4)
     table = displaced(observed(4, target), moves)
-    found = localize_measured(ForwardModel(LENS), table)
+    found = solve_table(table, ForwardModel(LENS))
     assert sorted(landmark.number for landmark in found.landmarks) == sorted(moves)
     wrong = np.isin(found.views.landmark, list(moves)) & found.views.used
-    np.testing.assert_array_equal(found.gross, wrong)
+    np.testing.assert_array_equal(found.outliers, wrong)
     assert found.sigma == pytest.approx(0.1, rel=0.1)
 
 
@@ -103,7 +103,7 @@ def test_clean_and_bent_targets_lose_no_landmark(target, bend):
     table = observed(5, target, bend=bend)
     outliers = calibrate_without_outliers(table, fit)[2]
     assert not outliers.landmarks
-    assert not localize_measured(ForwardModel(LENS), table).landmarks
+    assert not solve_table(table, ForwardModel(LENS)).landmarks
 
 
 def test_a_wrong_lens_is_no_wrong_landmark():
@@ -113,7 +113,7 @@ def test_a_wrong_lens_is_no_wrong_landmark():
         replace(LENS, cx=LENS.cx + 30),
         replace(LENS, fy=1.05 * LENS.fy),
     ):
-        assert not localize_measured(ForwardModel(lens), table).landmarks
+        assert not solve_table(table, ForwardModel(lens)).landmarks
 
 
 @pytest.mark.parametrize('name', ['ov_plane/train', 'ov_cube/train'])

@@ -8,9 +8,11 @@ from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scene.observations import stereo_views
+from fisheye_svp_ros.scene.observations import stereo_views, views_of
 from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
 from fisheye_svp_ros.simulate.simulation import simulate_stereo
+from fisheye_svp_ros.solve.localization import Localization
+from fisheye_svp_ros.solve.solved_poses import SolvedPoses
 from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
 from fisheye_svp_ros.study.solutions import (
     FIT_METRICS,
@@ -25,12 +27,27 @@ from fisheye_svp_ros.study.solutions import (
 RESIDUAL = np.array([[[3.0, 4.0], [0.0, 0.0], [np.nan, np.nan]], np.full((3, 2), np.nan)])
 
 
+def solved(pose):
+    """Return what is solved with such poses (2,) and RESIDUAL, one point of which is rejected."""
+    views = views_of(np.ones((2, 3, 3)), np.zeros((2, 3, 2)))
+    residual, rejected = RESIDUAL.copy(), np.array([[False, False, True], [False] * 3])
+    residual[rejected] = 70.0
+    covariance = np.tile(np.eye(6), (2, 1, 1))
+    result = Localization.of_one_minimum(
+        pose, covariance, residual, np.ones(2), np.ones(2, dtype=bool), np.zeros(2, dtype=int)
+    )
+    model = ForwardModel(load_lens(lens_path('fish180')))
+    return SolvedPoses(model, views, result, rejected, ('', ''), None, np.ones(2))
+
+
 def test_localization_metrics_by_hand():
     true = paper_pose(2)
     change = np.array([[1e-3, -2e-3, 2e-3, 0, 0, 0], [0, 0, 0, 3e-3, 0, 4e-3]])
-    metrics = localization_metrics(true.retract(change), RESIDUAL, true)
-    assert (*metrics, 'odds', 'ambiguous') == LOCALIZATION_METRICS
+    metrics = localization_metrics(solved(true.retract(change)), true)
+    assert tuple(metrics) == LOCALIZATION_METRICS
     expected = {
+        'odds': [0, 0],
+        'ambiguous': [0, 0],
         'points': [2, 0],
         'rms_px': [np.sqrt(12.5), np.nan],
         'mean_residual_px': [2.5, np.nan],
@@ -47,8 +64,8 @@ def test_localization_metrics_by_hand():
 
 
 def test_without_the_truth_there_are_no_errors():
-    metrics = localization_metrics(paper_pose(2), RESIDUAL)
-    assert tuple(metrics) == FIT_METRICS
+    metrics = localization_metrics(solved(paper_pose(2)))
+    assert tuple(metrics) == (*FIT_METRICS, 'odds', 'ambiguous')
     one = np.array([[0.5, 0.25]])
     metrics = stereo_depth_metrics(one, -one, np.ones((1, 2, 3)))
     assert tuple(metrics) == ('points', 'error2_px', 'error2_vertical_px', 'error2_max_px')

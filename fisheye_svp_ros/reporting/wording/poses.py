@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
+from fisheye_svp_ros.io.tag_maps import tags_of
 from fisheye_svp_ros.solve.outliers import WrongLandmark
 
 _MAX_NAMES = 10
@@ -66,25 +69,36 @@ def map_notes(
         )
 
 
-def wrong_landmark_notes(landmarks: Sequence[WrongLandmark]) -> Iterator[str]:
-    """Yield what to say of wrong landmarks: which, how far off, and what to do."""
-    moved = [landmark for landmark in landmarks if landmark.is_displaced]
+def wrong_landmark_notes(
+    landmarks: Sequence[WrongLandmark], of_tags: bool = False
+) -> Iterator[str]:
+    """Yield what to say of wrong landmarks: which, how far off, and what to do.
+
+    of_tags: they are corners of tags, which are named in their place.
+    """
+    kind, place = ('tag', 'the map says') if of_tags else ('landmark', 'x, y, z say')
+    numbers = tags_of(np.array([one.number for one in landmarks], dtype=np.int64))
+    groups: dict[int, list[WrongLandmark]] = {}
+    for landmark, tag in zip(landmarks, numbers.tolist(), strict=True):
+        groups.setdefault(tag if of_tags else landmark.number, []).append(landmark)
+    moved = {
+        number: max(float((one.offset**2).sum()) ** 0.5 for one in group if one.is_displaced)
+        for number, group in groups.items()
+        if any(one.is_displaced for one in group)
+    }
     if moved:
-        sizes = [float((landmark.offset**2).sum()) ** 0.5 for landmark in moved]
-        names = [
-            f'{landmark.number} by {1e3 * size:.3g} mm'
-            for landmark, size in zip(moved, sizes, strict=True)
-        ]
         many = len(moved) > 1
+        names = [f'{number} by {1e3 * size:.3g} mm' for number, size in moved.items()]
         yield (
-            f'landmark{"s" if many else ""} not where x, y, z say: {_enumerate_names(names)}; '
+            f'{kind}{"s" if many else ""} not where {place}: {_enumerate_names(names)}; '
             f'rejected; measure {"them" if many else "it"} again'
         )
-    for landmark in landmarks:
-        if not landmark.is_displaced:
+    for number, group in groups.items():
+        if number not in moved:
+            points, px = sum(one.points for one in group), max(one.px for one in group)
             yield (
-                f'landmark {landmark.number}: its {landmark.points} points are {landmark.px:.3g} '
-                'px off and no other place explains them; rejected; check its number'
+                f'{kind} {number}: its {points} points are {px:.3g} px off and no other place '
+                'explains them; rejected; check its number'
             )
 
 
