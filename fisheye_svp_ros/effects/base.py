@@ -100,8 +100,8 @@ class Scene:
     def times(self) -> Array:
         """Time of each view (S,), s; NaN where unknown."""
         t = np.where(self.views.used, self.views.t, np.nan)
-        known = np.asarray(np.isfinite(t).any(axis=1))
-        return scatter(known, np.nanmean(t[known], axis=1))
+        timed = np.asarray(np.isfinite(t).any(axis=1))
+        return scatter(timed, np.nanmean(t[timed], axis=1))
 
     @cached_property
     def twist(self) -> Array:
@@ -111,8 +111,10 @@ class Scene:
         """
         twist = np.zeros((len(self.times), 6))
         for camera in np.unique(self.views.camera):
-            mine = np.flatnonzero((self.views.camera == camera) & np.isfinite(self.times))
-            order = mine[np.argsort(self.times[mine], kind='stable')]
+            views_of_camera = np.flatnonzero(
+                (self.views.camera == camera) & np.isfinite(self.times)
+            )
+            order = views_of_camera[np.argsort(self.times[views_of_camera], kind='stable')]
             if len(order) < 2:
                 continue
             step = np.diff(self.times[order])
@@ -125,7 +127,7 @@ class Scene:
     def normalized_uv(self) -> Array:
         """Image points (S, N, 2) relative to the principal point, over the focal length."""
         if self.cameras:
-            return gather_rows([(rows, own.normalized_uv()) for rows, _, own in self.cameras])
+            return gather_rows([(rows, part.normalized_uv()) for rows, _, part in self.cameras])
         center, focal = (self.lens.cx, self.lens.cy), (self.lens.fx, self.lens.fy)
         return np.asarray((self.uv - np.array(center)) / np.array(focal))
 
@@ -218,10 +220,10 @@ class Effect(ABC):
             return curved
         held: Mapping[str, Any] = getattr(lens, self.lens_field)
         if self.name in held:
-            known, before = self.from_dict(held[self.name], lens.name)
-            if known != self:
+            held_form, before = self.from_dict(held[self.name], lens.name)
+            if held_form != self:
                 raise LensError(
-                    f'lens {lens.name!r} already holds {known.key} in {self.lens_field}; '
+                    f'lens {lens.name!r} already holds {held_form.key} in {self.lens_field}; '
                     f'{self.key} cannot be added'
                 )
             values = values + before
@@ -240,7 +242,7 @@ class Effect(ABC):
 
         scale: of the focal length, px; rows: share of the old image's rows that it has.
         """
-        return values * [scale if one.unit == 'px' else 1.0 for one in self.parameters]
+        return values * [scale if parameter.unit == 'px' else 1.0 for parameter in self.parameters]
 
     def merge_with(self, other: Self) -> Effect:
         """Return the form that holds this one and another of the same effect."""
@@ -313,8 +315,8 @@ class Effect(ABC):
     def from_dict(cls, entry: Mapping[str, Any], where: str) -> tuple[Effect, Array]:
         """Return the effect and its values; raise LensError naming `where` and the field."""
         structure = {name: value for name, value in entry.items() if name != 'parameters'}
-        known = {field.name for field in fields(cls)}
-        if foreign := [name for name in structure if name not in known]:
+        field_names = {field.name for field in fields(cls)}
+        if foreign := [name for name in structure if name not in field_names]:
             raise LensError(
                 f'{where}: effect {cls.name} has {foreign[0]}, which does not belong '
                 'there; its numbers are in a mapping, parameters'
@@ -415,10 +417,10 @@ def _velocities(pose: Pose, t: Array) -> Array:
         return np.repeat(change / max(t[1] - t[0], 1e-9), 2, axis=0)
     middle = np.clip(np.arange(len(t)), 1, len(t) - 2)
     before, after = pose.take(middle - 1), pose.take(middle + 1)
-    here = pose.take(middle)
+    middle_pose = pose.take(middle)
     h0 = np.maximum(t[middle] - t[middle - 1], 1e-9)[:, None]
     h1 = np.maximum(t[middle + 1] - t[middle], 1e-9)[:, None]
-    d0, d1 = here.difference(before) / h0, after.difference(here) / h1
+    d0, d1 = middle_pose.difference(before) / h0, after.difference(middle_pose) / h1
     # Slope of the parabola at the instant itself, also at the two ends.
     offset = (t - t[middle])[:, None]
     return np.asarray((d0 * h1 + d1 * h0) / (h0 + h1) + offset * 2 * (d1 - d0) / (h0 + h1))
@@ -465,16 +467,16 @@ class ModelTerm:
 
 def _time_step(t: Array) -> float:
     """Return the median time between frames of times t (N,), s; NaN where there are no two."""
-    known = np.unique(t[np.isfinite(t)])
-    return float(np.median(np.diff(known))) if len(known) > 1 else np.nan
+    instants = np.unique(t[np.isfinite(t)])
+    return float(np.median(np.diff(instants))) if len(instants) > 1 else np.nan
 
 
 def camera_terms(terms: Iterable[ModelTerm], camera: int) -> tuple[ModelTerm, ...]:
     """Return what acts in the views of one camera, with that camera's values."""
     return tuple(
-        ModelTerm(form, np.asarray(term.values)[own])
+        ModelTerm(form, np.asarray(term.values)[slots])
         for term in terms
-        for form, own in term.effect.forms_of_camera(camera)
+        for form, slots in term.effect.forms_of_camera(camera)
     )
 
 

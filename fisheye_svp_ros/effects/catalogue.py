@@ -63,7 +63,7 @@ def load_effects(entries: Mapping[str, Any], where: str) -> tuple[ModelTerm, ...
     terms = []
     for name, entry in entries.items():
         if name not in CATALOGUE:
-            known = ', '.join(CATALOGUE)
-            raise LensError(f'{where}: effect {name!r} is unknown; known are {known}')
+            names = ', '.join(CATALOGUE)
+            raise LensError(f'{where}: effect {name!r} is unknown; known are {names}')
         terms.append(ModelTerm(*CATALOGUE[name].from_dict(entry, where)))
     return tuple(terms)

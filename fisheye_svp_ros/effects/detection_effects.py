@@ -53,17 +53,17 @@ class DotCentroidEffect(Effect):
         in_camera = scene.pose.into_body(views.points)
         distance = np.linalg.norm(in_camera, axis=-1)
         for board in scene.boards:
-            mine = views.used & (views.board == board.id)
-            if not board.flat or not mine.any():
+            on_board = views.used & (views.board == board.id)
+            if not board.flat or not on_board.any():
                 continue
-            radius = _PROBE * distance[mine]
+            radius = _PROBE * distance[on_board]
             angle = 2 * np.pi * np.arange(_RIM) / _RIM
             rim = np.cos(angle)[:, None] * board.axes[0] + np.sin(angle)[:, None] * board.axes[1]
-            turned = rim @ scene.pose.rotation[np.nonzero(mine)[0]]
-            points = in_camera[mine][:, None] + (_RIM_SCALE * radius)[:, None, None] * turned
-            center = project(scene.lens, in_camera[mine], limited=False).uv
+            turned = rim @ scene.pose.rotation[np.nonzero(on_board)[0]]
+            points = in_camera[on_board][:, None] + (_RIM_SCALE * radius)[:, None, None] * turned
+            center = project(scene.lens, in_camera[on_board], limited=False).uv
             bias = _polygon_centroid(project(scene.lens, points, limited=False).uv) - center
-            column[mine] = np.nan_to_num(bias / (radius**2)[:, None])[..., None]
+            column[on_board] = np.nan_to_num(bias / (radius**2)[:, None])[..., None]
         return column
 
 

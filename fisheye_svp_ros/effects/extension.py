@@ -65,9 +65,9 @@ class Target:
         target = self.known
         if target is None or not len(target.landmark):
             return views
-        slot, known, same = _find_same(target, views)
+        slot, is_listed, same = _find_same(target, views)
         board = np.where(same, target.board[slot], views.board)
-        new = views.used & ~known
+        new = views.used & ~is_listed
         if new.any() and (board != views.board)[same & views.used].any():
             away = np.linalg.norm(views.points[new][:, None] - target.points, axis=-1)
             board[new] = target.board[away.argmin(axis=1)]
@@ -79,10 +79,10 @@ class Target:
             return np.ones(views.landmark.shape, dtype=bool)
         if not len(self.known.landmark):
             return np.zeros(views.landmark.shape, dtype=bool)
-        _, known, same = _find_same(self.known, views)
+        _, is_listed, same = _find_same(self.known, views)
         count = (same & views.used).sum(axis=1)
         shows = (count > 0) & (2 * count >= views.used.sum(axis=1))
-        return np.asarray(shows[:, None] & (same | ~known))
+        return np.asarray(shows[:, None] & (same | ~is_listed))
 
     def displacement(self, scene: Scene, stage: str) -> Array | float:
         """Displacement (S, N, D) by the corrections at a stage, in views that show the target."""
@@ -95,9 +95,9 @@ class Target:
 
 def _find_same(target: KnownTarget, views: Views) -> tuple[Index, Mask, Mask]:
     """Return places in the table (S, N), whether the number is there, whether the place is."""
-    slot, known = find_landmarks(target.landmark, views)
+    slot, is_listed = find_landmarks(target.landmark, views)
     off = np.abs(target.points[slot] - views.points).max(axis=-1)
-    return slot, known, known & (off < _POSITION_TOLERANCE)
+    return slot, is_listed, is_listed & (off < _POSITION_TOLERANCE)
 
 
 def landmark_rows(observations: Observations) -> list[list[float]]:
@@ -119,9 +119,9 @@ def on_boards(observations: Observations, rows: Sequence[Sequence[float]] | None
         group_views(observations),
     )
     assert target is not None
-    mine = views.used & target.landmark_mask(views).any(axis=1, keepdims=True)
+    on_target = views.used & target.landmark_mask(views).any(axis=1, keepdims=True)
     board = observations.board.copy()
-    board[views.row[mine]] = target.assign_boards(views).board[mine]
+    board[views.row[on_target]] = target.assign_boards(views).board[on_target]
     return replace(observations, board=board)
 
 

@@ -102,13 +102,13 @@ class ForwardModel:
         if not isinstance(lens, Lens):
             if len(lens) > 1:
                 self.cameras = tuple(
-                    ForwardModel(own, None if terms is None else camera_terms(terms, i))
-                    for i, own in enumerate(lens)
+                    ForwardModel(single, None if terms is None else camera_terms(terms, i))
+                    for i, single in enumerate(lens)
                 )
                 terms = ()
             lens = lens[0]
-        own = load_effects(lens.corrections, lens.name) if terms is None else terms
-        self.terms = tuple(own)
+        corrections = load_effects(lens.corrections, lens.name) if terms is None else terms
+        self.terms = tuple(corrections)
         self._target = Target.from_entries(lens.target, lens.name) if terms is None else None
         self._given = lens
         self.lens = curved_lens(lens, self.terms)
@@ -201,8 +201,11 @@ class ForwardModel:
         if self.cameras:
             return gather_rows(
                 [
-                    (rows, self.cameras[i].transform_columns(own, views.take(rows), columns[rows]))
-                    for rows, i, own in linear.cameras
+                    (
+                        rows,
+                        self.cameras[i].transform_columns(part, views.take(rows), columns[rows]),
+                    )
+                    for rows, i, part in linear.cameras
                 ]
             )
         for stage, before, after in (
@@ -259,10 +262,10 @@ class ForwardModel:
         if not self.cameras:
             return Scene(views, self.lens, pose, linear.ideal, linear.image.incidence)
         parts = tuple(
-            (rows, i, self.cameras[i].scene(pose.take(rows), views.take(rows), own))
-            for rows, i, own in linear.cameras
+            (rows, i, self.cameras[i].scene(pose.take(rows), views.take(rows), part))
+            for rows, i, part in linear.cameras
         )
-        rays = [(rows, own.image.incidence) for rows, _, own in linear.cameras]
+        rays = [(rows, part.image.incidence) for rows, _, part in linear.cameras]
         unit = gather_rows([(rows, np.moveaxis(ray.unit, 0, -1)) for rows, ray in rays])
         incidence = Incidence(
             gather_rows([(rows, ray.theta) for rows, ray in rays]),
@@ -296,11 +299,11 @@ class ForwardModel:
     ) -> Array:
         count = len(effect.parameters)
         columns = np.zeros((*linear.uv.shape, count))
-        for (rows, number, own), (_, _, seen) in zip(linear.cameras, scene.cameras, strict=True):
+        for (rows, number, part), (_, _, seen) in zip(linear.cameras, scene.cameras, strict=True):
             model = self.cameras[number]
-            for form, mine in effect.forms_of_camera(number):
-                block = np.zeros((*own.uv.shape, count))
-                block[..., mine] = model.effect_columns(form, seen, own)
+            for form, slots in effect.forms_of_camera(number):
+                block = np.zeros((*part.uv.shape, count))
+                block[..., slots] = model.effect_columns(form, seen, part)
                 columns[rows] = block
         return columns
 
@@ -310,9 +313,11 @@ class ForwardModel:
             return lens_columns(self.lens, linear.image, names[0])
         ends = np.cumsum([0, *map(len, names)])
         columns = np.zeros((*linear.uv.shape, ends[-1]))
-        for rows, i, own in linear.cameras:
-            block = np.zeros((*own.uv.shape, ends[-1]))
-            block[..., ends[i] : ends[i + 1]] = self.cameras[i].lens_columns(own, names[i : i + 1])
+        for rows, i, part in linear.cameras:
+            block = np.zeros((*part.uv.shape, ends[-1]))
+            block[..., ends[i] : ends[i + 1]] = self.cameras[i].lens_columns(
+                part, names[i : i + 1]
+            )
             columns[rows] = block
         return columns
 
@@ -337,10 +342,10 @@ class ForwardModel:
             for rows, i, model in self.split(views)
         )
         uv, d_pose, ideal, optical, points = (
-            gather_rows([(rows, getattr(own, name)) for rows, _, own in parts])
+            gather_rows([(rows, getattr(part, name)) for rows, _, part in parts])
             for name in ('uv', 'd_pose', 'ideal', 'optical', 'points')
         )
-        valid = gather_rows([(rows, own.valid.astype(float)) for rows, _, own in parts]) > 0
+        valid = gather_rows([(rows, part.valid.astype(float)) for rows, _, part in parts]) > 0
         return LinearViews(
             uv, valid, d_pose, ideal, optical, self.lens, pose, points, limited, parts
         )

@@ -90,8 +90,8 @@ class RigFlexEffect(Effect):
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
         require_cameras(scene)
         seen, count = np.unique(scene.views.frame, return_counts=True)
-        frames, both = (tuple(map(int, part)) for part in (seen, seen[count > 1]))
-        forms = [cls(1, frames), cls(2, frames), cls(0, both)]
+        frames, shared = (tuple(map(int, part)) for part in (seen, seen[count > 1]))
+        forms = [cls(1, frames), cls(2, frames), cls(0, shared)]
         return [form for form in forms if form.degree < len(form.frames)]
 
     def holds_for(self, t: Array, known: Array) -> bool:
@@ -120,8 +120,10 @@ class RigFlexEffect(Effect):
             x = 2 * order / max(len(self.frames) - 1, 1) - 1
             amounts = np.polynomial.legendre.legvander(x, self.degree)[:, 1:]
         else:
-            own = scene.views.frame[:, None] == np.array(self.frames)
-            amounts = np.where(own.any(axis=1, keepdims=True), own - 1 / len(self.frames), 0.0)
+            in_frame = scene.views.frame[:, None] == np.array(self.frames)
+            amounts = np.where(
+                in_frame.any(axis=1, keepdims=True), in_frame - 1 / len(self.frames), 0.0
+            )
         turn = scene.pose.rotation * (scene.views.camera > 0)[:, None, None]
         turns = amounts[:, None, :, None] * turn[:, :, None, :]
         turns = turns.reshape(len(order), 3, len(self.parameters))

@@ -113,8 +113,11 @@ class RadialProfileEffect(Effect):
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
-        own, limit = len(scene.lens.image_height.coefficient_names), round(scene.theta_max, 6)
-        finest = cls(_MAX_TERMS, limit, own % _MAX_TERMS + 1)
+        coefficient_count, limit = (
+            len(scene.lens.image_height.coefficient_names),
+            round(scene.theta_max, 6),
+        )
+        finest = cls(_MAX_TERMS, limit, coefficient_count % _MAX_TERMS + 1)
         return [*(cls(terms, limit) for terms in (1, 2, 4)), finest]
 
     def merge_with(self, other: Self) -> Effect:
@@ -181,10 +184,10 @@ class ChebyshevHeight:
 @cache
 def _shifted_chebyshev(count: int) -> Array:
     """Return the factors (count, count) of 1, s, s^2 ... in T_0(2s - 1), T_1(2s - 1) ..."""
-    found, z = np.zeros((count, count)), np.polynomial.Polynomial([-1.0, 2.0])
+    factors, z = np.zeros((count, count)), np.polynomial.Polynomial([-1.0, 2.0])
     for order in range(count):
-        found[order, : order + 1] = np.polynomial.Chebyshev.basis(order)(z).coef
-    return found
+        factors[order, : order + 1] = np.polynomial.Chebyshev.basis(order)(z).coef
+    return factors
 
 
 @dataclass(frozen=True)
@@ -261,8 +264,8 @@ class DomePortEffect(PlaneEffect):
         outer = self.radius + self.thickness
         turn = (1 - 1 / self.glass_index) * self.thickness / (self.radius * outer)
         along = unit[..., :, None] * unit[..., None, :]
-        radial, other = slope * np.cos(theta), np.eye(2) - along
-        return turn * (radial[..., None, None] * along + across[..., None, None] * other)
+        radial, tangential = slope * np.cos(theta), np.eye(2) - along
+        return turn * (radial[..., None, None] * along + across[..., None, None] * tangential)
 
     def extend(self, lens: Lens, values: Array) -> Lens:
         if lens.port is not None:

@@ -56,17 +56,17 @@ class RigEffect(Effect):
         return all(effect.holds_for(t, known) for _, _, effect in self.parts)
 
     def prior_sigma(self, scene: Scene) -> Array:
-        own = {number: camera for _, number, camera in scene.cameras}
+        scenes = {number: camera for _, number, camera in scene.cameras}
         return np.concatenate(
-            [effect.prior_sigma(own[number]) for number, _, effect in self.parts]
+            [effect.prior_sigma(scenes[number]) for number, _, effect in self.parts]
         )
 
     def columns(self, scene: Scene) -> Array:
         columns = np.zeros((*scene.uv.shape[:2], DIMENSIONS[self.stage], len(self.parameters)))
         for rows, number, seen in scene.cameras:
-            for form, own in self.forms_of_camera(number):
+            for form, slots in self.forms_of_camera(number):
                 block = np.zeros((*seen.uv.shape[:2], *columns.shape[2:]))
-                block[..., own] = form.columns(seen)
+                block[..., slots] = form.columns(seen)
                 columns[rows] = block
         return columns
 
@@ -79,12 +79,12 @@ class RigEffect(Effect):
             start = stop
 
     def merge_with(self, other: Self) -> Effect:
-        known = {number: (label, effect) for number, label, effect in self.parts}
+        merged = {number: (label, effect) for number, label, effect in self.parts}
         for number, label, effect in other.parts:
-            if number in known:
-                effect = known[number][1].merge_with(effect)
-            known[number] = label, effect
-        return type(self)(tuple((number, *known[number]) for number in sorted(known)))
+            if number in merged:
+                effect = merged[number][1].merge_with(effect)
+            merged[number] = label, effect
+        return type(self)(tuple((number, *merged[number]) for number in sorted(merged)))
 
 
 @cache

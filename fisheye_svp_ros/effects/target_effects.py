@@ -66,10 +66,10 @@ class LandmarkSurveyEffect(Effect):
 
     def slots(self, landmark: Index) -> Index:
         """Return the place (...) of each landmark among the displaced ones, -1 for the others."""
-        known = np.array(self.landmarks)
-        order = np.argsort(known)
-        slot = np.clip(np.searchsorted(known, landmark, sorter=order), 0, len(known) - 1)
-        return np.where(known[order[slot]] == landmark, order[slot], -1)
+        landmarks = np.array(self.landmarks)
+        order = np.argsort(landmarks)
+        slot = np.clip(np.searchsorted(landmarks, landmark, sorter=order), 0, len(landmarks) - 1)
+        return np.where(landmarks[order[slot]] == landmark, order[slot], -1)
 
     def columns(self, scene: Scene) -> Array:
         slot = self.slots(scene.views.landmark)
@@ -228,13 +228,13 @@ class BoardPoseEffect(Effect):
             raise Untestable('the target is one rigid piece (no second board)')
         labels, counts = np.unique(scene.views.board[scene.views.used], return_counts=True)
         reference = labels[np.argmax(counts)]
-        others = [
+        boards = [
             (float(board.id), *(float(x) for x in np.round(board.center, 9)))
             for board in scene.boards
             if board.id != reference
         ]
-        forms: list[Effect] = [cls((landmark,)) for landmark in others]
-        return forms if len(others) == 1 else [cls(tuple(others)), *forms]
+        forms: list[Effect] = [cls((landmark,)) for landmark in boards]
+        return forms if len(boards) == 1 else [cls(tuple(boards)), *forms]
 
     def merge_with(self, other: Self) -> Effect:
         return replace(self, boards=tuple(dict.fromkeys((*self.boards, *other.boards))))
@@ -255,8 +255,8 @@ class BoardPoseEffect(Effect):
     def columns(self, scene: Scene) -> Array:
         blocks = []
         for number, *center in self.boards:
-            mine = (scene.views.board == number)[..., None, None]
+            on_board = (scene.views.board == number)[..., None, None]
             arm = scene.views.points - np.array(center)
             shift = np.broadcast_to(np.eye(3), (*arm.shape, 3))
-            blocks.append(np.concatenate([shift, -cross_matrix(arm)], axis=-1) * mine)
+            blocks.append(np.concatenate([shift, -cross_matrix(arm)], axis=-1) * on_board)
         return np.concatenate(blocks, axis=-1)

@@ -67,9 +67,9 @@ class KnownTarget(NamedTuple):
         """Return displacements (L, 3) board by board."""
         maps = []
         for board in find_boards(self.points, self.board):
-            mine = self.board == board.id
-            local = less_similarity(self.points[mine], moved[mine]) @ board.axes.T
-            place = board.to_board(self.points[mine])[:, :2] * board.size
+            on_board = self.board == board.id
+            local = less_similarity(self.points[on_board], moved[on_board]) @ board.axes.T
+            place = board.to_board(self.points[on_board])[:, :2] * board.size
             maps.append(BoardMap(board.id, place, local[:, 2], local[:, :2]))
         return maps
 
@@ -82,14 +82,14 @@ def find_landmarks(landmark: Index, views: Views) -> tuple[Index, Mask]:
 
 def at_landmarks(views: Views, landmark: Index, values: Array) -> Array:
     """Return values (L, D) of landmarks (L,), ascending, where views (S, N) show them, else 0."""
-    slot, known = find_landmarks(landmark, views)
-    return np.where((known & views.used)[..., None], values[slot], 0.0)
+    slot, is_listed = find_landmarks(landmark, views)
+    return np.where((is_listed & views.used)[..., None], values[slot], 0.0)
 
 
 def board_maps(views: Views, terms: Sequence[ModelTerm], lens: Lens) -> list[BoardMap]:
     """Return how effects on the target, among some terms, displace the landmarks of views."""
-    known = KnownTarget.from_views(views)
-    return known.maps(known.displacements(terms, lens))
+    target = KnownTarget.from_views(views)
+    return target.maps(target.displacements(terms, lens))
 
 
 def less_similarity(points: Array, moved: Array) -> Array:

@@ -184,7 +184,7 @@ class BagWriter:
                 topic,
                 typename,
                 typestore=_types(),
-                offered_qos_profiles=[_profile(one) for one in offered],
+                offered_qos_profiles=[_profile(profile) for profile in offered],
             )
         except Exception as cause:
             raise BagError(f'{topic}: {typename} cannot be recorded ({cause!r:.100})') from cause

@@ -231,8 +231,8 @@ def _read_parquet(pyarrow: Any, stream: IO[bytes], wanted: Callable[[str], bool]
     names = ', '.join(schema.names)
     written = (about.metadata or {}).get(_NAMES, names.encode()).decode(errors='replace')
     if names != written:
-        both = zip_longest(schema.names, written.split(', '))
-        now, before = next(pair for pair in both if len({*pair}) > 1)
+        name_pairs = zip_longest(schema.names, written.split(', '))
+        now, before = next(pair for pair in name_pairs if len({*pair}) > 1)
         raise ValueError(f'column {now!r} was written as {before!r}; write the table again')
     table = file.read([name for name in schema.names if wanted(name)])
     if {table.num_rows, sum(about.row_group(i).num_rows for i in range(about.num_row_groups))} != {

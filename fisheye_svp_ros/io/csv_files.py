@@ -142,7 +142,7 @@ class CsvTable:
             )
 
     def _check_header(self, required: Sequence[str]) -> None:
-        wanted, there = ','.join(required), ','.join(self._header)
+        wanted, columns = ','.join(required), ','.join(self._header)
         if not any(self._header):
             raise ObservationError(
                 f'{self.path}: it is empty; a header with {wanted or "names"} is needed'
@@ -157,7 +157,7 @@ class CsvTable:
             which = f'column {names} is' if len(missing) == 1 else f'columns {names} are'
             raise ObservationError(
                 f'{self.path}: {which} missing from its header, '
-                f'{there[:_MAX_HEADER]!r}; needed are {wanted}'
+                f'{columns[:_MAX_HEADER]!r}; needed are {wanted}'
             )
         twice = [name for name, count in Counter(self._header).items() if name and count > 1]
         if twice:
@@ -199,7 +199,9 @@ def _uncomment(lines: list[str], required: Sequence[str]) -> int:
 def _separator(lines: Sequence[str]) -> str:
     """Return what separates the cells: a semicolon or tab where the header has no comma."""
     header = lines[0] if lines else ''
-    return next((one for one in ';\t' if one in header and ',' not in header), ',')
+    return next(
+        (separator for separator in ';\t' if separator in header and ',' not in header), ','
+    )
 
 
 def _is_number(cell: str) -> bool:
@@ -303,13 +305,13 @@ def write_observations(path: str | Path, observations: Observations) -> None:
         columns['camera'] = np.array(table.cameras)[table.camera]
     if table.board.any():
         columns['board'] = table.board
-    timed, known = np.isfinite(table.t), np.isfinite(table.sigma)
+    timed, weighted = np.isfinite(table.t), np.isfinite(table.sigma)
     if timed.any() and not timed.all():
         raise ObservationError(f'{table.source}: t is known for some rows only')
     if timed.any():
         columns['t'] = table.t
-    if known.any():
-        columns['sigma'] = np.where(known, table.sigma.astype(object), '')
+    if weighted.any():
+        columns['sigma'] = np.where(weighted, table.sigma.astype(object), '')
     write_columns(path, columns)
 
 

@@ -324,7 +324,9 @@ def read_camera_info(
     matrix[0, 2] -= low[0]
     matrix[1, 2] -= low[1]
     matrix[:2] /= np.array(bins, dtype=float)[:, None]
-    fx, fy, cx, cy, skew = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2), (0, 1)))
+    fx, fy, cx, cy, skew = (
+        float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2), (0, 1))
+    )
     return CameraModel(
         '' if rectified else str(message.distortion_model),
         (part[0] // bins[0], part[1] // bins[1]),
@@ -349,11 +351,11 @@ def statuses(message: Any) -> list[ResultStatus]:
     """Return the statuses of a DiagnosticArray."""
     return [  # the level is a byte: rclpy gives bytes, a bag reader a number
         ResultStatus(
-            one.level[0] if isinstance(one.level, bytes) else int(one.level),
-            str(one.message),
-            {pair.key: pair.value for pair in one.values},
+            status.level[0] if isinstance(status.level, bytes) else int(status.level),
+            str(status.message),
+            {pair.key: pair.value for pair in status.values},
         )
-        for one in message.status
+        for status in message.status
     ]
 
 

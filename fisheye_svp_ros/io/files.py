@@ -214,8 +214,8 @@ def write_json(path: str | Path, document: Mapping[str, Any]) -> None:
 
 def as_read(document: Mapping[str, Any]) -> dict[str, Any]:
     """Return a document as it is read back from what `write_json` writes."""
-    found: dict[str, Any] = json.loads(json.dumps(_finite(document)))
-    return found
+    plain: dict[str, Any] = json.loads(json.dumps(_finite(document)))
+    return plain
 
 
 def _finite(value: Any) -> Any:
@@ -347,11 +347,11 @@ def read_json(path: str | Path, error: type[FisheyeSvpError]) -> dict[str, Any]:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    mapping = dict(pairs)
+    if len(mapping) < len(pairs):
         names = [name for name, _ in pairs]
         raise ValueError(f'{next(n for n in names if names.count(n) > 1)!r} is listed twice')
-    return found
+    return mapping
 
 
 def _refuse_repeated_keys(node: yaml.Node | None) -> None:

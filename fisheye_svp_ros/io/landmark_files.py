@@ -21,8 +21,8 @@ def environment(spread: str, radius: float, layout: str | Path | None = None) ->
     Raises ObservationError for an unknown spread or an impossible radius.
     """
     if spread not in SPREADS:
-        known = ', '.join(SPREADS)
-        raise ObservationError(f'environment {spread!r} is unknown; known are {known}')
+        names = ', '.join(SPREADS)
+        raise ObservationError(f'environment {spread!r} is unknown; known are {names}')
     if not (np.isfinite(radius) and radius > 0):
         raise ObservationError(f'environment radius is {radius} m; it must be above 0')
     path = config_path('environments/kita.yaml') if layout is None else Path(layout)

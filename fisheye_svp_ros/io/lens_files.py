@@ -118,7 +118,7 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
     _refuse_unknown(document, _FIELDS, where, {_LEGACY_KEY})
     image = _section(document, 'image', where)
     target = _effects(document, 'target', where)
-    own = _effects(document, 'corrections', where)
+    corrections = _effects(document, 'corrections', where)
     Target.from_entries(target, where)
     lens = Lens(
         name=str(document.get('name', Path(where).stem)),
@@ -128,12 +128,12 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
         max_incidence=np.nan,
         viewpoint_shift=_viewpoint_shift(document.get('viewpoint_shift'), where),
         port=None
-        if PORT not in own
-        else _curve(own[PORT], PORTS, '', 0, f'{where}: corrections.port'),
-        tangential=_tangential(own.get(TANGENTIAL), where),
+        if PORT not in corrections
+        else _curve(corrections[PORT], PORTS, '', 0, f'{where}: corrections.port'),
+        tangential=_tangential(corrections.get(TANGENTIAL), where),
         image_field=None
-        if IMAGE_FIELD not in own
-        else ImageField.from_dict(own[IMAGE_FIELD], where),
+        if IMAGE_FIELD not in corrections
+        else ImageField.from_dict(corrections[IMAGE_FIELD], where),
         target=target,
         calibration=_mapping(document, 'calibration', where),
         uncertainty=_mapping(document, 'uncertainty', where),
@@ -145,8 +145,8 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
     if given is not None:
         degrees = _number_at(document, 'max_incidence_deg', where)
         lens = check_lens(replace(lens, max_incidence=np.radians(degrees).item()), where)
-    own = {name: entry for name, entry in own.items() if name not in _OF_LENS}
-    for entries in (_effects(document, _LEGACY_KEY, where), own):
+    corrections = {name: entry for name, entry in corrections.items() if name not in _OF_LENS}
+    for entries in (_effects(document, _LEGACY_KEY, where), corrections):
         lens = extend_lens(lens, load_effects(entries, where))
     return lens if given is not None else replace(lens, max_incidence=field_of_view(lens))
 
@@ -166,13 +166,13 @@ def lens_to_dict(lens: Lens) -> dict[str, Any]:
             _curve_to_dict(part, VIEWPOINT_SHIFTS, 'e') for part in lens.viewpoint_shift.summands()
         ]
         document['viewpoint_shift'] = parts if len(parts) > 1 else parts[0]
-    own = {} if lens.port is None else {PORT: _curve_to_dict(lens.port, PORTS, '')}
-    own |= lens.corrections
+    corrections = {} if lens.port is None else {PORT: _curve_to_dict(lens.port, PORTS, '')}
+    corrections |= lens.corrections
     if lens.tangential is not None:
-        own[TANGENTIAL] = lens.tangential.values
+        corrections[TANGENTIAL] = lens.tangential.values
     if lens.image_field is not None:
-        own[IMAGE_FIELD] = lens.image_field.to_dict()
-    document |= {'corrections': own, 'target': dict(lens.target)}
+        corrections[IMAGE_FIELD] = lens.image_field.to_dict()
+    document |= {'corrections': corrections, 'target': dict(lens.target)}
     for name in ('calibration', 'uncertainty'):
         section = getattr(lens, name)
         if section is not None:
@@ -245,8 +245,8 @@ def _viewpoint_shift(section: Any, where: str) -> ViewpointShift | None:
     if not all(isinstance(part, dict) for part in parts):
         raise LensError(f'{where}: viewpoint_shift must be a mapping with a model')
     place = f'{where}: viewpoint_shift'
-    first, *others = (_curve(part, VIEWPOINT_SHIFTS, 'e', 0, place) for part in parts)
-    return reduce(ViewpointShift.plus, others, first)
+    first, *curves = (_curve(part, VIEWPOINT_SHIFTS, 'e', 0, place) for part in parts)
+    return reduce(ViewpointShift.plus, curves, first)
 
 
 def _tangential(section: Mapping[str, Any] | None, where: str) -> TangentialDistortion | None:
@@ -271,16 +271,16 @@ def _curve(
         raise LensError(f'{where}.model is {name!r}; known are {", ".join(registry)}')
     kind = registry[name]
     numbered = _three_numbers(values.pop(listed, []), f'{where}.{listed}')
-    known = kind.coefficient_names
-    most = sum(name.removeprefix(listed).isdigit() for name in known)
+    names = kind.coefficient_names
+    most = sum(name.removeprefix(listed).isdigit() for name in names)
     if len(numbered) > most:
         raise LensError(f'{where}.{listed} has {len(numbered)} values; this model takes {most}')
     values |= {f'{listed}{i}': value for i, value in enumerate(numbered, start=first)}
-    _refuse_unknown(values, set(known), where)
+    _refuse_unknown(values, set(names), where)
     missing = [
         parameter.name
         for parameter in signature(kind).parameters.values()
-        if parameter.name in known
+        if parameter.name in names
         and parameter.default is parameter.empty
         and parameter.name not in values
     ]

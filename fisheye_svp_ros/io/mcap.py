@@ -59,8 +59,8 @@ def whole_messages(
     for batch in _chunk_messages(path, note, passed):
         first = min(message.time for message in batch)
         yield from (message for message in held if message.time <= first)
-        rest = (message for message in held if message.time > first)
-        held = sorted((*rest, *batch), key=lambda message: message.time)
+        remaining = (message for message in held if message.time > first)
+        held = sorted((*remaining, *batch), key=lambda message: message.time)
     yield from held
 
 

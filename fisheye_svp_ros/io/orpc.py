@@ -39,9 +39,9 @@ def read(path: str | Path) -> Observations:
     t is counted from the earliest image below the target's folder, s, where the names carry the
     time.  Raises ObservationError, naming file, line and field.
     """
-    given = Path(path)
-    files = visible_paths(given.glob('*.orpc')) if given.is_dir() else [given]
-    folder = given if given.is_dir() else given.parent
+    location = Path(path)
+    files = visible_paths(location.glob('*.orpc')) if location.is_dir() else [location]
+    folder = location if location.is_dir() else location.parent
     description = _description(folder)
     boards = _read_boards(description)
     corners = [_read_corners(file, boards) for file in files]
@@ -109,7 +109,7 @@ def _read_board_poses(path: Path, single: bool) -> dict[float, Array]:
         numbers += _field_numbers(path, line, fields)
     if not numbers or len(numbers) % 13:
         raise ObservationError(f'{path}: a board number and 3 x 4 numbers are needed for each')
-    poses = {one[0]: one[1:].reshape(3, 4) for one in np.reshape(numbers, (-1, 13))}
+    poses = {row[0]: row[1:].reshape(3, 4) for row in np.reshape(numbers, (-1, 13))}
     for number, pose in poses.items():
         turn = pose[:, :3]
         if not np.allclose(turn @ turn.T, np.eye(3), atol=_SQUARE) or np.linalg.det(turn) < 0:
@@ -150,13 +150,13 @@ def _read_corners(path: Path, boards: dict[int, BoardCorners]) -> Array:
 
 def _image_times(files: list[Path], dataset: Path) -> Array:
     """Return the seconds (F,) from the earliest image of the data set; NaN without times."""
-    mine = [_time(file) for file in files]
+    times = [_time(file) for file in files]
     everywhere = [_time(file) for file in visible_paths(dataset.rglob('*.orpc'))]
-    known = [time for time in (*mine, *everywhere) if time is not None]
+    instants = [time for time in (*times, *everywhere) if time is not None]
     return np.array(
         [
-            np.nan if time is None or None in mine else (time - min(known)).total_seconds()
-            for time in mine
+            np.nan if time is None or None in times else (time - min(instants)).total_seconds()
+            for time in times
         ]
     )
 

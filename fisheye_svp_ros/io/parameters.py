@@ -64,7 +64,7 @@ class Row(NamedTuple):
         if isinstance(self.default, tuple):
             if isinstance(value, str) or not isinstance(value, Sequence):
                 raise ParameterError(f'{self.name} is {value!r}; a list is needed')
-            return tuple(self._check_one(one, self.default[0]) for one in value)
+            return tuple(self._check_one(item, self.default[0]) for item in value)
         return self._check_one(value, self.default)
 
     def _check_one(self, value: Any, like: Any) -> Any:
@@ -114,13 +114,13 @@ def with_values(table: S, values: Mapping[str, Any]) -> S:
     Paths of files may begin with package://, file:// or ~.
     Raises ParameterError for a value that is not allowed.
     """
-    given = {
+    changes = {
         row.name: _check_value(row, values[row.name])
         if row.name in values
         else getattr(table, row.name)
         for row in rows(table)
     }
-    return type(table)(**given)
+    return type(table)(**changes)
 
 
 def _check_value(row: Row, value: Any) -> Any:
@@ -155,7 +155,7 @@ def sweep_of(table: Any, parameters: Mapping[str, Any], excluded: Collection[str
     excluded: parameters that cannot be swept.
     Raises ParameterError for an unknown parameter, an empty list or a value that is not allowed.
     """
-    known = {
+    points = {
         row.name: row
         for row in rows(table)
         if not isinstance(row.default, tuple) and row.name not in excluded
@@ -164,10 +164,10 @@ def sweep_of(table: Any, parameters: Mapping[str, Any], excluded: Collection[str
     for name, values in parameters.items():
         if not name.startswith(SWEEP):
             continue
-        row = known.get(name.removeprefix(SWEEP))
+        row = points.get(name.removeprefix(SWEEP))
         if row is None:
             raise ParameterError(
-                f'{name}: no such parameter to sweep; known are ' + ', '.join(known)
+                f'{name}: no such parameter to sweep; known are ' + ', '.join(points)
             )
         if values is None:  # as a parameter file has an empty list
             values = []

@@ -45,8 +45,8 @@ def photographs_beside(path: Path, cameras: Sequence[str]) -> tuple[tuple[int, s
         return ()
     try:
         entries = [
-            (int(one['frame']), str(one['camera']), str(one['name']))
-            for one in read_json(beside, ObservationError).get('photographs', ())
+            (int(entry['frame']), str(entry['camera']), str(entry['name']))
+            for entry in read_json(beside, ObservationError).get('photographs', ())
         ]
     except (KeyError, TypeError, ValueError) as cause:
         raise ObservationError(
@@ -135,12 +135,12 @@ def read_observations(path: str | Path) -> Observations:
 
     Raises ObservationError, naming file, line and field, for anything missing or malformed.
     """
-    given = path_of(path)
+    location = path_of(path)
     for reader in READERS.values():
-        if reader.recognises(given):
+        if reader.recognises(location):
             read: Callable[[Path], Observations] = import_module(reader.module).read
-            return read(given)
-    if not given.exists():
+            return read(location)
+    if not location.exists():
         raise ObservationError(f'{path}: no such file or folder; check the path')
     forms = ', '.join(reader.form for reader in READERS.values())
     raise ObservationError(f'{path}: not observations in a known form; these are {forms}')

@@ -203,18 +203,18 @@ def _topics_present(bag: Bag, worlds: set[str]) -> str:
 def _join_sets(
     sets: list[_PointSet], landmarks: dict[int, Landmarks], world: str, source: str
 ) -> Observations:
-    stamps = sorted({one.stamp for one in sets})
+    stamps = sorted({item.stamp for item in sets})
     frames = {stamp: frame for frame, stamp in enumerate(stamps)}
-    named = [one.camera.removeprefix(world).lstrip('/').replace('/', '_') for one in sets]
+    named = [item.camera.removeprefix(world).lstrip('/').replace('/', '_') for item in sets]
     cameras = tuple(dict.fromkeys(named))
-    counts = [len(one.points.landmark) for one in sets]
+    counts = [len(item.points.landmark) for item in sets]
     return make_observations(
-        np.repeat([frames[one.stamp] for one in sets], counts),
-        np.concatenate([one.points.landmark for one in sets]),
-        np.concatenate([one.points.uv for one in sets]),
-        np.concatenate([_landmark_points(one, landmarks, source) for one in sets]),
+        np.repeat([frames[item.stamp] for item in sets], counts),
+        np.concatenate([item.points.landmark for item in sets]),
+        np.concatenate([item.points.uv for item in sets]),
+        np.concatenate([_landmark_points(item, landmarks, source) for item in sets]),
         camera=np.repeat([cameras.index(name) for name in named], counts),
-        t=np.repeat([one.stamp / 1e9 for one in sets], counts),
+        t=np.repeat([item.stamp / 1e9 for item in sets], counts),
         cameras=cameras,
         source=source,
     )
@@ -222,11 +222,11 @@ def _join_sets(
 
 def _landmark_points(one: _PointSet, landmarks: dict[int, Landmarks], source: str) -> Any:
     """Return the landmarks (N, 3) of a set: those of its stamp, or the latest before it."""
-    known = sorted(landmarks)
-    place = max(bisect_right(known, one.stamp) - 1, 0)
-    points, found = landmarks[known[place]].lookup(one.points.landmark)
-    if not found.all():
-        missing = one.points.landmark[~found][0]
+    stamps = sorted(landmarks)
+    place = max(bisect_right(stamps, one.stamp) - 1, 0)
+    points, is_listed = landmarks[stamps[place]].lookup(one.points.landmark)
+    if not is_listed.all():
+        missing = one.points.landmark[~is_listed][0]
         raise ObservationError(
             f'{source}: landmark {missing} of {one.camera}/image_points is not in the landmarks'
         )

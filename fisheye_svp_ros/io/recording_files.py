@@ -38,8 +38,8 @@ def recording_files(path: Path) -> list[Path]:
 def metadata_topics(folder: Path) -> set[tuple[str, str]]:
     """Return the topics and types that the metadata of a recording lists; empty without."""
     with suppress(BagError, KeyError, TypeError):
-        known = read_yaml(folder / 'metadata.yaml', BagError)['rosbag2_bagfile_information']
-        topics = [topic['topic_metadata'] for topic in known['topics_with_message_count']]
+        information = read_yaml(folder / 'metadata.yaml', BagError)['rosbag2_bagfile_information']
+        topics = [topic['topic_metadata'] for topic in information['topics_with_message_count']]
         return {(str(topic['name']), str(topic['type'])) for topic in topics}
     return set()
 

@@ -123,7 +123,7 @@ def pair_of_camera_infos(paths: Sequence[str | Path]) -> Pose | None:
     None for other files, and for cameras that were calibrated by themselves.
     """
     foreign = [read_lens_file(path) for path in paths]
-    sides = [one.rectified for one in foreign if one is not None and one.rectified is not None]
+    sides = [file.rectified for file in foreign if file is not None and file.rectified is not None]
     if len(sides) != 2 or len(paths) != 2 or not all(np.linalg.det(p[:, :3]) for _, p in sides):
         return None
     left, right = (
@@ -148,8 +148,8 @@ def rigs_of_lenses(path: str | Path) -> tuple[Pose, ...]:
 
 
 def _rig_path(path: str | Path) -> Path:
-    given = path_of(path)
-    return given / 'rig.yaml' if given.is_dir() else given
+    location = path_of(path)
+    return location / 'rig.yaml' if location.is_dir() else location
 
 
 def _read_chain(path: str | Path) -> tuple[tuple[str, ...], tuple[Pose, ...]]:
@@ -178,6 +178,6 @@ def _read_rig(path: str | Path) -> Foreign:
     if foreign is None:
         raise LensError(f'{file}: left_in_right with position and quaternion is needed')
     if not foreign.rigs:
-        both = '; give the folder with both camera_info files' if foreign.rectified else ''
-        raise LensError(f'{file}: it holds one camera, or no transform between two{both}')
+        remedy = '; give the folder with both camera_info files' if foreign.rectified else ''
+        raise LensError(f'{file}: it holds one camera, or no transform between two{remedy}')
     return foreign

@@ -79,22 +79,22 @@ def sweep_path(name: str) -> Path:
 
 
 def _given_or_named(name: str, folder: str, error: type[FisheyeSvpError]) -> Path:
-    given, named = Path(name), config_path(f'{folder}/{name}.yaml')
+    literal, named = Path(name), config_path(f'{folder}/{name}.yaml')
     # FILE#cam1 names one of the lenses of a file, or of a folder.
     holder = Path(without_camera(name)[0])
-    if given.suffix in ('.yaml', '.yml') or is_there(holder, Path.is_file):
-        return given
+    if literal.suffix in ('.yaml', '.yml') or is_there(holder, Path.is_file):
+        return literal
     # What has no slash may come over the network, and is a name in config/ then.
     if '/' in name and is_there(holder, Path.is_dir):
-        return given
+        return literal
     if not is_there(named, Path.is_file):
-        if given.is_dir():
+        if literal.is_dir():
             raise error(
                 f'{name!r} is a folder, and not one of the {folder} of this package; '
                 f'write {name}/ for the folder'
             )
-        known = ', '.join(sorted(path.stem for path in config_path(folder).glob('*.yaml')))
-        raise error(f'{name!r} is neither a file nor one of the {folder} of this package: {known}')
+        names = ', '.join(sorted(path.stem for path in config_path(folder).glob('*.yaml')))
+        raise error(f'{name!r} is neither a file nor one of the {folder} of this package: {names}')
     return named
 
 

@@ -79,11 +79,11 @@ class LinearImage:
         lens = self.lens
         place = lens.displace_tangentially(self._by_curve)
         u, v = np.moveaxis((place - (lens.cx, lens.cy)) / (lens.fx, lens.fy), -1, 0)
-        zero, one = np.zeros_like(u), np.ones_like(u)
+        zero, ones = np.zeros_like(u), np.ones_like(u)
         columns = np.stack(
             [
-                np.stack([u, u, zero, one, zero], axis=-1),
-                np.stack([v, zero, v, zero, one], axis=-1),
+                np.stack([u, u, zero, ones, zero], axis=-1),
+                np.stack([v, zero, v, zero, ones], axis=-1),
             ],
             axis=-2,
         )
@@ -231,9 +231,9 @@ def back_project(lens: Lens, uv: Array) -> Rays:
     if lens.viewpoint_shift is not None:
         origin[..., 2] = lens.shift_at(theta)
     if lens.port is not None:
-        at, way = port_projection.trace_rays(lens, direction.reshape(-1, 3))
-        back = (at.value * way.value).sum(axis=0)
-        origin = (at.value - back * way.value).T.reshape(direction.shape)
+        origin_on_port, way = port_projection.trace_rays(lens, direction.reshape(-1, 3))
+        back = (origin_on_port.value * way.value).sum(axis=0)
+        origin = (origin_on_port.value - back * way.value).T.reshape(direction.shape)
         direction = way.value.T.reshape(direction.shape)
         valid &= np.isfinite(direction).all(axis=-1)
     return Rays(np.where(valid[..., None], origin, np.nan), direction, theta, valid)

@@ -92,8 +92,8 @@ class ImageHeight(Curve):
     def plus(self, change: HeightChange) -> ImageHeight:
         """Return the sum with a change, as a curve of the registry where there is one."""
         powers = change.powers
-        known = None if powers is None else self.with_powers(powers)
-        return SumOfHeights(self, (change,)) if known is None else known
+        with_powers = None if powers is None else self.with_powers(powers)
+        return SumOfHeights(self, (change,)) if with_powers is None else with_powers
 
 
 class Trigonometric(ImageHeight):
@@ -194,10 +194,10 @@ class ViewpointShift(Curve):
         """Return the sum with a curve of the same kind; None for another kind."""
         if type(self) is not type(other):
             return None
-        mine, more = self._lengths(), other._lengths()
+        lengths, more = self._lengths(), other._lengths()
         if self.with_values(**more) != other:
             return None
-        return self.with_values(**{name: value + more[name] for name, value in mine.items()})
+        return self.with_values(**{name: value + more[name] for name, value in lengths.items()})
 
 
 @dataclass(frozen=True)

@@ -170,8 +170,8 @@ class ImageField:
         if not (arrays['pitch'] > 0).all():
             raise LensError(f'{where}.pitch is {arrays["pitch"].tolist()}; it must be above 0')
         for name in ('u', 'v', 'stderr'):
-            one = arrays.get(name, u)
-            if one.ndim != 2 or one.shape != u.shape:
+            values = arrays.get(name, u)
+            if values.ndim != 2 or values.shape != u.shape:
                 raise LensError(f'{where}.{name} must be rows of numbers, as many as those of u')
         if not all(MIN_NODES <= count <= MAX_NODES for count in u.shape):
             raise LensError(
@@ -227,11 +227,11 @@ def _number_array(entry: Mapping[str, Any], name: str, where: str) -> Array:
     if name not in entry:
         raise LensError(f'{where}.{name} is missing')
     try:
-        found = np.array(entry[name], dtype=float)
+        array = np.array(entry[name], dtype=float)
     except (TypeError, ValueError, OverflowError) as cause:
         raise LensError(
             f'{where}.{name} must be lists of numbers, as long as each other'
         ) from cause
-    if not np.isfinite(found).all():
+    if not np.isfinite(array).all():
         raise LensError(f'{where}.{name} holds a number that is not finite')
-    return found
+    return array

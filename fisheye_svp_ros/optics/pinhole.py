@@ -129,7 +129,7 @@ class TangentialDistortion:
     @property
     def values(self) -> dict[str, float]:
         """The coefficients by name."""
-        return {one.name: getattr(self, one.name) for one in fields(self)}
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def apply(self, curve: ImageHeight, place: Array) -> Array:
         """Return places (..., 2) in the image of those that the radial curve alone gives."""

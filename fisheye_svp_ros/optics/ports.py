@@ -59,9 +59,9 @@ class Varying:
 
     def dot(self, other: Varying) -> Varying:
         """Return the inner product of two vectors, (1, M)."""
-        both = self * other
+        product = self * other
         return Varying(
-            both.value.sum(axis=-2, keepdims=True), both.slope.sum(axis=-2, keepdims=True)
+            product.value.sum(axis=-2, keepdims=True), product.slope.sum(axis=-2, keepdims=True)
         )
 
     def root(self) -> Varying:
@@ -132,8 +132,8 @@ class Port(Curve, ABC):
         """Return the coefficients; those from variable `first` on are the variables themselves."""
         numbers = [constant(value, variables) for value in self.coefficients]
         if first is not None:
-            for number, one in enumerate(numbers, start=first):
-                one.slope[number] = 1.0
+            for number, coefficient in enumerate(numbers, start=first):
+                coefficient.slope[number] = 1.0
         return numbers
 
     def check(self) -> str:
@@ -187,12 +187,12 @@ class FlatGlass(Port):
         self, origin: Varying, direction: Varying, numbers: Sequence[Varying]
     ) -> tuple[Varying, Varying]:
         distance, medium, tilt_x, tilt_y, thickness, glass = numbers
-        one = constant(1.0, len(medium.slope))
-        normal = stack_vector(tilt_y.tan(), 0.0 - tilt_x.tan(), one).unit()
-        at = origin + direction * ((distance - normal.dot(origin)) / normal.dot(direction))
-        direction = refract(direction, normal, one, glass)
-        at = at + direction * (thickness / normal.dot(direction))
-        return at, refract(direction, normal, glass, medium)
+        air = constant(1.0, len(medium.slope))
+        normal = stack_vector(tilt_y.tan(), 0.0 - tilt_x.tan(), air).unit()
+        point = origin + direction * ((distance - normal.dot(origin)) / normal.dot(direction))
+        direction = refract(direction, normal, air, glass)
+        point = point + direction * (thickness / normal.dot(direction))
+        return point, refract(direction, normal, glass, medium)
 
     def start(self, points: Array) -> Array:
         """See `Port.start`; exact where the viewpoint is the origin, NaN where no ray leads.

@@ -37,7 +37,7 @@ def claims(evaluations: Mapping[str, LensEvaluation]) -> list[Claim]:
     """Check every statement on the evaluations of both lenses with the SVP solver."""
     pair = [evaluations[name] for name in LENSES]
     return [
-        *(claim for one in pair for claim in _localization_bounds(one)),
+        *(claim for result in pair for claim in _localization_bounds(result)),
         *_localization(*pair),
         *_calibration(*pair),
         *_stereo(*pair),
@@ -84,10 +84,10 @@ def _localization_bounds(evaluation: LensEvaluation) -> Iterator[Claim]:
 
 
 def _localization(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]:
-    z = [found.localization[..., _Z] for found in (evaluation, other)]
+    z = [result.localization[..., _Z] for result in (evaluation, other)]
     size = [np.abs(values).mean() for values in z]
     angles = np.radians(np.linspace(0, 88, 89))
-    spans = [1e3 * np.ptp(found.lens.shift_at(angles)) for found in (evaluation, other)]
+    spans = [1e3 * np.ptp(result.lens.shift_at(angles)) for result in (evaluation, other)]
     yield _make_claim(
         3,
         'The z errors of Fish214 are fairly large, those of Fish180 much smaller, because the '
@@ -96,7 +96,7 @@ def _localization(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator
         _by_lens('mean |z|, {}, mm', size) | _by_lens('shift range to 88 degree, {}, mm', spans),
     )
     change = [(np.ptp(v, axis=0) / np.abs(v).mean(axis=0)).max() for v in z]
-    axis = [found.localization[..., _AXIS] for found in (evaluation, other)]
+    axis = [result.localization[..., _AXIS] for result in (evaluation, other)]
     growth = min((a[-1] / a[0]).min() for a in axis)
     yield _make_claim(
         3,
@@ -116,10 +116,10 @@ def _localization(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator
     # Whole beside Inner and Outer, in what noise does to z and in what SVP does.
     numbers: dict[str, float] = {}
     best: list[bool] = []
-    for found, values in zip((evaluation, other), far, strict=True):
-        noise = [1e3 * np.sqrt(s.solved.covariance[0, 2, 2]) for s in found.localized]
+    for result, values in zip((evaluation, other), far, strict=True):
+        noise = [1e3 * np.sqrt(s.solved.covariance[0, 2, 2]) for s in result.localized]
         for spread, deviation, error in zip(SPREADS, noise, np.abs(values), strict=True):
-            where = f'{NAMES[found.lens.name]} {spread.title()} 2.0 m, mm'
+            where = f'{NAMES[result.lens.name]} {spread.title()} 2.0 m, mm'
             numbers |= {
                 f'z for 1 px of noise, {where}': deviation,
                 f'|z| from SVP, {where}': error,
@@ -135,7 +135,7 @@ def _localization(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator
 
 def _calibration(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]:
     position = [np.linalg.norm(f.calibration[..., :3], axis=-1) for f in (evaluation, other)]
-    axis = [found.calibration[..., _AXIS] for found in (evaluation, other)]
+    axis = [result.calibration[..., _AXIS] for result in (evaluation, other)]
     worst, worst_axis = position[0].max(), axis[0].max()
     yield _make_claim(
         4,
@@ -158,7 +158,7 @@ def _calibration(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator[
 def _stereo(evaluation: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]:
     # Lens, radius, style.
     error2, largest, error3 = (
-        np.stack([found.panels(name).reshape(3, 3) for found in (evaluation, other)])
+        np.stack([result.panels(name).reshape(3, 3) for result in (evaluation, other)])
         for name in ('error2_px', 'error2_max_px', 'error3_m')
     )
     growth = error2[:, 1:] / error2[:, :-1]

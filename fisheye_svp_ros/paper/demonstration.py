@@ -181,7 +181,11 @@ def demo_rows(table: DataFrame, lenses: Sequence[str], radii: Sequence[float]) -
 
 def residual_fields(records: Iterable[Any]) -> list[ResidualSet]:
     """Return the residuals of every localization with the whole environment (figure 6)."""
-    return [one for one in residual_sets(records) if one.tags.get('environment') == 'whole']
+    return [
+        residuals
+        for residuals in residual_sets(records)
+        if residuals.tags.get('environment') == 'whole'
+    ]
 
 
 def _is_shown(task: Task, row: dict[str, Any]) -> bool:
@@ -227,13 +231,13 @@ def _published_cells(
 
 def rectified_pair(lens: Lens) -> tuple[RectifiedPair, tuple[NDArray[Any], ...]]:
     """Return the pair of two cameras with the lens, and their rectified photographs."""
-    place, both = _board_in_left(), rig('vergent')
+    place, rig_pose = _board_in_left(), rig('vergent')
     camera = camera_for([lens], 'pinhole', (640, 480), np.radians(110.0), along_baseline=True)
-    pair = rectify_pair(lens, lens, both, camera, _PAIR_RANGE)
+    pair = rectify_pair(lens, lens, rig_pose, camera, _PAIR_RANGE)
     left = place.inverse()
     images = [
         side.remap(render(lens, _BOARD, pose, Exposure(), np.random.default_rng(0)))
-        for side, pose in ((pair.left, left), (pair.right, left.compose(both.inverse())))
+        for side, pose in ((pair.left, left), (pair.right, left.compose(rig_pose.inverse())))
     ]
     return pair, tuple(images)
 

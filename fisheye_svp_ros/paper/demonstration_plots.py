@@ -39,8 +39,8 @@ def draw_comparison(path: Path, rows: Sequence[DemoRow]) -> None:
         axes = figure.subplots(len(lenses), len(_TITLES), squeeze=False)
         for line, lens in zip(axes, lenses, strict=True):
             for axis, (task, title) in zip(line, _TITLES.items(), strict=True):
-                mine = [row for row in rows if (row.lens, row.task) == (lens, task)]
-                _draw_errors(axis, mine)
+                lens_rows = [row for row in rows if (row.lens, row.task) == (lens, task)]
+                _draw_errors(axis, lens_rows)
                 axis.set_title(f'{title}\n{lens}' if lens == lenses[0] else lens, loc='left')
                 if lens == lenses[-1]:
                     axis.set_xlabel('mm')
@@ -77,8 +77,11 @@ def draw_residual_fields(path: Path, fields: Sequence[ResidualSet]) -> None:
     with picture(path, 3.4 * count, 0.3 + 3.7 * len(names)) as figure:
         axes = figure.subplots(len(names), count, squeeze=False)
         for line, name in zip(axes, names, strict=True):
-            lens, mine = load_lens(lens_path(name)), [f for f in fields if f.tags['lens'] == name]
-            for axis, field in zip(line, mine, strict=False):
+            lens, lens_fields = (
+                load_lens(lens_path(name)),
+                [f for f in fields if f.tags['lens'] == name],
+            )
+            for axis, field in zip(line, lens_fields, strict=False):
                 _draw_residuals(axis, field, lens)
 
 

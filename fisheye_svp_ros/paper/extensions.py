@@ -92,8 +92,8 @@ def calibrated_shift(lens: Lens) -> Lens:
     views = views_of(points, exact.uv + noise)
     start = lens.svp()
     pose = localize(ForwardModel(start), views, right).pose
-    known = scaled_shift(lens, 0.0).with_parameters(['s0'], [lens.parameters['s0']])
-    return adjust_lens(known, views, pose, _FREE).lens
+    svp = scaled_shift(lens, 0.0).with_parameters(['s0'], [lens.parameters['s0']])
+    return adjust_lens(svp, views, pose, _FREE).lens
 
 
 VARIANTS: dict[str, Callable[[Lens], Lens]] = {
@@ -139,16 +139,16 @@ def _drops_under(ranges: Array, error: Array) -> Array:
 
     Between two ranges the error is taken as a power of the range.
     """
-    found = np.zeros(len(NOISES))
+    sums = np.zeros(len(NOISES))
     for i, noise in enumerate(NOISES):
         above = np.flatnonzero(error > noise)
         if not above.size:
             continue
         last = above[-1]
         if last == len(ranges) - 1:
-            found[i] = np.nan
+            sums[i] = np.nan
             continue
         low, high = np.log(error[last : last + 2])
         along = (low - np.log(noise)) / (low - high)
-        found[i] = ranges[last] * (ranges[last + 1] / ranges[last]) ** along
-    return found
+        sums[i] = ranges[last] * (ranges[last + 1] / ranges[last]) ** along
+    return sums

@@ -112,10 +112,10 @@ def draw_localization(path: Path, evaluations: dict[str, LensEvaluation]) -> Non
                 _draw_world(axis, view, points)
             line[0].set_ylabel(f'{SPREADS[spread].title()}, {RADII[radius]} m\ny / m')
             for axis, name in zip(line[2:], LENSES, strict=True):
-                one = evaluations[name]
-                _draw_image_frame(axis, one.lens)
-                mean = one.localization[radius, spread, -1]
-                _draw_residuals(axis, one.localized[spread], radius, _COLORS[name])
+                evaluation = evaluations[name]
+                _draw_image_frame(axis, evaluation.lens)
+                mean = evaluation.localization[radius, spread, -1]
+                _draw_residuals(axis, evaluation.localized[spread], radius, _COLORS[name])
                 axis.set_title(f'{NAMES[name]}: {mean:.4f} px', fontsize=9)
 
 
@@ -154,9 +154,12 @@ def draw_calibration_poses(path: Path) -> None:
             axis.plot(points[:, across], points[:, up], 's', color=_INK, markersize=3)
             for camera, color, name in ((right, OURS, 'right'), (left, PUBLISHED, 'left')):
                 ends = camera.position + 0.12 * camera.rotation[..., 2]
-                for one, end in zip(camera.position, ends, strict=True):
+                for start, end in zip(camera.position, ends, strict=True):
                     axis.plot(
-                        [one[across], end[across]], [one[up], end[up]], color=color, linewidth=1
+                        [start[across], end[across]],
+                        [start[up], end[up]],
+                        color=color,
+                        linewidth=1,
                     )
                 axis.plot(
                     camera.position[:, across],
@@ -232,14 +235,14 @@ def draw_crossings(path: Path, crossings: Sequence[Crossings]) -> None:
         axes = figure.subplots(1, len(quantities), sharey=True)
         for axis, quantity in zip(axes, quantities, strict=True):
             for name in LENSES:
-                mine = [c for c in crossings if (c.lens, c.quantity) == (name, quantity)]
-                for line, one in zip(_LINES, mine, strict=True):
+                lens_crossings = [c for c in crossings if (c.lens, c.quantity) == (name, quantity)]
+                for line, crossing in zip(_LINES, lens_crossings, strict=True):
                     axis.plot(
                         NOISES,
-                        np.where(one.ranges > 0, one.ranges, np.nan),
+                        np.where(crossing.ranges > 0, crossing.ranges, np.nan),
                         line,
                         color=_COLORS[name],
-                        label=f'{NAMES[name]}, {one.where}',
+                        label=f'{NAMES[name]}, {crossing.where}',
                         marker='o',
                         markersize=3,
                     )
@@ -332,19 +335,19 @@ def _draw_left_image(
 ) -> None:
     lens = evaluation.lens
     _draw_image_frame(axis, lens)
-    both = np.isfinite(measured.distance)
-    known = ForwardModel(lens.svp())
-    curves = epipolar_curves(known, known, rig(style), measured.uv_right[both], _CURVE)
+    measurable = np.isfinite(measured.distance)
+    model = ForwardModel(lens.svp())
+    curves = epipolar_curves(model, model, rig(style), measured.uv_right[measurable], _CURVE)
     axis.plot(curves[..., 0].T, curves[..., 1].T, color=FAINT, linewidth=0.6)
-    u, v = measured.uv_left[both].T
+    u, v = measured.uv_left[measurable].T
     axis.plot(u, v, 'o', color=_INK, markersize=2)
-    ends = v - _VERTICAL_MAGNIFIED[lens.name] * measured.vertical[both]
+    ends = v - _VERTICAL_MAGNIFIED[lens.name] * measured.vertical[measurable]
     axis.plot([u, u], [v, ends], color=OURS, linewidth=1.2)
 
 
 def _draw_points(axis: Any, measured: StereoMeasurement, across: int, up: int) -> None:
-    known = np.isfinite(measured.measured[:, 0])
-    true, solved = measured.true[known], measured.measured[known]
+    finite = np.isfinite(measured.measured[:, 0])
+    true, solved = measured.true[finite], measured.measured[finite]
     axis.plot(
         [true[:, across], solved[:, across]],
         [true[:, up], solved[:, up]],

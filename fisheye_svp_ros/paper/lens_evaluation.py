@@ -145,9 +145,9 @@ def calibrate_rigs(
             blank = views_of(points, np.zeros((len(right.position), len(points), 2)))
             seen.append(views_of(points, model.predict(pose, blank).uv))
     left_views, right_views = map(Views.concatenate, views)
-    known = ForwardModel(lens.svp() if solver is None else solver)
+    solving_model = ForwardModel(lens.svp() if solver is None else solver)
     solved = solve_rigs(
-        (known, known),
+        (solving_model, solving_model),
         left_views,
         right_views,
         len(systems),
@@ -171,9 +171,13 @@ def measure(
     model = ForwardModel(lens)
     uv_right = model.predict(right, blank).uv
     uv_left = model.predict(right.compose(left_in_right.take(None)), blank).uv
-    known = ForwardModel(lens.svp() if solver is None else solver)
+    solving_model = ForwardModel(lens.svp() if solver is None else solver)
     solved = measure_points(
-        (known, known), left_in_right.take(None), uv_left, uv_right, right.into_body(points)
+        (solving_model, solving_model),
+        left_in_right.take(None),
+        uv_left,
+        uv_right,
+        right.into_body(points),
     )
     calibration = solved.solution
     return StereoMeasurement(

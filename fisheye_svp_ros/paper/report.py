@@ -72,7 +72,9 @@ def _draw_pictures(results: Results, folder: Path, executor: Executor) -> list[P
     under_way: dict[str, Future[None]] = {}
     with TemporaryDirectory() as scratch, ExitStack() as stack:
         # Whatever ends this, nobody draws any longer when the scratch folder goes.
-        stack.callback(lambda: wait([one for one in under_way.values() if not one.cancel()]))
+        stack.callback(
+            lambda: wait([future for future in under_way.values() if not future.cancel()])
+        )
         for name, (draw, *arguments) in _picture_tasks(results).items():
             under_way[name] = executor.submit(draw, Path(scratch, f'{name}.png'), *arguments)
 
@@ -137,12 +139,12 @@ def _recovery(results: Results) -> Iterator[Block]:
     rows = []
     for k, name in enumerate(LENSES):
         curves = _MM * shift_curves(fits, name, theta)
-        own = results.lenses[name].shift_at(theta)
+        shift = results.lenses[name].shift_at(theta)
         f = np.array([fit.lens_numbers[k, 0] for fit in fits])
         rows.append([NAMES[name], 'f, px', f'{results.lenses[name].fx:.1f}', _span(f, 1)])
         rows += [
             [NAMES[name], f'shift at {angle} degree, mm', f'{_MM * value:.2f}', _span(fitted, 2)]
-            for angle, value, fitted in zip(_ANGLES, own, curves.T, strict=True)
+            for angle, value, fitted in zip(_ANGLES, shift, curves.T, strict=True)
         ]
     yield TableBlock(['lens', 'quantity', 'used', 'all fits'], rows, 2)
     yield Text(
@@ -302,9 +304,9 @@ def _solvers(results: Results) -> Iterator[Block]:
         'with the range: it comes from f. All cells are in paper.json.'
     )
     rows = []
-    for variant, found in results.found.items():
+    for variant, evaluations in results.found.items():
         for name in LENSES:
-            one = found[name]
+            evaluation = evaluations[name]
             rows.append(
                 [
                     variant,
@@ -312,13 +314,13 @@ def _solvers(results: Results) -> Iterator[Block]:
                     *(
                         f'{value:.4f}'
                         for value in (
-                            np.abs(one.localization[..., 2]).max(),
-                            one.localization[..., 3].max(),
-                            one.localization[..., 4].max(),
-                            np.linalg.norm(one.calibration[..., :3], axis=-1).max(),
-                            one.calibration[..., 3].max(),
-                            one.panels('error2_px').max(),
-                            _MM * one.panels('error3_m').max(),
+                            np.abs(evaluation.localization[..., 2]).max(),
+                            evaluation.localization[..., 3].max(),
+                            evaluation.localization[..., 4].max(),
+                            np.linalg.norm(evaluation.calibration[..., :3], axis=-1).max(),
+                            evaluation.calibration[..., 3].max(),
+                            evaluation.panels('error2_px').max(),
+                            _MM * evaluation.panels('error3_m').max(),
                         )
                     ),
                 ]

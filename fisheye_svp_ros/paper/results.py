@@ -74,10 +74,8 @@ class Results(NamedTuple):
         """Return the 180 cells of tables 1 to 4 for a variant of the solver."""
         evaluations = [self.found[variant][name] for name in LENSES]
         return [
-            *cells(LOCALIZATION, np.stack([one.localization for one in evaluations]), 1, SPREADS),
-            *cells(
-                CALIBRATION, np.stack([one.calibration for one in evaluations]), 3, STYLE_NAMES
-            ),
+            *cells(LOCALIZATION, np.stack([e.localization for e in evaluations]), 1, SPREADS),
+            *cells(CALIBRATION, np.stack([e.calibration for e in evaluations]), 3, STYLE_NAMES),
         ]
 
     def panels(self) -> list[Panel]:
@@ -90,8 +88,8 @@ class Results(NamedTuple):
 
     def verdicts(self) -> dict[str, int]:
         """Return how many statements have which verdict."""
-        found = [claim.verdict for claim in self.claims]
-        return {verdict: found.count(verdict) for verdict in sorted(set(found))}
+        verdicts = [claim.verdict for claim in self.claims]
+        return {verdict: verdicts.count(verdict) for verdict in sorted(set(verdicts))}
 
     def document(self) -> dict[str, Any]:
         """Return the mapping of paper.json; NaN stands for what the paper does not print."""

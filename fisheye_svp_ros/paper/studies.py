@@ -80,15 +80,17 @@ def load_family(path: str | Path | None = None) -> Family:
     try:
         members = tuple(
             Member(
-                one['seed'],
-                one['misfit'],
-                one['cost'],
-                one['within_10'],
-                one['within_5'],
-                np.array([[one[lens][name] for name in NAMES] for lens in LENSES]),
-                np.radians(np.array([one['incidence_deg'], one['azimuth_deg']], dtype=float)).T,
+                member['seed'],
+                member['misfit'],
+                member['cost'],
+                member['within_10'],
+                member['within_5'],
+                np.array([[member[lens][name] for name in NAMES] for lens in LENSES]),
+                np.radians(
+                    np.array([member['incidence_deg'], member['azimuth_deg']], dtype=float)
+                ).T,
             )
-            for one in document['members']
+            for member in document['members']
         )
         low, high = (
             np.array([document['calibration_range'][lens][end] for lens in LENSES]).reshape(

@@ -328,8 +328,8 @@ class Guide:
             return False
         most = _MAX_MOTION * self.session.lens.width
         for view in last:
-            _, mine, theirs = np.intersect1d(seen.ids, view.ids, return_indices=True)
-            moved = np.abs(seen.uv[mine] - view.uv[theirs])
+            _, rows, theirs = np.intersect1d(seen.ids, view.ids, return_indices=True)
+            moved = np.abs(seen.uv[rows] - view.uv[theirs])
             if not moved.size or moved.max() > most:
                 return False
         return True

@@ -152,8 +152,8 @@ class Criterion:
             remaining = _marginal_information(information, self.interest, self.nuisance)
             return np.asarray(np.linalg.slogdet(remaining)[1]) / len(self.interest)
         merits = []
-        for other in self.others or (self.nuisance[:0],):
-            unknown = np.concatenate([self.nuisance, other])
+        for nuisance in self.others or (self.nuisance[:0],):
+            unknown = np.concatenate([self.nuisance, nuisance])
             remaining = _marginal_information(information, self.interest, unknown)
             merits.append(np.einsum('i,bij,j->b', self.value, remaining, self.value))
         return np.asarray(np.min(merits, axis=0))
@@ -240,9 +240,9 @@ class Design:
     def question(self, name: str, others: Sequence[str] = ()) -> Criterion:
         """Ask for the error of a number, or whether an effect is not one of some others."""
         interest = self.columns(name)
-        groups = tuple(self.columns(other) for other in others)
-        rest = np.setdiff1d(np.arange(len(self.names)), np.concatenate([interest, *groups]))
-        return Criterion(interest, rest, self.values[interest] if others else None, groups)
+        groups = tuple(self.columns(name) for name in others)
+        nuisance = np.setdiff1d(np.arange(len(self.names)), np.concatenate([interest, *groups]))
+        return Criterion(interest, nuisance, self.values[interest] if others else None, groups)
 
     def choose(self, question: Criterion, count: int) -> tuple[Index, list[float]]:
         """Return places of chosen shots, best first, and the answer with each one more.
@@ -361,12 +361,14 @@ def _detectable(state: RigState, board: FlatBoard, shots: Shots, field: float) -
     )
     size, rim = np.array([state.lens.width, state.lens.height]), board.rim
     # Most boards do not fit by their corners, for which there is no need to look at all of them.
-    for some in (board.corners, np.arange(len(rim))):
+    for indices in (board.corners, np.arange(len(rim))):
         left = np.flatnonzero(feasible)
         if not left.size:
             return feasible
         camera = shots.camera.take(left)
-        views = blank_views(board.landmark[some], rim[some], left.size, board=board.board[some])
+        views = blank_views(
+            board.landmark[indices], rim[indices], left.size, board=board.board[indices]
+        )
         edge, outer = model.predict(camera, views), camera.into_body(views.points)
         seen = outer[..., 2] > np.cos(field) * np.linalg.norm(outer, axis=-1)
         with np.errstate(invalid='ignore'):
@@ -408,9 +410,9 @@ def information(linear: Linearization, effects: Sequence[Effect]) -> Array:
 
 def _marginal_information(information: Array, interest: Index, unknown: Index) -> Array:
     """Return the information (B, P, P) of some columns with others unknown."""
-    own = information[:, interest[:, None], interest]
+    block = information[:, interest[:, None], interest]
     if not len(unknown):
-        return np.asarray(own)
+        return np.asarray(block)
     mixed = information[:, unknown[:, None], interest]
-    rest = information[:, unknown[:, None], unknown]
-    return np.asarray(own - np.swapaxes(mixed, -1, -2) @ np.linalg.solve(rest, mixed))
+    nuisance = information[:, unknown[:, None], unknown]
+    return np.asarray(block - np.swapaxes(mixed, -1, -2) @ np.linalg.solve(nuisance, mixed))

@@ -110,13 +110,13 @@ def next_photographs(
     seen = pose.into_body(views.points)[views.used]
     reached = float(np.arccos((seen[:, 2] / np.linalg.norm(seen, axis=-1)).min()))
     room = room._replace(field=min(room.field, max_view_angle(after.state.lens, reached)))
-    asked, others, effects = _choose_question(after, causes, number)
+    asked, rivals, effects = _choose_question(after, causes, number)
     shots = candidate_shots(after.state, board, room, np.random.default_rng(0))
     design = Design(after, effects, board, shots, noise)
-    others = tuple(o for o in others if any(o == n.partition('.')[0] for n in design.names))
-    question = lens_criterion(design) if asked == 'lens' else design.question(asked, others)
+    rivals = tuple(o for o in rivals if any(o == n.partition('.')[0] for n in design.names))
+    question = lens_criterion(design) if asked == 'lens' else design.question(asked, rivals)
     chosen, answers = design.choose(question, count)
-    return next_views(design, asked, others, question, chosen, answers)
+    return next_views(design, asked, rivals, question, chosen, answers)
 
 
 def next_views(
@@ -149,14 +149,14 @@ def _choose_question(
     if number is not None:
         return number, (), _effects_with(number, after)
     fitted = {term.name for term in after.state.terms}
-    mine = [c for c in causes if c.effect in fitted and c.stage in ('lens', 'target')]
-    for cause in mine:
+    fitted_causes = [c for c in causes if c.effect in fitted and c.stage in ('lens', 'target')]
+    for cause in fitted_causes:
         # How a board sags, no photograph that is planned can tell.
         alike = tuple(name for name in cause.indistinguishable_from if name in CATALOGUE)
         if alike:
             return cause.effect, alike, richest_forms(after, alike)
-    if mine:
-        return mine[0].effect, (), []
+    if fitted_causes:
+        return fitted_causes[0].effect, (), []
     if after.free:
         return 'lens', (), []
     return 'e0', (), [ViewpointShiftEffect(1)]
@@ -179,7 +179,7 @@ def _effects_with(number: str, after: Linearization) -> list[Effect]:
 
     None where the fit has it.  Raises ParameterError where no effect does.
     """
-    known = list(after.free)
+    names = list(after.free)
     if number in {*after.free, *(name for t in after.state.terms for name in _names_of(t.effect))}:
         return []
     for name, kind in CATALOGUE.items():
@@ -193,7 +193,7 @@ def _effects_with(number: str, after: Linearization) -> list[Effect]:
             if number in _names_of(form):
                 return [form]
         parts = [parameter.name for form in forms for parameter in form.parameters]
-        known += (
+        names += (
             [name]
             if '.' in ''.join(parts)
             else [f'{name}.{part}' for part in dict.fromkeys(parts)]
@@ -202,7 +202,7 @@ def _effects_with(number: str, after: Linearization) -> list[Effect]:
         raise ParameterError(f'--for {number}: {number} is fixed; add --free intrinsics')
     raise ParameterError(
         f'--for {number}: not a parameter of this lens or of an effect; known '
-        f'are {", ".join(known)}'
+        f'are {", ".join(names)}'
     )
 
 

@@ -49,12 +49,12 @@ class BudgetRequest(NamedTuple):
     @property
     def header(self) -> tuple[str, ...]:
         """The heads of the table's columns."""
-        own = ('its parameters', 'what remains') if self.own else ()
+        names = ('its parameters', 'what remains') if self.own else ()
         return (
             'error',
             f'{self.model} causes',
             'noise causes',
-            *own,
+            *names,
             'limit',
             'unit',
             'kept',
@@ -69,16 +69,16 @@ class BudgetRequest(NamedTuple):
 
 def budget_rows(points: Sequence[Point], asked: BudgetRequest) -> list[tuple[str, ...]]:
     """Return the table's rows, under the header."""
-    found = []
+    table_rows = []
     for point in asked.relevant_points(points):
         unit, factor = DISPLAY_UNITS[UNITS[point.quantity]]
-        own = (point.parameters, point.misfit) if asked.own else ()
-        found.append(
+        sizes = (point.parameters, point.misfit) if asked.own else ()
+        table_rows.append(
             (
                 _LABELS[point.quantity],
                 *(
                     f'{factor * value:.3g}' if np.isfinite(value) else '-'
-                    for value in (point.error, point.noise, *own, point.limit)
+                    for value in (point.error, point.noise, *sizes, point.limit)
                 ),
                 unit,
                 _YES_NO[point.kept],
@@ -88,7 +88,7 @@ def budget_rows(points: Sequence[Point], asked: BudgetRequest) -> list[tuple[str
                 else 'nowhere',
             )
         )
-    return found
+    return table_rows
 
 
 def answer(points: Sequence[Point], asked: BudgetRequest) -> str:

@@ -54,9 +54,9 @@ class CalibratedCamera:
             for name, limits in self.trust.admissible.items()
             if not limits.settled
         }
-        for known in (errors, ranges):
-            if 'f' in known:
-                known['fx'] = known['fy'] = known['f']
+        for by_name in (errors, ranges):
+            if 'f' in by_name:
+                by_name['fx'] = by_name['fy'] = by_name['f']
         return [
             (
                 name,

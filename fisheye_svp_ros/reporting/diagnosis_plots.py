@@ -91,8 +91,8 @@ class PlotData(NamedTuple):
     def from_evaluation(cls, evaluation: Evaluation) -> PlotData:
         """Leave out outliers: they have a table of their own."""
         points = point_residuals(evaluation)
-        both = np.concatenate([points.before, points.after], axis=1)
-        kept = ~points.outlier & np.isfinite(both).all(axis=1)
+        vectors = np.concatenate([points.before, points.after], axis=1)
+        kept = ~points.outlier & np.isfinite(vectors).all(axis=1)
         shown = PointResiduals._make(array[kept] for array in points)
         state = evaluation.fixed_model.state
         lenses = dict(zip(state.labels, state.lenses, strict=True))
@@ -102,8 +102,8 @@ class PlotData(NamedTuple):
         """Return the points that were seen through one of the lenses."""
         if len(self.lenses) == 1:
             return self.points
-        mine = self.points.camera == camera
-        return PointResiduals._make(array[mine] for array in self.points)
+        of_camera = self.points.camera == camera
+        return PointResiduals._make(array[of_camera] for array in self.points)
 
 
 def draw_field(file: File, shown: PlotData, narrow: bool = False) -> None:
@@ -345,8 +345,8 @@ def draw_image_frame(axis: Axes, lens: Lens) -> None:
         inside = (u > 0) & (u < lens.width) & (v > 0) & (v < lens.height)
         axis.plot(np.where(inside, u, np.nan), v, ':', color=NOISE, lw=0.8)
         if inside.any():
-            at = int(np.argmax(np.where(inside, np.sin(turn - 0.6), -2)))
-            axis.annotate(f'{degrees}°', (u[at], v[at]), color=NOISE, fontsize=8)
+            place = int(np.argmax(np.where(inside, np.sin(turn - 0.6), -2)))
+            axis.annotate(f'{degrees}°', (u[place], v[place]), color=NOISE, fontsize=8)
     axis.set(xlim=(-1, lens.width), ylim=(lens.height, -1))
 
 

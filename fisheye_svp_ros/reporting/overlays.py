@@ -47,8 +47,8 @@ def _overlay(pixels: np.ndarray, searched: SearchedPhotograph) -> np.ndarray:
 def write_coverage(path: Path, detection: Detection) -> None:
     """Draw all corners on the image, and, as a first calibration has them, angles and ranges."""
     table = detection.observations
-    found = sum(photograph.points is not None for photograph in detection.searched)
-    shown = f'{found} photographs of {len(detection.searched)}'
+    searched_count = sum(photograph.points is not None for photograph in detection.searched)
+    shown = f'{searched_count} photographs of {len(detection.searched)}'
     width, height = np.max([*detection.image_sizes.values()], axis=0).tolist()
     with picture(path, 10.0, 4.5) as figure:
         image, field = figure.subplots(1, 2)

@@ -22,7 +22,7 @@ _COLORS = 'YlGnBu'
 
 def draw_uncertainty(file: File, maps: Mapping[str, RayMap], narrow: bool = False) -> None:
     """Draw the standard error of the rays of each camera (its name, '' for one), near and far."""
-    sides = [len(each.v) / len(each.u) for each in maps.values()]
+    sides = [len(ray_map.v) / len(ray_map.u) for ray_map in maps.values()]
     width, columns = (NARROW, 1) if narrow else (9.2, 2)
     height = (width - 1.0) / columns * sum(sides) * 2 / columns + 0.5 * len(sides) * 2 / columns
     with picture(file, width, height) as figure:
@@ -36,8 +36,10 @@ def draw_ray_map(figure: Figure, axes: Any, rays: RayMap, name: str = '') -> Non
     sd = 1e3 * rays.sd
     levels = _levels(sd)
     norm = BoundaryNorm(levels, 256, extend='both')
-    for axis, each, range_m in zip(axes, sd, rays.ranges, strict=True):
-        shown = axis.contourf(rays.u, rays.v, each, levels, cmap=_COLORS, norm=norm, extend='both')
+    for axis, deviation, range_m in zip(axes, sd, rays.ranges, strict=True):
+        shown = axis.contourf(
+            rays.u, rays.v, deviation, levels, cmap=_COLORS, norm=norm, extend='both'
+        )
         axis.plot(*_some(rays.uv).T, '.', color=INK, ms=1.0, alpha=0.4)
         axis.set_title(f'{name} at {range_m:g} m'.strip())
         _frame(axis, rays)

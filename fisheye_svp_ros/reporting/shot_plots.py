@@ -106,9 +106,9 @@ def draw_guide(pixels: Pixels, guide: Guide, board: DetectedBoard | None) -> NDA
             _FRACTION_BITS,
         )
     if board is not None:
-        found = _to_fixed_point(board.uv, zoom)
-        _dots(picture, found, _SEEN, 3)
-        first = found[int(np.argmin(board.ids))].tolist()
+        corners = _to_fixed_point(board.uv, zoom)
+        _dots(picture, corners, _SEEN, 3)
+        first = corners[int(np.argmin(board.ids))].tolist()
         cv2.circle(picture, first, 9 << _FRACTION_BITS, _SEEN, 2, cv2.LINE_AA, _FRACTION_BITS)
     _draw_texts(picture, guide)
     return picture
@@ -131,12 +131,12 @@ def _draw_texts(picture: NDArray[np.uint8], guide: Guide) -> None:
     """Write what to do above, with the score as a bar, and where matters stand below."""
     height, width = picture.shape[:2]
     line, size = round(_BAND * width), _LETTER * width
-    todo, where, known = guide_words(guide)
+    todo, where, progress = guide_words(guide)
     for top, bottom in ((0, round(2.6 * line)), (height - round(1.3 * line), height)):
         picture[top:bottom] //= 4
     for text, base in ((todo, 1.0), (where, 2.0)):
         _write_words(picture, text, round(base * line), size)
-    _write_words(picture, known, height - round(0.4 * line), size)
+    _write_words(picture, progress, height - round(0.4 * line), size)
     left, right, top = round(0.6 * width), round(0.98 * width), round(0.3 * line)
     ready = guide.score >= MIN_SCORE
     cv2.rectangle(

@@ -90,15 +90,15 @@ def draw_table(table: DataFrame, folder: Path) -> list[Path]:
     swept = swept_parameters(table)
     numbers = [name for name in swept if is_number(table, name)]
     for x in numbers if metrics else ():
-        others = [name for name in swept if name != x]
-        drawings.append((f'error_against_{x}', _draw_curves, (table, metrics, x, others)))
+        parameters = [name for name in swept if name != x]
+        drawings.append((f'error_against_{x}', _draw_curves, (table, metrics, x, parameters)))
     if len(numbers) >= 2 and metrics:
         y, x = sorted(sorted(numbers, key=lambda n: -table[n].nunique())[:2], key=numbers.index)
-        others = [name for name in swept if name not in (x, y)]
-        drawings.append((f'heat_map_{y}_{x}', _draw_grids, (table, metrics, x, y, others)))
+        parameters = [name for name in swept if name not in (x, y)]
+        drawings.append((f'heat_map_{y}_{x}', _draw_grids, (table, metrics, x, y, parameters)))
     if {*_SPREAD_COLUMNS} <= {*table} and table['noise_px'].any():
-        others = [name for name in swept if name != 'noise_px']
-        few = [name for name in others if table[name].nunique() <= 2 * _HUES]
+        parameters = [name for name in swept if name != 'noise_px']
+        few = [name for name in parameters if table[name].nunique() <= 2 * _HUES]
         fewest = min(few, key=lambda name: table[name].nunique(), default=None)
         drawings.append(('residuals_and_noise', _draw_spreads, (table, fewest)))
     if runs := _compared_runs(table):
@@ -133,12 +133,12 @@ def _draw_curves(
     merged = [name for name in others if name not in by]
     with _axes(path, len(metrics), 4.2, 3.6) as (figure, axes):
         for axis, metric in zip(axes, metrics, strict=True):
-            found = [
+            error_curves = [
                 curve
                 for curve in curves(table, metric.column, x, by)
                 if all(v in values for v, values in zip(curve.key, looks, strict=True))
             ]
-            for curve in found:
+            for curve in error_curves:
                 place = [values.index(v) for values, v in zip(looks, curve.key, strict=True)]
                 color = _hues(len(looks[0]))[place[0]] if place else OURS
                 middle, low, high = (metric.factor * values for values in curve[2:])
@@ -155,7 +155,9 @@ def _draw_curves(
                     ),
                 )
             _scale_axis(
-                axis, found[0].x, metric.factor * np.concatenate([c.median for c in found])
+                axis,
+                error_curves[0].x,
+                metric.factor * np.concatenate([c.median for c in error_curves]),
             )
             axis.set_xlabel(_label(x))
             axis.set_title(metric.title, loc='left')
@@ -186,13 +188,13 @@ def _draw_grids(
 ) -> None:
     with _axes(path, len(metrics), 4.4, 3.6) as (figure, axes):
         for axis, metric in zip(axes, metrics, strict=True):
-            found = grid(table, metric.column, x, y)
-            values = np.ma.masked_invalid(metric.factor * found.median)
+            medians = grid(table, metric.column, x, y)
+            values = np.ma.masked_invalid(metric.factor * medians.median)
             positive = values.compressed()[values.compressed() > 1e-6]
             wide = positive.size and positive.max() > 30 * positive.min()
             norm = LogNorm(positive.min(), positive.max()) if wide else None
             mesh = axis.imshow(values, origin='lower', aspect='auto', cmap=_COLORS, norm=norm)
-            for set_ticks, cells in ((axis.set_xticks, found.x), (axis.set_yticks, found.y)):
+            for set_ticks, cells in ((axis.set_xticks, medians.x), (axis.set_yticks, medians.y)):
                 step = -(-len(cells) // _TICKS)
                 set_ticks(range(0, len(cells), step), [f'{cell:g}' for cell in cells[::step]])
             axis.tick_params(axis='x', rotation=45)
@@ -236,7 +238,7 @@ def draw_residuals(path: Path, clouds: Sequence[Points], lenses: Sequence[str]) 
     lenses: of each cloud, told apart by color; '' where it is not known.
     """
     names = list(dict.fromkeys(lenses))
-    each = max(1, _CLOUD // len(names))
+    count = max(1, _CLOUD // len(names))
     with picture(path, 8.4, 3.6) as figure:
         axes = figure.subplots(1, 2, sharey=True)
         nearest, farthest = np.inf, 0.0
@@ -244,7 +246,7 @@ def draw_residuals(path: Path, clouds: Sequence[Points], lenses: Sequence[str]) 
             points = np.concatenate(
                 [cloud for cloud, lens in zip(clouds, lenses, strict=True) if lens == name]
             )
-            points = points[:: -(-len(points) // each)]
+            points = points[:: -(-len(points) // count)]
             size = np.hypot(points['du'], points['dv'])
             for axis, x in zip(axes, (np.degrees(points['theta']), points['range']), strict=True):
                 axis.plot(
@@ -286,10 +288,10 @@ def _scale_axis(axis: Any, x: Sequence[float], y: Array) -> None:
             shown = _pick_evenly(sorted(x), _LABELS)
             axis.set_xticks(shown, [f'{value:g}' for value in shown])
             axis.tick_params(axis='x', which='minor', bottom=False, labelbottom=False)
-    known = y[np.isfinite(y) & (y > 1e-6)]
-    if known.size and known.max() > 30 * known.min():
+    positive = y[np.isfinite(y) & (y > 1e-6)]
+    if positive.size and positive.max() > 30 * positive.min():
         axis.set_yscale('log')
-        axis.set_ylim(known.min() / 2, known.max() * 2)
+        axis.set_ylim(positive.min() / 2, positive.max() * 2)
 
 
 def _label(name: str) -> str:

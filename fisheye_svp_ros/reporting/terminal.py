@@ -88,9 +88,9 @@ def draw_or_note(path: Path, draw: Callable[..., None], *arguments: Any) -> bool
 def print_lines(lines: Iterable[str]) -> None:
     """Print sentences, the first as a title, those that are too long for a line hanging."""
     out = console()
-    title, *rest = lines
+    title, *body = lines
     out.print(title)
-    for line in rest:
+    for line in body:
         out.print(Padding(line, (0, 0, 0, 2)))
 
 

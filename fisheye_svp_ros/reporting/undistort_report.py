@@ -163,12 +163,12 @@ def draw_remaining(path: Path, side: Rectification, left: Remaining, what: str) 
 
 def draw_pair(path: Path, left: NDArray[Any], right: NDArray[Any]) -> None:
     """Draw two rectified images side by side, with rows across both."""
-    both = np.concatenate([to_color(left), to_color(right)], axis=1)
-    zoom = min(_MAX_SIZE / both.shape[1], 1.0)
-    both = cv2.resize(both, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA)
-    for row in np.linspace(0, both.shape[0] - 1, _LINES + 2)[1:-1].round().astype(int).tolist():
-        cv2.line(both, (0, row), (both.shape[1] - 1, row), _ORANGE, 1)
-    write_png(path, both)
+    picture = np.concatenate([to_color(left), to_color(right)], axis=1)
+    zoom = min(_MAX_SIZE / picture.shape[1], 1.0)
+    picture = cv2.resize(picture, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA)
+    for row in np.linspace(0, picture.shape[0] - 1, _LINES + 2)[1:-1].round().astype(int).tolist():
+        cv2.line(picture, (0, row), (picture.shape[1] - 1, row), _ORANGE, 1)
+    write_png(path, picture)
 
 
 def _number(value: float, decimals: int) -> str:

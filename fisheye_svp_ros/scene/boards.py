@@ -103,10 +103,10 @@ class BoardTurn(NamedTuple):
         """
         kept = ~(rows & np.isin(table.landmark, self.alone))
         table, rows = table.take(kept), rows[kept]
-        known, rows = table.landmarks(), rows & np.isin(table.landmark, self.landmark)
+        landmarks, rows = table.landmarks(), rows & np.isin(table.landmark, self.landmark)
         landmark, xyz = table.landmark.copy(), table.xyz.copy()
         landmark[rows] = self.partner[np.searchsorted(self.landmark, landmark[rows])]
-        xyz[rows] = known.points[np.searchsorted(known.ids, landmark[rows])]
+        xyz[rows] = landmarks.points[np.searchsorted(landmarks.ids, landmark[rows])]
         return replace(table, landmark=landmark, xyz=xyz)
 
 
@@ -114,9 +114,9 @@ def board_turns(landmarks: Landmarks, board_of: Index) -> list[BoardTurn]:
     """Return every turn of every flat board; board_of (L,): of each landmark."""
     boards = []
     for board in find_boards(landmarks.points, board_of):
-        mine = board_of == board.id
+        on_board = board_of == board.id
         if board.flat:
-            boards += _turns(board, landmarks.ids[mine], landmarks.points[mine])
+            boards += _turns(board, landmarks.ids[on_board], landmarks.points[on_board])
     return boards
 
 

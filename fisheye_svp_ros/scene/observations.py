@@ -38,10 +38,10 @@ class Landmarks:
         """Return the points (..., 3) of `ids` (...), and which of them are known."""
         slot = np.searchsorted(self.ids, ids, sorter=self._order)
         place = self._order[np.minimum(slot, len(self.ids) - 1)]
-        known = np.asarray(self.ids[place] == ids)
+        is_listed = np.asarray(self.ids[place] == ids)
         points = self.points.take(place, axis=0)
-        points[~known] = np.nan
-        return points, known
+        points[~is_listed] = np.nan
+        return points, is_listed
 
     @cached_property
     def _order(self) -> Index:
@@ -326,10 +326,10 @@ def stereo_views(observations: Observations, default_sigma: float = 1.0) -> tupl
     landmarks, slot = np.unique(observations.landmark, return_inverse=True)
     pair = []
     for camera in map(observations.cameras.index, pair_names):
-        mine = np.flatnonzero(observations.camera == camera)
+        rows = np.flatnonzero(observations.camera == camera)
         row = np.full((len(frames), len(landmarks)), -1, dtype=np.int64)
-        row[frame[mine], slot[mine]] = mine
-        twice = mine[row[frame[mine], slot[mine]] != mine]
+        row[frame[rows], slot[rows]] = rows
+        twice = rows[row[frame[rows], slot[rows]] != rows]
         if twice.size:
             raise ObservationError(
                 f'{observations.source}: landmark {observations.landmark[twice[0]]} is listed '
@@ -420,7 +420,7 @@ def frame_names(table: Observations, frame: int, camera: str | None = None) -> l
     names = photograph_names(table)
     here = (table.cameras[i] for i in np.unique(table.camera))
     cameras = here if camera is None else (camera,)
-    listed = [names[frame, one] for one in cameras if (frame, one) in names]
+    listed = [names[frame, camera] for camera in cameras if (frame, camera) in names]
     return listed or [f'frame {frame}' + (f' of {camera}' if camera else '')]
 
 
@@ -434,8 +434,8 @@ def list_frames(table: Observations, frames: Sequence[int], most: int = 10) -> s
 
     Photographs by name; `frames 1, 2 and 3` where no photograph is known.
     """
-    each = [dict.fromkeys(frame_names(table, frame)) for frame in dict.fromkeys(frames)]
-    names = list(dict.fromkeys(name for group in each for name in group))
+    names_by_frame = [dict.fromkeys(frame_names(table, frame)) for frame in dict.fromkeys(frames)]
+    names = list(dict.fromkeys(name for group in names_by_frame for name in group))
     head = ''
     if names and all(name.startswith('frame ') for name in names):
         head = 'frames ' if len(names) > 1 else 'frame '

@@ -44,8 +44,8 @@ def implausible_sigma(sigma: Array) -> Mask:
 
     So large a weight leaves nothing else to be seen.
     """
-    known = sigma[np.isfinite(sigma)]
-    typical = float(np.median(known)) if len(known) else 0.0
+    stated = sigma[np.isfinite(sigma)]
+    typical = float(np.median(stated)) if len(stated) else 0.0
     return np.asarray(sigma < max(_MIN_SIGMA, _MIN_SIGMA_SHARE * typical))
 
 
@@ -109,11 +109,11 @@ def check_rigid(observations: Observations) -> None:
     Landmarks that lie close together in one view then do so in others too, wherever the table says
     that they are and whatever the lens.  This needs no fit: of random image points none ends soon.
     """
-    found = _rigidity(observations)
-    if found is not None and found < _MIN_RIGIDITY:
+    rigidity = _rigidity(observations)
+    if rigidity is not None and rigidity < _MIN_RIGIDITY:
         raise ObservationError(
             f'{observations.source}: landmarks that are close in one frame are not in others '
-            f'(correlation {found:.2f}; of any rigid target at least {_MIN_RIGIDITY:g}); check '
+            f'(correlation {rigidity:.2f}; of any rigid target at least {_MIN_RIGIDITY:g}); check '
             'that image points and landmark numbers belong together, in every frame'
         )
 
@@ -132,17 +132,17 @@ def _rigidity(table: Observations) -> float | None:
     views, view = np.unique(np.stack([table.frame, table.camera]), axis=1, return_inverse=True)
     if views.shape[1] < _RIGID_VIEWS:
         return None
-    some = slot >= 0
+    counted = slot >= 0
     uv = np.full((views.shape[1], len(often), 2), np.nan)
-    uv[view.reshape(-1)[some], slot[some]] = table.uv[some]
+    uv[view.reshape(-1)[counted], slot[counted]] = table.uv[counted]
     one, other = np.triu_indices(len(often), 1)
     length = np.log(np.maximum(np.linalg.norm(uv[:, one] - uv[:, other], axis=-1), _COINCIDENT))
-    known = np.isfinite(length)
-    length = np.where(known, length, 0.0)
-    length -= known * (length.sum(axis=1) / np.maximum(known.sum(axis=1), 1))[:, None]
+    measured = np.isfinite(length)
+    length = np.where(measured, length, 0.0)
+    length -= measured * (length.sum(axis=1) / np.maximum(measured.sum(axis=1), 1))[:, None]
     length = np.clip(length, -1.0, 1.0)  # few points that coincide, or are far off, decide nothing
-    elsewhere = (length.sum(axis=0) - length) / np.maximum(known.sum(axis=0) - 1, 1)
-    shared = known & (known.sum(axis=0) > 1)
+    elsewhere = (length.sum(axis=0) - length) / np.maximum(measured.sum(axis=0) - 1, 1)
+    shared = measured & (measured.sum(axis=0) > 1)
     if shared.sum() < _RIGID_PAIRS or not np.ptp(elsewhere[shared]):
         return None
     return float(np.corrcoef(length[shared], elsewhere[shared])[0, 1])
@@ -150,10 +150,10 @@ def _rigidity(table: Observations) -> float | None:
 
 def is_another_target(observations: Observations, other: Observations) -> bool:
     """Whether landmarks of one number stand in different places of two tables."""
-    one, there = observations.landmarks(), other.landmarks()
-    _, mine, theirs = np.intersect1d(one.ids, there.ids, return_indices=True)
-    apart = np.abs(one.points[mine] - there.points[theirs])
-    return bool(apart.max(initial=0.0) > _PLACE_TOLERANCE * np.ptp(one.points, axis=0).max())
+    landmarks, other_landmarks = observations.landmarks(), other.landmarks()
+    _, rows, theirs = np.intersect1d(landmarks.ids, other_landmarks.ids, return_indices=True)
+    apart = np.abs(landmarks.points[rows] - other_landmarks.points[theirs])
+    return bool(apart.max(initial=0.0) > _PLACE_TOLERANCE * np.ptp(landmarks.points, axis=0).max())
 
 
 def dither(table: Observations) -> Observations:
@@ -237,5 +237,5 @@ def looks_side_by_side(table: Observations, size: tuple[int, int]) -> bool:
 
 def _chance(center: Array, left: Mask) -> float:
     """Return how often places (F,), spread evenly over 0 to 1, leave such a gap at a half."""
-    gap, others = center[~left].min() - center[left].max(), len(center) - 1
-    return float((1 - gap) ** others * (1 + others * gap))
+    gap, count = center[~left].min() - center[left].max(), len(center) - 1
+    return float((1 - gap) ** count * (1 + count * gap))

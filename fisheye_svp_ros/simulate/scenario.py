@@ -182,11 +182,11 @@ def _simulate_rig(scenario: Scenario, poses: Pose, rng: np.random.Generator) -> 
     names, lenses, places = scenario_cameras(scenario.rig_file)
     lenses = tuple(_scale_shift(lens, scenario.shift_scale) for lens in lenses)
     landmarks, count = scenario_landmarks(scenario), len(poses.position)
-    each = tuple(poses.compose(places.take(i).broadcast_to(count)) for i in range(len(names)))
+    posed = tuple(poses.compose(places.take(i).broadcast_to(count)) for i in range(len(names)))
     seen = simulate_rig(
-        [ForwardModel(lens) for lens in lenses], landmarks, each, scenario.noise_px, rng, names
+        [ForwardModel(lens) for lens in lenses], landmarks, posed, scenario.noise_px, rng, names
     )
-    return Simulation(lenses[0], landmarks, seen, each, None, lenses)
+    return Simulation(lenses[0], landmarks, seen, posed, None, lenses)
 
 
 def scenario_cameras(rig: str) -> tuple[tuple[str, ...], tuple[Lens, ...], Pose]:
@@ -332,8 +332,8 @@ def _interpolate_poses(poses: Pose, steps: int, numbers: Index) -> Pose:
         rotation_from_vector(part * turn) @ before.rotation,
         before.position + part * (after.position - before.position),
     )
-    there = numbers >= last * steps
-    way.rotation[there], way.position[there] = poses.rotation[last], poses.position[last]
+    done = numbers >= last * steps
+    way.rotation[done], way.position[done] = poses.rotation[last], poses.position[last]
     return way
 
 
@@ -367,12 +367,12 @@ def simulate_batches(scenarios: Sequence[Scenario], first: int) -> Iterator[Scen
     Raises FisheyeSvpError as `simulate_scenario` does.
     """
     groups: dict[tuple[object, ...], list[_ScenarioScene]] = {}
-    known: dict[tuple[object, ...], Pose] = {}
+    cache: dict[tuple[object, ...], Pose] = {}
     for row, scenario in enumerate(scenarios):
         where = (scenario.poses, scenario.poses_file, scenario.trajectory_steps, scenario.baseline)
-        if where not in known:
-            known[where] = scenario_poses(scenario)
-        scene = _ScenarioScene(row, scenario, scenario_landmarks(scenario), known[where])
+        if where not in cache:
+            cache[where] = scenario_poses(scenario)
+        scene = _ScenarioScene(row, scenario, scenario_landmarks(scenario), cache[where])
         shape = len(scene.landmarks.ids), len(scene.poses.position)
         key = (scenario.lens, scenario.shift_scale, scenario.style == MONO, *shape)
         groups.setdefault(key, []).append(scene)

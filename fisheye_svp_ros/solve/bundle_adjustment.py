@@ -204,11 +204,11 @@ def adjust_lens_from(
         RigState(
             pose.take(i),
             identity(1),
-            lens.with_parameters(names, one.tolist()),
+            lens.with_parameters(names, value.tolist()),
             (),
             corrected=True,
         )
-        for i, one in enumerate(values)
+        for i, value in enumerate(values)
     ]
     problem = Adjustment(RigViews.of_one_camera(views), states[0], names)
     solved: Minimum = levenberg_marquardt(problem, problem.pack(states), max_iterations)
@@ -347,10 +347,10 @@ class Adjustment:
         if prior.rig is not None:
             off, columns = _pose_rows(prior.rig, state.rig.take(np.s_[1:]))
             cost = cost + (off**2).sum()
-            for i, (one, row) in enumerate(zip(columns, off, strict=True)):
-                mine = slice(6 * i, 6 * i + 6)
-                shared[mine, mine] += one.T @ one
-                shared_gradient[mine] += row @ one
+            for i, (column, row) in enumerate(zip(columns, off, strict=True)):
+                slots = slice(6 * i, 6 * i + 6)
+                shared[slots, slots] += column.T @ column
+                shared_gradient[slots] += row @ column
         return cost, normal
 
 

@@ -38,14 +38,14 @@ def find_frame_groups(
     No groups are returned where a fifth of the views is in none.
     """
     count, groups = len(views.frame), list[Index]()
-    rest = np.arange(count)
-    while len(rest) >= MIN_GROUP and len(groups) < _MAX_GROUPS:
-        group = _find_group(views, rest, image_size, noise_px, orders)
+    ungrouped = np.arange(count)
+    while len(ungrouped) >= MIN_GROUP and len(groups) < _MAX_GROUPS:
+        group = _find_group(views, ungrouped, image_size, noise_px, orders)
         if not len(group):
             break
         groups.append(group)
-        rest = np.setdiff1d(rest, group)
-    return groups if len(groups) > 1 and len(rest) <= count // 5 else []
+        ungrouped = np.setdiff1d(ungrouped, group)
+    return groups if len(groups) > 1 and len(ungrouped) <= count // 5 else []
 
 
 def _find_group(
@@ -89,7 +89,7 @@ def _seeds(rest: Index, orders: Sequence[Array]) -> Iterator[Index]:
     rng = np.random.default_rng(0)
     while len(groups) < _MAX_SEEDS:
         groups.append(tuple(rng.choice(rest, min(_SEED, len(rest)), replace=False)))
-    for seed in dict.fromkeys(tuple(sorted(one)) for one in groups):
+    for seed in dict.fromkeys(tuple(sorted(group)) for group in groups):
         yield np.array(seed)
 
 
@@ -106,12 +106,12 @@ def _fit_lens(views: Views, image_size: tuple[int, int]) -> tuple[Lens | None, f
         start = replace(bare, cx=center[0], cy=center[1])
         try:
             with np.errstate(all='ignore'):
-                found = fit_lens(start, views, _CURVE)
+                fitted = fit_lens(start, views, _CURVE)
         except (FisheyeSvpError, np.linalg.LinAlgError):
             continue
-        rms = float(np.sqrt(np.nanmean((found.residual**2).sum(axis=-1))))
+        rms = float(np.sqrt(np.nanmean((fitted.residual**2).sum(axis=-1))))
         if rms < best[1]:
-            best = found.lens, rms
+            best = fitted.lens, rms
     return best
 
 

@@ -211,9 +211,11 @@ def fit_hand_eye(
     """
     linear = Linearization(data, state, free)
     unknowns = 6 * data.frames + linear.shared_columns.shape[-1]
-    given = bool(np.isfinite(data.observations.sigma).all())
+    sigma_stated = bool(np.isfinite(data.observations.sigma).all())
     sigma = (
-        1.0 if given else noise_sigma(linear.sum_of_squares, int(linear.row_mask.sum()), unknowns)
+        1.0
+        if sigma_stated
+        else noise_sigma(linear.sum_of_squares, int(linear.row_mask.sum()), unknowns)
     )
     start, robot, noise, odds = _likelier_arrangement(state.pose, flange, known, sigma)
     _check_noise(noise, state.pose.take(known), odds)
@@ -222,8 +224,8 @@ def fit_hand_eye(
         lens = _LensKnowledge.instead_of_images(data, state, free, lens_covariance / sigma**2)
     for _ in range(_ROUNDS):
         problem = _HandEyeAdjustment(data, state, free, robot, noise, lens)
-        found = levenberg_marquardt(problem, problem.pack_all(state, start))
-        state, start = problem.unpack(found.state), problem.transforms(found.state, 0)
+        minimum = levenberg_marquardt(problem, problem.pack_all(state, start))
+        state, start = problem.unpack(minimum.state), problem.transforms(minimum.state, 0)
         before, noise = noise, problem.estimate_noise(state, start)
         if np.abs(noise / before - 1).max() < _TOLERANCE or (noise <= _MIN_NOISE).all():
             break
@@ -264,14 +266,14 @@ def _likelier_arrangement(
         off = robot.residual(start, camera)[known].reshape(-1, 2, 3)
         noise = np.maximum(np.sqrt((off**2).mean(axis=(0, 2))), _MIN_NOISE)
         # Of the robot, in its own lengths: a scale near zero would explain any position.
-        own = noise / [max(abs(start.scale), _MIN_NOISE), 1.0]
-        starts.append((-freedom * float(np.log(own).sum()), start, robot, noise))
+        relative = noise / [max(abs(start.scale), _MIN_NOISE), 1.0]
+        starts.append((-freedom * float(np.log(relative).sum()), start, robot, noise))
     if not starts:
         assert problem is not None
         raise problem
     likelihood, start, robot, noise = max(starts, key=lambda one: one[0])
-    other = min(one[0] for one in starts) if len(starts) > 1 else -np.inf
-    odds = min(float(np.exp(min(likelihood - other, 100.0))), MAX_ODDS)
+    runner_up = min(start[0] for start in starts) if len(starts) > 1 else -np.inf
+    odds = min(float(np.exp(min(likelihood - runner_up, 100.0))), MAX_ODDS)
     return start, robot, noise, odds
 
 
@@ -304,26 +306,26 @@ class _Robot(NamedTuple):
     def residual(self, transforms: Transforms, camera: Pose) -> Array:
         """Return flange by the images minus flange by the robot (F, 6), zero where unknown."""
         stated = Pose(self.flange.rotation, transforms.scale * self.flange.position)
-        found = transforms.flange(camera)
-        off = (found.inverse() if self.fixed_camera else found).difference(stated)
+        flange = transforms.flange(camera)
+        off = (flange.inverse() if self.fixed_camera else flange).difference(stated)
         return np.where(self.known[:, None], off, 0.0)
 
     def columns(self, transforms: Transforms, camera: Pose) -> tuple[Array, Array]:
         """Return derivatives (F, 6, 6) by the camera's pose and (F, 6, 13) by what is shared."""
-        found = transforms.flange(camera)
-        base = np.broadcast_to(transforms.target.rotation, found.rotation.shape)
-        lever = cross_matrix(found.rotation @ transforms.camera.position)
+        flange = transforms.flange(camera)
+        base = np.broadcast_to(transforms.target.rotation, flange.rotation.shape)
+        lever = cross_matrix(flange.rotation @ transforms.camera.position)
         frame = np.zeros((len(base), 6, 6))
         frame[:, :3, :3], frame[:, :3, 3:], frame[:, 3:, 3:] = base, lever @ base, base
         shared = np.zeros((len(base), 6, PARAMETERS))
-        shared[:, :3, :3] = -found.rotation
-        shared[:, :3, 3:6] = -found.rotation @ cross_matrix(transforms.camera.position)
-        shared[:, 3:, 3:6] = -found.rotation
+        shared[:, :3, :3] = -flange.rotation
+        shared[:, :3, 3:6] = -flange.rotation @ cross_matrix(transforms.camera.position)
+        shared[:, 3:, 3:6] = -flange.rotation
         shared[:, :3, 6:9] = np.eye(3)
-        shared[:, :3, 9:12] = -cross_matrix(found.position - transforms.target.position)
+        shared[:, :3, 9:12] = -cross_matrix(flange.position - transforms.target.position)
         shared[:, 3:, 9:12] = np.eye(3)
         if self.fixed_camera:
-            inverse = _inverse_derivative(found)
+            inverse = _inverse_derivative(flange)
             frame, shared = inverse @ frame, inverse @ shared
         turned = log_derivative(self.residual(transforms, camera)[:, 3:])
         frame[:, 3:], shared[:, 3:] = turned @ frame[:, 3:], turned @ shared[:, 3:]
@@ -394,8 +396,8 @@ class _HandEyeAdjustment(Adjustment):
 
     def pack_all(self, state: RigState, transforms: Transforms) -> Arrays:
         """Return a state and the transforms, which come last."""
-        own = (*transforms.camera, *transforms.target, np.array([transforms.scale]))
-        return (*self.pack([state]), *(part[None] for part in own))
+        parts = (*transforms.camera, *transforms.target, np.array([transforms.scale]))
+        return (*self.pack([state]), *(part[None] for part in parts))
 
     def unpack(self, packed: Arrays, system: int = 0) -> RigState:
         return super().unpack(packed[:5], system)
@@ -421,16 +423,16 @@ class _HandEyeAdjustment(Adjustment):
         frame, shared = self._robot.columns(transforms, state.pose)
         blocks = equations.blocks[0]
         inverse = np.linalg.inv(blocks)
-        rest = -frame @ inverse @ equations.cross[0]
-        rest[..., -PARAMETERS:] += shared
+        coupled = -frame @ inverse @ equations.cross[0]
+        coupled[..., -PARAMETERS:] += shared
         whole = arrow_covariance(tuple(equations)).shared[0]
         variance = frame @ inverse @ np.swapaxes(frame, -1, -2)
-        variance = variance + rest @ whole @ np.swapaxes(rest, -1, -2)
+        variance = variance + coupled @ whole @ np.swapaxes(coupled, -1, -2)
         leverage = np.diagonal(variance, axis1=-2, axis2=-1) * self._weight**2
         residual = self._robot.residual(transforms, state.pose)
-        known = self._robot.known
-        freedom = (1 - leverage[known]).reshape(-1, 2, 3).sum(axis=(0, 2))
-        squares = (residual[known] ** 2).reshape(-1, 2, 3).sum(axis=(0, 2))
+        has_flange = self._robot.known
+        freedom = (1 - leverage[has_flange]).reshape(-1, 2, 3).sum(axis=(0, 2))
+        squares = (residual[has_flange] ** 2).reshape(-1, 2, 3).sum(axis=(0, 2))
         return np.asarray(np.maximum(np.sqrt(squares / np.maximum(freedom, 1e-3)), _MIN_NOISE))
 
     def covariance(self, state: RigState, transforms: Transforms) -> Array:
@@ -438,10 +440,10 @@ class _HandEyeAdjustment(Adjustment):
         normal = self._joint(state, transforms)[1]
         information = arrow_information(normal)[0]
         scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-        own = information[-PARAMETERS:, -PARAMETERS:] / np.outer(
+        relative = information[-PARAMETERS:, -PARAMETERS:] / np.outer(
             scale[-PARAMETERS:], scale[-PARAMETERS:]
         )
-        if np.linalg.eigvalsh(own)[0] < _MIN_EIGENVALUE:
+        if np.linalg.eigvalsh(relative)[0] < _MIN_EIGENVALUE:
             raise GeometryError(
                 'the poses of the robot do not determine the hand-eye transform; '
                 'turn the flange about two axes or more, and move it'
@@ -481,8 +483,8 @@ def flange_poses(data: RigViews, poses: dict[int, Pose]) -> tuple[Pose, Mask]:
     A frame that the first camera did not see, of cameras that no rig holds together, has none.
     """
     numbers = data.frame_numbers.tolist()
-    known = np.array([number in poses for number in numbers])
+    has_pose = np.array([number in poses for number in numbers])
     if data.frames > len(set(numbers)):
-        known &= np.isin(np.arange(data.frames), data.frame_of[data.camera_of == 0])
+        has_pose &= np.isin(np.arange(data.frames), data.frame_of[data.camera_of == 0])
     missing = Pose(np.eye(3), np.zeros(3))
-    return Pose.stack([poses.get(number, missing) for number in numbers]), known
+    return Pose.stack([poses.get(number, missing) for number in numbers]), has_pose

@@ -61,9 +61,12 @@ def initial_poses(points: Array, direction: Array, weight: Array, spread: bool =
     rows = np.flatnonzero(error > _DOUBTFUL) if spread else np.empty(0, dtype=np.int64)
     if rows.size:
         turns = np.broadcast_to(_cube_turns(), (len(rows), 24, 3, 3))
-        other = _best_turn(turns, problem.take(rows), _MORE_STEPS)
-        better = other[2] < error[rows]
-        rotation[rows[better]], translation[rows[better]] = other[0][better], other[1][better]
+        mirrored = _best_turn(turns, problem.take(rows), _MORE_STEPS)
+        better = mirrored[2] < error[rows]
+        rotation[rows[better]], translation[rows[better]] = (
+            mirrored[0][better],
+            mirrored[1][better],
+        )
     return problem.camera(rotation, translation)
 
 

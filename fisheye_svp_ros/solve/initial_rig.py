@@ -28,15 +28,15 @@ def initial_state(data: RigViews, lens: Lens, others: Sequence[Lens] = ()) -> Ri
     effects of the state.
     Raises GeometryError, naming the frame, where a view has too few points.
     """
-    models = [ForwardModel(one) for one in (lens, *others)]
+    models = [ForwardModel(other_lens) for other_lens in (lens, *others)]
     labels = data.observations.cameras if others else ('',)
     terms = models[0].terms_for(data.views)
     of_target = terms[len(models[0].terms) :]
     if others:
         terms = (*_camera_terms(labels, models), *of_target)
     bare = [
-        replace(one, corrections={}, target={} if of_target else one.target)
-        for one in (lens, *others)
+        replace(other_lens, corrections={}, target={} if of_target else other_lens.target)
+        for other_lens in (lens, *others)
     ]
     state = RigState(
         identity(data.frames), identity(data.cameras), bare[0], terms, tuple(bare[1:]), labels
@@ -55,11 +55,11 @@ def localize_frames(data: RigViews, known: RigState) -> RigState:
 
 def localize_cameras(model: ForwardModel, views: Views, start: Pose | None = None) -> Pose:
     """Return the pose of every view, by the lens of its camera; raises as `localize` does."""
-    found = identity(len(views.frame))
-    for rows, _, one in model.split(views):
+    poses = identity(len(views.frame))
+    for rows, _, camera_model in model.split(views):
         near = None if start is None else start.take(rows)
-        found.put(rows, localize(one, views.take(rows), near).pose)
-    return found
+        poses.put(rows, localize(camera_model, views.take(rows), near).pose)
+    return poses
 
 
 def prediction_distances(model: ForwardModel, pose: Pose, views: Views) -> Array:
@@ -74,9 +74,9 @@ def _camera_terms(labels: Sequence[str], models: Sequence[ForwardModel]) -> list
     for i, (label, model) in enumerate(zip(labels, models, strict=True)):
         for term in model.terms:
             effect, values = assign_camera(term.effect, i, label), term.values
-            if known := held.get(term.name):
-                effect = known.effect.merge_with(effect)
-                values = np.concatenate([known.values, values])
+            if held_values := held.get(term.name):
+                effect = held_values.effect.merge_with(effect)
+                values = np.concatenate([held_values.values, values])
             held[term.name] = ModelTerm(effect, values)
     return list(held.values())
 
@@ -87,16 +87,18 @@ def _rig_from_frames(data: RigViews, model: ForwardModel, solved: Pose) -> Pose:
     body = identity(data.frames) if data.poses is None else data.poses
     placed[:] = data.poses is not None
     for camera in range(data.cameras):
-        mine = np.flatnonzero(data.camera_of == camera)
-        frames = data.frame_of[mine]
+        rows = np.flatnonzero(data.camera_of == camera)
+        frames = data.frame_of[rows]
         shared = placed[frames]
         if camera and shared.any():
-            seen, views = body.take(frames[shared]), data.views.take(mine[shared])
-            relative = seen.inverse().compose(solved.take(mine[shared]))
+            seen, views = body.take(frames[shared]), data.views.take(rows[shared])
+            relative = seen.inverse().compose(solved.take(rows[shared]))
             rig.put(camera, relative.take(_best_rig(model, views, seen, relative)))
         new = ~shared
-        own = solved.take(mine[new]).compose(rig.take([camera] * int(new.sum())).inverse())
-        body.put(frames[new], own)
+        rig_in_world = solved.take(rows[new]).compose(
+            rig.take([camera] * int(new.sum())).inverse()
+        )
+        body.put(frames[new], rig_in_world)
         placed[frames] = True
     return rig
 

@@ -108,11 +108,11 @@ def levenberg_marquardt(
             damping[active], growth[active], better, before - cost, moved
         )
         active = active[damping[active] < STUCK]
-    rest = np.flatnonzero(~converged & np.isfinite(total))
-    if rest.size:
+    unconverged = np.flatnonzero(~converged & np.isfinite(total))
+    if unconverged.size:
         # Some effects have derivatives that are not exact: no step keeps what it promises.
-        _, moved = problem.step(_take_rows(normal, rest), np.zeros(len(rest)))
-        converged[rest] = moved <= _STALL_TOLERANCE * total[rest]
+        _, moved = problem.step(_take_rows(normal, unconverged), np.zeros(len(unconverged)))
+        converged[unconverged] = moved <= _STALL_TOLERANCE * total[unconverged]
     return Minimum(state, total, converged, iterations, normal)
 
 
@@ -288,8 +288,8 @@ def _eliminate(scaled: ArrowEquations) -> tuple[Array, Array]:
     """Return blocks^-1 [cross, gradient] (S, V, B, K + 1) and the Schur complement (S, K, K)."""
     right = np.concatenate([scaled.cross, scaled.block_gradient[..., None]], axis=-1)
     eliminated = never_singular(lambda h: np.linalg.solve(h, right), scaled.blocks)
-    known = np.einsum('svbk,svbl->skl', scaled.cross, eliminated[..., :-1])
-    reduced = scaled.shared - known
+    explained = np.einsum('svbk,svbl->skl', scaled.cross, eliminated[..., :-1])
+    reduced = scaled.shared - explained
     return eliminated, (reduced + np.swapaxes(reduced, -1, -2)) / 2
 
 

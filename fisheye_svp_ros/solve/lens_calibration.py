@@ -322,8 +322,8 @@ def fit_lens(start: Lens, views: Views, names: tuple[str, ...]) -> AdjustedLens:
     """Scan the focal length, adjust the best candidates to few points, then to everything."""
     shift = start.viewpoint_shift
     port_names = tuple(name for name in names if name in start.port_names)
-    other = (*port_names, *(() if shift is None else shift.coefficient_names))
-    svp_names = tuple(name for name in names if name not in other)
+    names_beyond = (*port_names, *(() if shift is None else shift.coefficient_names))
+    svp_names = tuple(name for name in names if name not in names_beyond)
     few = select_points(views)
     focals, pose = focal_candidates(start.svp(), few, _CANDIDATES)
     values = np.tile(parameter_values(start, svp_names), (len(focals), 1))

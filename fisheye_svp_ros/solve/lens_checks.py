@@ -114,14 +114,14 @@ def extrapolated_points(lens: Lens, uv: Array) -> ExtrapolatedPoints | None:
 
     None where none does, or where nobody says how far the lens was calibrated.
     """
-    known = lens.calibrated_angle
-    if known is None:
+    angle = lens.calibrated_angle
+    if angle is None:
         return None
     height = np.hypot((uv[:, 0] - lens.cx) / lens.fx, (uv[:, 1] - lens.cy) / lens.fy)
-    limit, _ = lens.image_height.value_and_slope(np.asarray(known + _ANGLE_SLACK))
+    limit, _ = lens.image_height.value_and_slope(np.asarray(angle + _ANGLE_SLACK))
     beyond = height > limit
     if not beyond.any():
         return None
     edge, _ = lens.image_height.value_and_slope(np.asarray(lens.max_incidence))
     farthest = lens.image_height.angle(np.minimum(height[beyond].max(), edge))
-    return ExtrapolatedPoints(float(beyond.mean()), float(farthest), known)
+    return ExtrapolatedPoints(float(beyond.mean()), float(farthest), angle)

@@ -47,14 +47,14 @@ def compare_lenses(one: Lens, other: Lens, ranges: Sequence[float] = RANGES) -> 
         )
     uv = _image_grid(one)
     rays = [back_project_corrected(lens, uv) for lens in (one, other)]
-    there = rays[0].valid & rays[1].valid
-    if there.sum() < _FEWEST:
+    seen = rays[0].valid & rays[1].valid
+    if seen.sum() < _FEWEST:
         raise LensError(
-            f'{one.name!r} and {other.name!r} have rays of {there.sum()} common image points; '
+            f'{one.name!r} and {other.name!r} have rays of {seen.sum()} common image points; '
             'lenses of one camera are compared'
         )
     (origin, direction), other_rays = (
-        (one_lens.origin[there], one_lens.direction[there]) for one_lens in rays
+        (one_lens.origin[seen], one_lens.direction[seen]) for one_lens in rays
     )
     points, motion = points_at(origin, direction, ranges), identity()
     for _ in range(_MAX_ITERATIONS):
@@ -64,7 +64,7 @@ def compare_lenses(one: Lens, other: Lens, ranges: Sequence[float] = RANGES) -> 
             break
     change = _move(motion, *other_rays, ranges) - points
     angle = np.linalg.norm(without_motion(points, change), axis=-1)
-    return LensComparison(uv[there], rays[0].theta[there], angle, motion)
+    return LensComparison(uv[seen], rays[0].theta[seen], angle, motion)
 
 
 def _image_grid(lens: Lens) -> Array:

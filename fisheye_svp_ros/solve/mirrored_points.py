@@ -56,16 +56,16 @@ def mirror_by_lens(views: Views, lens: Lens) -> Mirror | None:
     few = select_points(views, _VIEWS)
     flipped = few.uv * [1.0, -1.0] + [0.0, lens.height - 1.0]
     images = {Mirror.V_UPWARDS: flipped, Mirror.UV_EXCHANGED: few.uv[..., ::-1]}
-    given = _median_rms(lens, few)
+    rms_given = _median_rms(lens, few)
     rms = {kind: _median_rms(lens, few._replace(uv=uv)) for kind, uv in images.items()}
     best = min(rms, key=lambda kind: rms[kind])
-    return best if given > max(_MIN_RMS, _MIN_GAIN * rms[best]) else None
+    return best if rms_given > max(_MIN_RMS, _MIN_GAIN * rms[best]) else None
 
 
 def _median_rms(lens: Lens, views: Views) -> float:
     residual = np.where(views.used[..., None], localize_views(lens, views).residual, np.nan)
-    each = [rms_px(one) if np.isfinite(one).any() else np.inf for one in residual]
-    return float(np.median(each))
+    rms_by_view = [rms_px(one) if np.isfinite(one).any() else np.inf for one in residual]
+    return float(np.median(rms_by_view))
 
 
 def _are_all_from_behind(views: Views) -> bool:

@@ -197,12 +197,15 @@ def cross_camera_offsets(data: RigViews, state: RigState, alone: Pose) -> tuple[
     for step in range(1, data.cameras):
         # From another view of the same frame: views are in the order of frames.
         other = np.arange(len(views.frame))
-        for mine in (np.flatnonzero(data.frame_of == f) for f in range(data.frames)):
-            other[mine] = np.roll(mine, step)
+        for frame_views in (np.flatnonzero(data.frame_of == f) for f in range(data.frames)):
+            other[frame_views] = np.roll(frame_views, step)
         offset = prediction_distances(model, body.take(other).compose(place), views)
         median = np.nanmedian(np.minimum(offset, UNSEEN_PX), axis=1)
-        mine = (other != np.arange(len(other))) & (median < misfit)
-        apart[mine], misfit[mine] = np.nan_to_num(offset[mine], posinf=UNSEEN_PX), median[mine]
+        frame_views = (other != np.arange(len(other))) & (median < misfit)
+        apart[frame_views], misfit[frame_views] = (
+            np.nan_to_num(offset[frame_views], posinf=UNSEEN_PX),
+            median[frame_views],
+        )
     return misfit, apart
 
 
@@ -234,14 +237,14 @@ def _find_swaps(model: ForwardModel, pose: Pose, views: Views, far: Mask, gate: 
             uv=np.zeros((1, len(ids), 2)),
             row=np.arange(len(ids))[None],
         )
-        here = pose.take(slice(view, view + 1))
-        seen = model.linearize(here, single).uv[0]
+        view_pose = pose.take(slice(view, view + 1))
+        seen = model.linearize(view_pose, single).uv[0]
         for point in np.flatnonzero(far[view]):
-            other = ids != views.landmark[view, point]
+            is_another = ids != views.landmark[view, point]
             off = np.linalg.norm(seen - views.uv[view, point], axis=-1)
-            swapped[view, point] = bool(np.nanmin(np.where(other, off, np.inf)) < gate)
-            reach = 2 * off[~other]
-            around = other & (np.linalg.norm(seen - seen[~other], axis=-1) < reach)
+            swapped[view, point] = bool(np.nanmin(np.where(is_another, off, np.inf)) < gate)
+            reach = 2 * off[~is_another]
+            around = is_another & (np.linalg.norm(seen - seen[~is_another], axis=-1) < reach)
             by_chance += float(np.nan_to_num(around.sum() * (gate / reach) ** 2).sum())
     return np.asarray(swapped & (special.pdtrc(swapped.sum() - 1, by_chance) < _SWAP_CHANCE))
 
@@ -265,6 +268,6 @@ def _landmark_scale(views: Views, offset: Array) -> Array:
     """Robust standard deviations (S, N) of a coordinate, one a landmark."""
     scale = np.zeros_like(offset)
     for landmark in np.unique(views.landmark[views.used]):
-        mine = views.used & (views.landmark == landmark)
-        scale[mine] = np.median(offset[mine]) / MEDIAN_NORM
+        sightings = views.used & (views.landmark == landmark)
+        scale[sightings] = np.median(offset[sightings]) / MEDIAN_NORM
     return scale

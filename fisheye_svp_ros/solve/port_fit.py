@@ -42,8 +42,8 @@ def start_port(data: RigViews, lens: Lens) -> Lens | None:
         tried.append((Linearization(few, state, PORT_PLACE).sum_of_squares, state.lens))
     if not tried or not np.isfinite(min(cost for cost, _ in tried)):
         return None
-    found = min(tried, key=lambda one: one[0])[1]
-    return replace(lens, port=found.port)
+    best = min(tried, key=lambda one: one[0])[1]
+    return replace(lens, port=best.port)
 
 
 def fit_port(
@@ -67,8 +67,8 @@ def fit_port(
         state, names = freed, (*PORT_PLACE, MEDIUM_INDEX)
     freed, errors, gain = _free_names(data, state, (*names, THICKNESS))
     # Glass of no thickness is part of the distance.
-    there = is_glass(freed.lens.parameters[THICKNESS])
-    if there and gain > np.log(2 * len(data.observations)):
+    has_glass = is_glass(freed.lens.parameters[THICKNESS])
+    if has_glass and gain > np.log(2 * len(data.observations)):
         state, names = freed, (*names, THICKNESS)
     if Linearization(data, state, ()).rms_px > LOST_PX:
         return None
@@ -96,7 +96,7 @@ def _free_names(
 def fit_free_curve(data: RigViews, base: RigState) -> RigState:
     """Return the fit of a lens curve and a center of any kind, in air."""
     theta = Linearization(data, base, ()).scene.theta_max
-    known = [t for t in base.terms if t.name != RadialProfileEffect.name]
+    terms = [t for t in base.terms if t.name != RadialProfileEffect.name]
     effect = RadialProfileEffect(CURVE_TERMS, round(theta, 6))
-    free = replace(base, terms=(*known, ModelTerm(effect, np.zeros(CURVE_TERMS))))
+    free = replace(base, terms=(*terms, ModelTerm(effect, np.zeros(CURVE_TERMS))))
     return adjust(data, free, INTRINSICS)

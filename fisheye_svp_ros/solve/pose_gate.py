@@ -67,8 +67,8 @@ def weakness(pose: GatedPose, limits: GateLimits) -> str:
         ('m', 'rad'),
         strict=True,
     ):
-        known = np.isfinite(block).all()
-        size = float(np.sqrt(np.linalg.eigvalsh(block)[-1])) if known else np.inf
+        finite = np.isfinite(block).all()
+        size = float(np.sqrt(np.linalg.eigvalsh(block)[-1])) if finite else np.inf
         if most and not size <= most:
             return f'standard deviation {size:.2g} {unit}, above {name} ({most:g})'
     return ''
@@ -99,32 +99,32 @@ class OdometryGate:
 
     def judge(self, pose: GatedPose, odometry: Pose) -> Verdict:
         """Return what the poses before say of one; odometry: the base in the odometry's frame."""
-        known, limits = [*self._history], self._limits
+        history, limits = [*self._history], self._limits
         way, angle = 0.0, 0.0
-        if known:
-            last = known[-1]
+        if history:
+            last = history[-1]
             turn = vector_from_rotation(odometry.rotation @ last.odometry.rotation.T)
             way = last.way + float(np.linalg.norm(odometry.position - last.odometry.position))
             angle = last.angle + float(np.linalg.norm(turn))
-        now = _Known(pose, odometry, way, angle)
-        self._history.append(now)
+        current = _Known(pose, odometry, way, angle)
+        self._history.append(current)
         if not limits.max_innovation:
             return Verdict()
-        carried = [self._carry(one, now) for one in known]
-        off = np.array([_sigmas(pose, *one) for one in carried])
+        carried = [self._carry(before, current) for before in history]
+        off = np.array([_sigmas(pose, *before) for before in carried])
         agree = off <= limits.max_innovation
-        if known and 2 * np.count_nonzero(agree) <= len(agree):
+        if history and 2 * np.count_nonzero(agree) <= len(agree):
             return Verdict(
                 f'{np.median(off):.3g} sigmas off where odometry has it (max_innovation '
                 f'{limits.max_innovation:g})'
             )
-        wrong = np.array([_wrong_beside(pose, *one) for one in carried])
+        wrong = np.array([_wrong_beside(pose, *before) for before in carried])
         unconfirmed = [
             tag
             for tag, odds in sorted(pose.suspects.items())
             if not any(
-                odds * share <= MIN_ODDS and tag not in one.pose.suspects
-                for one, share in zip(known, wrong, strict=True)
+                odds * share <= MIN_ODDS and tag not in before.pose.suspects
+                for before, share in zip(history, wrong, strict=True)
             )
         ]
         if unconfirmed:
@@ -135,9 +135,9 @@ class OdometryGate:
     def _carry(self, before: _Known, now: _Known) -> tuple[Pose, Array]:
         """Return where odometry carries a pose, and the covariance (6, 6) of that."""
         moved = before.odometry.inverse().compose(now.odometry)
-        there, covariance = carried_pose(before.pose.base, before.pose.covariance, moved)
+        carried, covariance = carried_pose(before.pose.base, before.pose.covariance, moved)
         drift = np.repeat([now.way - before.way, now.angle - before.angle], 3)
-        return there, covariance + np.diag((self._limits.odom_error * drift) ** 2)
+        return carried, covariance + np.diag((self._limits.odom_error * drift) ** 2)
 
 
 def _sigmas(pose: GatedPose, there: Pose, covariance: Array) -> float:

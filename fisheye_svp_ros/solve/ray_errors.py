@@ -173,7 +173,7 @@ def ray_model(
     """
     count = len(covariance)
     base = points_on_rays(lens_of(np.zeros(count)), uv, ranges)
-    there = np.isfinite(base).all(axis=(0, 2))
+    visible = np.asarray(np.isfinite(base).all(axis=(0, 2)))
     sides = []
     variance = np.maximum(np.diag(covariance), 0.0)
     if others is not None:
@@ -184,19 +184,19 @@ def ray_model(
         if not step.any():
             sides.append(np.zeros_like(base))
             continue
-        one, other = (points_on_rays(lens_of(sign * step), uv, ranges) for sign in (1, -1))
-        there &= np.isfinite(one).all(axis=(0, 2)) & np.isfinite(other).all(axis=(0, 2))
-        sides.append((one - other) / (2 * step[k]))
-    points = base[:, there]
+        forward, backward = (points_on_rays(lens_of(sign * step), uv, ranges) for sign in (1, -1))
+        visible &= np.isfinite(forward).all(axis=(0, 2)) & np.isfinite(backward).all(axis=(0, 2))
+        sides.append((forward - backward) / (2 * step[k]))
+    points = base[:, visible]
     moves = (
-        np.stack([side[:, there] for side in sides], axis=-1)
+        np.stack([side[:, visible] for side in sides], axis=-1)
         if sides
         else (np.zeros((*points.shape, 0)))
     )
-    first = None if datum is None else int(there[:datum].sum())
+    first = None if datum is None else int(visible[:datum].sum())
     columns = without_motion(points, moves, first)
     model = RayModel(points, columns, covariance, ranges, others, freedom, first)
-    return model, np.asarray(there)
+    return model, np.asarray(visible)
 
 
 class RayMap(NamedTuple):
@@ -227,12 +227,12 @@ def map_rays(
     u, v = (np.linspace(0.0, side - 1.0, round(side / pitch) + 1) for side in size)
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     typical, ranges = typical_points(uv), (RANGES[0], RANGES[-1])
-    model, there = rays_of(np.concatenate([typical, grid]), ranges, len(typical))
-    of_grid = np.flatnonzero(there[len(typical) :])
+    model, visible = rays_of(np.concatenate([typical, grid]), ranges, len(typical))
+    of_grid = np.flatnonzero(visible[len(typical) :])
     sd = np.full((len(ranges), len(grid)), np.nan)
-    for at in range(len(ranges)):
-        drawn = model.sample(at)[int(there[: len(typical)].sum()) :]
-        sd[at, of_grid] = np.sqrt((drawn**2).sum(axis=1).mean(axis=-1))
+    for k in range(len(ranges)):
+        drawn = model.sample(k)[int(visible[: len(typical)].sum()) :]
+        sd[k, of_grid] = np.sqrt((drawn**2).sum(axis=1).mean(axis=-1))
     return RayMap(u, v, sd.reshape(len(ranges), len(v), len(u)), ranges, uv)
 
 
@@ -245,8 +245,8 @@ def points_on_rays(lens: Lens, uv: Array, ranges: Sequence[float] = RANGES) -> A
 def points_at(origin: Array, direction: Array, ranges: Sequence[float] = RANGES) -> Array:
     """Return the points (R, G, 3), m, of rays, both (G, 3), at ranges from the camera frame."""
     along = (origin * direction).sum(axis=-1)
-    rest = (origin**2).sum(axis=-1) - along**2
-    away = np.sqrt(np.array(ranges)[:, None] ** 2 - rest) - along
+    miss2 = (origin**2).sum(axis=-1) - along**2
+    away = np.sqrt(np.array(ranges)[:, None] ** 2 - miss2) - along
     return np.asarray(origin + away[..., None] * direction)
 
 
@@ -276,7 +276,7 @@ def _split_motion(points: Array, change: Array, datum: int | None = None) -> tup
     motion = across_rays(np.concatenate([shifts, -cross_matrix(points)], axis=-1))
     angles = across_rays(change.reshape(*points.shape, -1))
     rows = points[:, :datum].size
-    fixed, moved = (one[:, :datum].reshape(rows, one.shape[-1]) for one in (motion, angles))
-    found = np.asarray(np.linalg.lstsq(fixed, moved, rcond=None)[0], dtype=float)
-    left = angles - motion @ found
-    return found.reshape(6, *change.shape[3:]), left.reshape(change.shape)
+    fixed, moved = (array[:, :datum].reshape(rows, array.shape[-1]) for array in (motion, angles))
+    motion_fit = np.asarray(np.linalg.lstsq(fixed, moved, rcond=None)[0], dtype=float)
+    left = angles - motion @ motion_fit
+    return motion_fit.reshape(6, *change.shape[3:]), left.reshape(change.shape)

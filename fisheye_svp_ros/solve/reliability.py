@@ -89,9 +89,9 @@ def _estimate_noise(checked: SolvedPoses) -> SolvedPoses:
     """Return the poses with the noise that the residuals of those show which pass."""
     result, weight = checked.result, checked.views.weight
     passed = np.array([not reason for reason in checked.reasons]) & result.converged
-    some = passed if passed.any() else result.converged
-    rows = 2 * ((weight > 0) & ~checked.outliers)[some].sum()
-    sigma = noise_sigma(result.cost[some].sum(), int(rows), 6 * int(some.sum()))
+    sound = passed if passed.any() else result.converged
+    rows = 2 * ((weight > 0) & ~checked.outliers)[sound].sum()
+    sigma = noise_sigma(result.cost[sound].sum(), int(rows), 6 * int(sound.sum()))
     reasons = checked.reasons
     if sigma > NOISIEST_PX:
         noisy = (
@@ -152,8 +152,8 @@ def _test(
     """
     freedom = 2 * (views.weight > 0).sum(axis=1) - 6
     allowed = (tolerance * sigma) ** 2
-    own = with_own_errors(model, views, localization.pose)
-    suspect = ~localization.converged | _suspect(own, localization, freedom, allowed)
+    with_errors = with_own_errors(model, views, localization.pose)
+    suspect = ~localization.converged | _suspect(with_errors, localization, freedom, allowed)
     if tags:
         suspect |= ~tags_agree(model, views, localization, allowed)
     result, reasons = localization, _place_reasons(views, localization)
@@ -168,7 +168,7 @@ def _test(
                 choices[int(i)], other = chosen, chosen.inliers
         elif searched:
             other = _consensus_pose(
-                model, view, own.take([i]), localization.take([i]), sigma, tolerance
+                model, view, with_errors.take([i]), localization.take([i]), sigma, tolerance
             )
         if other is not None:
             result.put([i], other)
@@ -216,9 +216,9 @@ def doubt_of_pairs(
     fails = misfit_fails(cost.sum(), np.asarray(len(cost)))
     if not gross.any() and not fails:
         return ''
-    rest = cost[~gross]
-    agreeing = len(rest) >= _MIN_AGREEMENT * len(cost)
-    if agreeing and not misfit_fails(rest.sum(), np.asarray(len(rest))):
+    inlier_cost = cost[~gross]
+    agreeing = len(inlier_cost) >= _MIN_AGREEMENT * len(cost)
+    if agreeing and not misfit_fails(inlier_cost.sum(), np.asarray(len(inlier_cost))):
         off = np.sqrt(cost[gross]) * sigma
         return f'pairs that do not match: {_landmark_names(ids[gross], off)}'
     return misfit_reason(float(cost.sum()) / len(cost), len(cost))
@@ -357,16 +357,16 @@ def _noise_from_median(views: Views, localization: Localization) -> Array:
 
 def _tags_reason(choices: TagChoices, residual: Array) -> str:
     """Say which tags are left out; residual (N, 2), px, from the likeliest pose."""
-    each = choices.rejected
-    if len(each) > 1:
-        names = ' or '.join(' and '.join(map(str, tags)) for tags in each[:_MAX_NAMES])
+    rejected = choices.rejected
+    if len(rejected) > 1:
+        names = ' or '.join(' and '.join(map(str, tags)) for tags in rejected[:_MAX_NAMES])
         return (
             f'tags contradict each other: without tag {names} the others agree; the covariance '
             'covers each choice; check the tag map'
         )
     size = np.nan_to_num(np.linalg.norm(residual, axis=-1), nan=np.inf)
-    largest = [size[choices.views.board[0] == tag].max() for tag in each[0]]
-    return f'outliers rejected: {_landmark_names(np.array(each[0]), np.array(largest), "tag")}'
+    largest = [size[choices.views.board[0] == tag].max() for tag in rejected[0]]
+    return f'outliers rejected: {_landmark_names(np.array(rejected[0]), np.array(largest), "tag")}'
 
 
 def _outliers_reason(view: Views, outliers: Mask, residual: Array, tags: bool) -> str:
@@ -381,8 +381,8 @@ def _outliers_reason(view: Views, outliers: Mask, residual: Array, tags: bool) -
 def _landmark_names(landmark: Index, size: Array, kind: str = 'landmark') -> str:
     """Return landmarks, or tags, by name, each with its residual, px; the first of many."""
     names = ', '.join(
-        f'{one} ({px:.3g} px)'
-        for one, px in zip(landmark[:_MAX_NAMES], size[:_MAX_NAMES], strict=True)
+        f'{landmark_id} ({px:.3g} px)'
+        for landmark_id, px in zip(landmark[:_MAX_NAMES], size[:_MAX_NAMES], strict=True)
     )
     more = f' and {len(landmark) - _MAX_NAMES} more' if len(landmark) > _MAX_NAMES else ''
     return f'{kind}{"s" if len(landmark) > 1 else ""} {names}{more}'
@@ -398,8 +398,8 @@ def _place_reasons(views: Views, localization: Localization) -> list[str]:
     cost = views.prior.equations(localization.pose)[0]
     why = 'height or tilt of the base is {:.3g} sigma off its plane: check planar_height and mount'
     return [
-        _join_reasons(why.format(np.sqrt(one)) if fails else '', reason)
-        for one, fails, reason in zip(
+        _join_reasons(why.format(np.sqrt(row)) if fails else '', reason)
+        for row, fails, reason in zip(
             cost, misfit_fails(cost, np.asarray(PRIOR_ROWS)), reasons, strict=True
         )
     ]

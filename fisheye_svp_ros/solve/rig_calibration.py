@@ -112,13 +112,13 @@ def _contradicts(data: RigViews, state: RigState) -> bool:
 def _boards_of_cameras(rows: Observations, lenses: Sequence[Lens]) -> tuple[int, ...]:
     """Return the board of each camera, the same for cameras that a relative pose relates."""
     board = np.arange(len(lenses))
-    for one in range(len(lenses)):
-        for other in range(one):
-            pair = select_shared(select_cameras(rows, (rows.cameras[other], rows.cameras[one])))
+    for first in range(len(lenses)):
+        for second in range(first):
+            pair = select_shared(select_cameras(rows, (rows.cameras[second], rows.cameras[first])))
             if len(pair.frames) >= _MIN_TIED_FRAMES and not is_unrelated(
-                *_start_rig(pair, (lenses[other], lenses[one]))
+                *_start_rig(pair, (lenses[second], lenses[first]))
             ):
-                board[board == board[one]] = board[other]
+                board[board == board[first]] = board[second]
     return tuple(np.unique(board, return_inverse=True)[1].tolist())
 
 
@@ -126,12 +126,16 @@ def _board_poses(rows: Observations, lenses: Sequence[Lens], boards: tuple[int, 
     """Return the poses (B,) of the boards in the frame of the first; raise GeometryError."""
     views = []
     for board in range(max(boards) + 1):
-        mine = [camera for camera, its in enumerate(boards) if its == board]
-        own = select_cameras(rows, [rows.cameras[camera] for camera in mine])
-        _, state = _start_rig(own, [lenses[camera] for camera in mine])
+        cameras_of_board = [camera for camera, its in enumerate(boards) if its == board]
+        board_rows = select_cameras(rows, [rows.cameras[camera] for camera in cameras_of_board])
+        _, state = _start_rig(board_rows, [lenses[camera] for camera in cameras_of_board])
         views.append(
             dict(
-                zip(own.frames.tolist(), map(state.pose.take, range(len(own.frames))), strict=True)
+                zip(
+                    board_rows.frames.tolist(),
+                    map(state.pose.take, range(len(board_rows.frames))),
+                    strict=True,
+                )
             )
         )
     placed, left = identity(len(views)), set(range(1, len(views)))
@@ -279,9 +283,9 @@ class RigStart(NamedTuple):
         data, state = data.select(several), replace(state, pose=state.pose.take(frames))
         linear, place = Linearization(data, state, ()), self._places()
         squared, freedom = linear.sum_of_squares, _freedom(linear)
-        known = sigma_known(data.observations)
-        fails = known and bool(misfit_fails(np.array(squared), np.array(freedom)))
-        sigma = None if known else float(np.sqrt(squared / freedom))
+        sigma_stated = sigma_known(data.observations)
+        fails = sigma_stated and bool(misfit_fails(np.array(squared), np.array(freedom)))
+        sigma = None if sigma_stated else float(np.sqrt(squared / freedom))
         squares = (linear.residual_px**2).sum(axis=-1)
         return RigCalibration(
             tuple(self.cameras[i] for i in place),
@@ -342,8 +346,8 @@ def calibrate_rig(
     )
     if free:
         linear = Linearization(data, state, ())
-        known = sigma_known(data.observations)
-        noise = 1.0 if known else np.sqrt(linear.sum_of_squares / _freedom(linear))
+        sigma_stated = sigma_known(data.observations)
+        noise = 1.0 if sigma_stated else np.sqrt(linear.sum_of_squares / _freedom(linear))
         values, vectors = np.linalg.eigh(information)
         root = noise * np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
         state = adjust(data, state, free, Prior(mean, root))
@@ -360,13 +364,13 @@ def _freedom(linear: Linearization) -> int:
 def _reject_outliers(placed: PlacedBoards) -> tuple[Observations, tuple[int, ...]]:
     """Return the rows without outliers, and the frames that no rig explains."""
     rows = placed.rows
-    _, found = find_outliers(placed.data, placed.state)
+    _, outliers = find_outliers(placed.data, placed.state)
     torn = {
         int(rows.frame[row])
-        for row, why in zip(found.rows, found.why, strict=True)
+        for row, why in zip(outliers.rows, outliers.why, strict=True)
         if why == FRAME
     }
-    kept = ~np.isin(np.arange(len(rows)), found.rows) & ~np.isin(rows.frame, sorted(torn))
+    kept = ~np.isin(np.arange(len(rows)), outliers.rows) & ~np.isin(rows.frame, sorted(torn))
     return select_shared(rows.take(kept)), tuple(sorted(torn))
 
 

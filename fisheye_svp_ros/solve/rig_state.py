@@ -95,10 +95,10 @@ def group_by_frame(observations: Observations, poses: dict[int, Pose] | None = N
     views = group_views(observations)
     numbers, frame_of = np.unique(views.frame, return_inverse=True)
     _, camera_of = np.unique(views.camera, return_inverse=True)
-    known = None
+    given_poses = None
     if poses is not None:
-        known = Pose.stack([poses[int(number)] for number in numbers])
-    return RigViews(views, frame_of.reshape(-1), camera_of.reshape(-1), known, observations)
+        given_poses = Pose.stack([poses[int(number)] for number in numbers])
+    return RigViews(views, frame_of.reshape(-1), camera_of.reshape(-1), given_poses, observations)
 
 
 @dataclass(frozen=True)
@@ -150,8 +150,8 @@ class RigState:
     def shared_values(self, free: Sequence[str]) -> Array:
         """Return free intrinsics and the values of the effects that move image points, (K,)."""
         lens = [
-            parameter_values(one, names)
-            for one, names in zip(self.lenses, self.lens_names(free), strict=True)
+            parameter_values(lens, names)
+            for lens, names in zip(self.lenses, self.lens_names(free), strict=True)
         ]
         return np.concatenate(
             [*map(np.array, lens), *(term.values for term in self.terms if is_shared(term.effect))]
@@ -337,8 +337,8 @@ class Linearization:
 
 def _place_columns(columns: Array, body: Index, count: int) -> Array:
     """Return columns (S, N, 2, 6) where those of each body stand, (S, N, 2, 6 (count - 1))."""
-    mine = body[:, None] == np.arange(1, count)
-    placed = columns[..., None, :] * mine[:, None, None, :, None]
+    is_body = body[:, None] == np.arange(1, count)
+    placed = columns[..., None, :] * is_body[:, None, None, :, None]
     return np.asarray(placed.reshape(*columns.shape[:3], -1))
 
 
@@ -376,5 +376,5 @@ def with_effect(state: RigState, effect: Effect, values: Array | None = None) ->
 
 def transfer_values(term: ModelTerm, new: Effect) -> Array:
     """Return start values of a form of an effect from another form's, by parameter name."""
-    known = dict(zip((p.name for p in term.effect.parameters), term.values, strict=True))
-    return np.array([known.get(parameter.name, 0.0) for parameter in new.parameters])
+    values = dict(zip((p.name for p in term.effect.parameters), term.values, strict=True))
+    return np.array([values.get(parameter.name, 0.0) for parameter in new.parameters])

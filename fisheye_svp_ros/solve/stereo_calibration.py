@@ -173,16 +173,16 @@ def _starts(
             f'frame {left_views.frame[lost[0]]} cannot be posed in either camera; each view needs '
             f'{MIN_POINTS} points that are not on one line'
         )
-    both = (left_posed & right_posed).reshape(systems, -1)
-    if not both.any(axis=1).all():
+    posed = (left_posed & right_posed).reshape(systems, -1)
+    if not posed.any(axis=1).all():
         raise GeometryError(
             f'no view can be posed in both cameras; one with {MIN_POINTS} points in each is needed'
         )
     rigs = right_pose.inverse().compose(left_pose)
-    rig = _robust_mean(rigs.reshape(systems, -1), both)
+    rig = _robust_mean(rigs.reshape(systems, -1), posed)
     from_left = left_pose.reshape(systems, -1).compose(rig.inverse().take(np.s_[:, None]))
-    own = right_pose.reshape(systems, -1)
-    return own.where(right_posed.reshape(systems, -1), from_left), rig
+    from_right = right_pose.reshape(systems, -1)
+    return from_right.where(right_posed.reshape(systems, -1), from_left), rig
 
 
 def _localize_sides(
@@ -193,7 +193,7 @@ def _localize_sides(
     if left is not right and not (
         left.is_lens_only and right.is_lens_only and left.lens == right.lens
     ):
-        return [_localize_posable(*one) for one in zip(models, sides, strict=True)]
+        return [_localize_posable(*side) for side in zip(models, sides, strict=True)]
     pose, posed = _localize_posable(left, Views.concatenate(sides))
     count = len(sides[0].frame)
     return [(pose.take(part), posed[part]) for part in (slice(count), slice(count, None))]

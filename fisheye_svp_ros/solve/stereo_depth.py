@@ -119,8 +119,8 @@ def triangulate(
     rays = left.back_project(pairs.left[None])
     first = pairs.rig.transform(rays.origin[0])
     along_first = (pairs.rig.rotation @ rays.direction[0][..., None])[..., 0]
-    other = right.back_project(pairs.right[None])
-    second, along_second = other.origin[0], other.direction[0]
+    right_rays = right.back_project(pairs.right[None])
+    second, along_second = right_rays.origin[0], right_rays.direction[0]
     normal = np.cross(along_first, along_second)
     between = second - first
     with np.errstate(divide='ignore', invalid='ignore'):
@@ -128,10 +128,10 @@ def triangulate(
         to_first = (np.cross(between, along_second) * normal).sum(axis=-1) / size2
         to_second = (np.cross(between, along_first) * normal).sum(axis=-1) / size2
         valid = (to_first > 0) & (to_second > 0)
-        one = first + to_first[:, None] * along_first
+        foot = first + to_first[:, None] * along_first
         two = second + to_second[:, None] * along_second
-    points = np.where(valid[:, None], (one + two) / 2, np.nan)
-    gap = np.where(valid, np.linalg.norm(one - two, axis=-1), np.nan)
+    points = np.where(valid[:, None], (foot + two) / 2, np.nan)
+    gap = np.where(valid, np.linalg.norm(foot - two, axis=-1), np.nan)
     shape = pairs.shape
     return StereoPoints(points.reshape(*shape, 3), gap.reshape(shape), valid.reshape(shape))
 

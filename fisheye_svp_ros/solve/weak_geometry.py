@@ -63,8 +63,8 @@ def hold_weak_geometry(
             group = weak[(double == two) & (many == (nodes == _MANY_NODES))]
             for start in range(0, len(group), at_once):
                 rows = group[start : start + at_once]
-                some, seen = localization.take(rows), views.take(rows)
-                minima = (some.pose, some.other)[: 1 + two]
+                poses, seen = localization.take(rows), views.take(rows)
+                minima = (poses.pose, poses.other)[: 1 + two]
                 covariance[rows] = _integrate(model, seen, minima, deviation[rows], nodes)
     if neglected is not None:
         covariance = covariance + _squared_bias(model, neglected, views, localization)
@@ -83,9 +83,9 @@ def is_ambiguous(localization: Localization) -> Mask:
     likely = np.flatnonzero(pose_odds(localization) > MIN_ODDS)
     apart = np.zeros(localization.cost.shape, dtype=bool)
     if likely.size:
-        some = localization.take(likely)
+        poses = localization.take(likely)
         away = squared_distances(
-            some.other.difference(some.pose)[:, None], some.covariance - some.added
+            poses.other.difference(poses.pose)[:, None], poses.covariance - poses.added
         )
         apart[likely] = away[:, 0] > CHI2_999
     return apart
@@ -108,11 +108,11 @@ def _weak_views(views: Views, localization: Localization) -> tuple[Index, Array]
     rows = np.flatnonzero(localization.converged & ((turn > _MIN_TILT**2) | likely))
     if not rows.size:
         return rows, np.zeros(0)
-    some = localization.take(rows)
+    poses = localization.take(rows)
     # A camera that turns about the target leaves the tangent of its path.
-    distance = np.linalg.norm(some.pose.position - _centers(views.take(rows)), axis=-1)
-    precision = np.linalg.eigvalsh(np.linalg.inv(some.covariance)[:, :3, :3])[:, -1]
-    turn = np.linalg.eigvalsh(some.covariance[:, 3:, 3:])[:, -1]
+    distance = np.linalg.norm(poses.pose.position - _centers(views.take(rows)), axis=-1)
+    precision = np.linalg.eigvalsh(np.linalg.inv(poses.covariance)[:, :3, :3])[:, -1]
+    turn = np.linalg.eigvalsh(poses.covariance[:, 3:, 3:])[:, -1]
     curvature = 0.5 * turn * distance * np.sqrt(precision)
     weak = (curvature > _MIN_CURVATURE) | likely[rows]
     return rows[weak], curvature[weak]
@@ -131,22 +131,22 @@ def _integrate(
     repeated, flat = np.repeat(np.arange(systems), count), node.reshape(-1)
     cost, (hessian, gradient) = pose_equations(model, flat, views.take(repeated))
     # The other four: a turn about the line of sight and the place of the target.
-    rest = _tilt_columns(flat, center[repeated])[1][..., 2:]
-    turned = np.swapaxes(rest, -1, -2)
-    relative, unit = with_unit_diagonal(turned @ hessian @ rest, 0.0)
+    free_columns = _tilt_columns(flat, center[repeated])[1][..., 2:]
+    turned = np.swapaxes(free_columns, -1, -2)
+    relative, unit = with_unit_diagonal(turned @ hessian @ free_columns, 0.0)
     inverse = never_singular(np.linalg.inv, relative) / (unit[:, :, None] * unit[:, None, :])
     slope = turned @ gradient[..., None]
     step = -inverse @ slope
     lowest = cost + (slope * step).sum(axis=(1, 2))
-    flat = flat.retract((rest @ step)[..., 0])
+    flat = flat.retract((free_columns @ step)[..., 0])
     volume = np.linalg.slogdet(relative)[1] + 2 * np.log(unit).sum(axis=-1)
     exponent = (-0.5 * lowest / scale[repeated] ** 2 - 0.5 * volume).reshape(systems, count)
     exponent = np.where(np.isfinite(exponent), exponent, -np.inf) - np.log(density)
     weight = np.exp(exponent - exponent.max(axis=1, keepdims=True))
     weight /= weight.sum(axis=1, keepdims=True)
     change = flat.difference(minima[0].take(repeated)).reshape(systems, count, 6)
-    own = rest @ inverse @ turned * scale[repeated, None, None] ** 2
-    return _mixture_scatter(weight, change, own.reshape(systems, count, 6, 6))
+    spread = free_columns @ inverse @ turned * scale[repeated, None, None] ** 2
+    return _mixture_scatter(weight, change, spread.reshape(systems, count, 6, 6))
 
 
 def _tilted_poses(
@@ -212,10 +212,10 @@ def _squared_bias(
 ) -> Array:
     """Return what neglecting part of a lens moves poses by, as outer products (S, 6, 6)."""
     image = true.predict(localization.pose, views, limited=False).uv
-    known = np.asarray(np.isfinite(image).all(axis=-1))
+    finite = np.asarray(np.isfinite(image).all(axis=-1))
     seen = views._replace(
-        uv=np.where(known[:, :, None], image, views.uv),
-        weight=np.where(known, views.weight, 0.0),
+        uv=np.where(finite[:, :, None], image, views.uv),
+        weight=np.where(finite, views.weight, 0.0),
     )
     _, (hessian, gradient) = pose_equations(model, localization.pose, seen)
     relative, unit = with_unit_diagonal(hessian, 0.0)

@@ -67,11 +67,11 @@ def find_wrong_landmarks(
         if best is not None and best.typical < NOISIEST_PX:
             break
         try:
-            found = landmarks.concentrate(start, fit)
+            wrong = landmarks.concentrate(start, fit)
         except (GeometryError, np.linalg.LinAlgError):
             continue
-        if best is None or found.typical < best.typical:
-            best = found
+        if best is None or wrong.typical < best.typical:
+            best = wrong
     return () if best is None or best.typical > NOISIEST_PX else landmarks.wrong(best)
 
 
@@ -110,8 +110,8 @@ class _LandmarkTable(NamedTuple):
         often = count >= _MIN_VIEWS
         ids, first = ids[often], first[often]
         place = np.searchsorted(ids, views.landmark)
-        known = views.used & np.isin(views.landmark, ids)
-        return cls(table, views, ids, np.where(known, place, len(ids)), table.xyz[first])
+        listed = views.used & np.isin(views.landmark, ids)
+        return cls(table, views, ids, np.where(listed, place, len(ids)), table.xyz[first])
 
     def is_suspicious(self, model: ForwardModel) -> bool:
         """Whether displaced landmarks explain most of what is left, or one stands out."""
@@ -154,9 +154,11 @@ class _LandmarkTable(NamedTuple):
         for i in np.flatnonzero(~agreement.kept):
             near = np.argsort(np.linalg.norm(self.xyz - self.xyz[i], axis=1), kind='stable')
             around = _finite_median(by_landmark[:, near[1 : 1 + _NEIGHBORS]], axis=1)
-            mine = by_landmark[:, i]
-            own = np.linalg.norm(mine - np.nan_to_num(around), axis=-1)
-            if _finite_median(own) > _OWN_SHARE * _finite_median(np.linalg.norm(mine, axis=-1)):
+            places = by_landmark[:, i]
+            distance = np.linalg.norm(places - np.nan_to_num(around), axis=-1)
+            if _finite_median(distance) > _OWN_SHARE * _finite_median(
+                np.linalg.norm(places, axis=-1)
+            ):
                 landmark = self._describe(int(i), agreement)
                 far = agreement.scale[i] > _MISMATCH_RATIO * OUTLIER_SIGMAS * agreement.typical
                 wrong += [landmark] if landmark.is_displaced or far else []
@@ -164,14 +166,14 @@ class _LandmarkTable(NamedTuple):
         return tuple(wrong) if share <= _MAX_WRONG_SHARE else ()
 
     def _describe(self, i: int, agreement: _Agreement) -> WrongLandmark:
-        mine = (self.slot == i) & agreement.posed[:, None]
+        sightings = (self.slot == i) & agreement.posed[:, None]
         offset = np.full(3, np.nan)
-        meeting = _meeting_point(agreement.model, agreement.pose, self.views, mine)
+        meeting = _meeting_point(agreement.model, agreement.pose, self.views, sightings)
         if meeting is not None:
             moved = self.views._replace(
-                points=np.where(mine[..., None], meeting, self.views.points)
+                points=np.where(sightings[..., None], meeting, self.views.points)
             )
-            left = prediction_distances(agreement.model, agreement.pose, moved)[mine]
+            left = prediction_distances(agreement.model, agreement.pose, moved)[sightings]
             if _finite_median(left) / MEDIAN_NORM < _MAX_REMAINDER * agreement.scale[i]:
                 offset = meeting - self.xyz[i]
         points = int((self.table.landmark == self.ids[i]).sum())
@@ -186,9 +188,9 @@ class _LandmarkTable(NamedTuple):
         """
         order = np.argsort(self.slot, axis=None, kind='stable')
         parts = np.split(distance.ravel()[order], np.cumsum(np.bincount(self.slot.ravel()))[:-1])
-        known = [part[np.isfinite(part)] for part in parts[: len(self.ids)]]
+        finite = [part[np.isfinite(part)] for part in parts[: len(self.ids)]]
         return np.array(
-            [np.median(part) / MEDIAN_NORM if len(part) else UNSEEN_PX for part in known]
+            [np.median(part) / MEDIAN_NORM if len(part) else UNSEEN_PX for part in finite]
         )
 
     def _sum(self, values: Array) -> Array:
@@ -201,16 +203,18 @@ class _LandmarkTable(NamedTuple):
         """Return distances (S, N), px, from the poses that most points of a view agree on."""
         pose, posed = identity(len(self.views.frame)), np.zeros(len(self.views.frame), dtype=bool)
         richest = np.argsort(-self.views.used.sum(axis=1), kind='stable')[:_CONSENSUS_VIEWS]
-        for rows, _, one in model.split(self.views):
+        for rows, _, camera_model in model.split(self.views):
             for view in np.intersect1d(np.arange(len(posed))[rows], richest):
                 used = np.flatnonzero(self.views.used[view])
                 step = max(1, len(used) // _CONSENSUS_POINTS)
                 single = self.views.take([view]).take_points(used[::step])
                 try:
-                    solution = localize(one, single)
+                    solution = localize(camera_model, single)
                 except GeometryError:
                     continue
-                pose.put([view], consensus_pose(one.seeing(single), single, solution, 1.0))
+                pose.put(
+                    [view], consensus_pose(camera_model.seeing(single), single, solution, 1.0)
+                )
                 posed[view] = True
         return self._distances(model, pose, posed)
 
@@ -218,13 +222,13 @@ class _LandmarkTable(NamedTuple):
         """Return poses (S,) by some landmarks (L,), and which views show enough of them."""
         used = self.views.used & np.append(kept, False)[self.slot]
         pose, posed = identity(len(used)), np.zeros(len(used), dtype=bool)
-        for rows, _, one in model.split(self.views):
+        for rows, _, camera_model in model.split(self.views):
             views = self.views.take(rows)
             views = views._replace(weight=np.where(used[rows], views.weight, 0.0))
-            inside = (views.weight > 0) & one.seeing(views).back_project(views.uv).valid
+            inside = (views.weight > 0) & camera_model.seeing(views).back_project(views.uv).valid
             which = np.flatnonzero(inside.sum(axis=1) >= MIN_POINTS)
             if len(which):
-                solution = localize(one, views.take(which))
+                solution = localize(camera_model, views.take(which))
                 at = np.arange(len(used))[rows][which]
                 pose.put(at, solution.pose)
                 posed[at] = solution.converged
@@ -251,8 +255,8 @@ def _agreeing(scale: Array) -> Mask:
 def _meeting_point(model: ForwardModel, pose: Pose, views: Views, mine: Mask) -> Array | None:
     """Return the point (3,) nearest to the rays of some points (S, N); None for no such point."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
-    for rows, _, one in model.split(views):
-        rays = one.seeing(views.take(rows)).back_project(views.take(rows).uv)
+    for rows, _, camera_model in model.split(views):
+        rays = camera_model.seeing(views.take(rows)).back_project(views.take(rows).uv)
         view, point = np.nonzero(mine[rows] & rays.valid)
         camera = pose.take(np.arange(len(mine))[rows][view])
         direction = (camera.rotation @ rays.direction[view, point][..., None])[..., 0]
@@ -268,7 +272,7 @@ def _meeting_point(model: ForwardModel, pose: Pose, views: Views, mine: Mask) ->
 def _finite_median(values: Array, axis: int | None = None) -> Array:
     """Return medians of what is finite; NaN where nothing is."""
     finite = np.isfinite(values)
-    some = finite.any(axis=axis, keepdims=True)
+    any_finite = finite.any(axis=axis, keepdims=True)
     # Where nothing is finite: of zeros, and masked afterwards.
-    median = np.nanmedian(np.where(finite, values, np.where(some, np.nan, 0.0)), axis=axis)
-    return np.asarray(np.where(np.squeeze(some, axis=axis), median, np.nan))
+    median = np.nanmedian(np.where(finite, values, np.where(any_finite, np.nan, 0.0)), axis=axis)
+    return np.asarray(np.where(np.squeeze(any_finite, axis=axis), median, np.nan))

@@ -176,14 +176,14 @@ def at_point(
             excess = np.log(error / allowed)
         by_range = _interpolate_rows(budget.spreads, excess, spread)
         by_spread = _interpolate_rows(np.log(budget.ranges), excess.T, np.log(working_range))
-        here = np.interp(np.log(working_range), np.log(budget.ranges), by_range)
-        own = [
+        at_working_range = np.interp(np.log(working_range), np.log(budget.ranges), by_range)
+        lens_parts = [
             budget.own.get(part, {}).get(quantity, np.full_like(noise, np.nan))
             for part in _LENS_PARTS
         ]
         caused, noisy, most, parameters, misfit = (
             _table_value(budget, table, spread, working_range)
-            for table in (error, noise, allowed, *own)
+            for table in (error, noise, allowed, *lens_parts)
         )
         logs = np.log(budget.ranges)
         rows.append(
@@ -192,7 +192,7 @@ def at_point(
                 caused,
                 noisy,
                 most,
-                None if np.isnan(here) else bool(here <= 0),
+                None if np.isnan(at_working_range) else bool(at_working_range <= 0),
                 # From which range on the limit is kept, and up to which spread
                 float(np.exp(_last_crossing(logs, by_range, ~(by_range <= 0), logs[0], np.nan))),
                 _last_crossing(
@@ -225,18 +225,18 @@ def _stereo_errors(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
     true, svp = ForwardModel(setup.lens), ForwardModel(setup.lens.svp())
     right = true.predict(identity(len(points)), views_of(points)).uv
     left = true.predict(setup.rig.broadcast_to(len(points)), views_of(points)).uv
-    both: Mask = np.asarray(np.isfinite(left + right).all(axis=-1))
-    pairs = (svp, svp, setup.rig, left[both], right[both])
+    seen: Mask = np.asarray(np.isfinite(left + right).all(axis=-1))
+    pairs = (svp, svp, setup.rig, left[seen], right[seen])
     offset = epipolar_offset(*pairs)
     solved = triangulate(*pairs).points
-    true_pairs = (true, true, setup.rig, left[both], right[both])
+    true_pairs = (true, true, setup.rig, left[seen], right[seen])
     spread = triangulate_optimally(*true_pairs, setup.noise).covariance
     per_pair = [
         offset.distance,
-        np.linalg.norm(solved - points[both], axis=-1),
+        np.linalg.norm(solved - points[seen], axis=-1),
         np.sqrt(np.trace(spread, axis1=-2, axis2=-1)),
     ]
-    epipolar, depth, depth_noise = (known_mean(scatter(both, values)) for values in per_pair)
+    epipolar, depth, depth_noise = (known_mean(scatter(seen, values)) for values in per_pair)
     # Noise of the left point across the curve and of the right point that moves the curve.
     epipolar_noise = np.full(len(points), 2 / np.sqrt(np.pi) * setup.noise)
     return [(epipolar, epipolar_noise), (depth, depth_noise)]
@@ -252,8 +252,8 @@ def _lens_errors(setup: Setup, points: Array) -> dict[str, dict[str, Array]]:
     errors, lens = LensErrors.from_lens(setup.lens), ForwardModel(setup.lens)
     some = points[:, ::_STEREO_CAPS]
     left = lens.predict(setup.rig.broadcast_to(len(some)), views_of(some)).uv
-    both: Mask = np.asarray(np.isfinite(left).all(axis=-1))
-    depth = depth_errors(errors, errors, setup.rig, some[both])
+    seen: Mask = np.asarray(np.isfinite(left).all(axis=-1))
+    depth = depth_errors(errors, errors, setup.rig, some[seen])
     poses = [
         errors.of_poses(views_of(caps), identity(len(caps)))
         for caps in np.array_split(points, -(-len(points) // _CAPS_PER_BLOCK))
@@ -267,7 +267,7 @@ def _lens_errors(setup: Setup, points: Array) -> dict[str, dict[str, Array]]:
         limits[part] = {
             'position': np.sqrt(variance[:, :3].sum(axis=-1)),
             'axis': np.sqrt(variance[:, 3:5].sum(axis=-1)),
-            'depth': known_mean(scatter(both, far)),
+            'depth': known_mean(scatter(seen, far)),
         }
     return limits
 
@@ -305,10 +305,10 @@ def _last_crossing(places: Array, excess: Array, side: Mask, none: float, all_: 
     i = int(rows[-1]) if rows.size else -1
     if i in (-1, len(places) - 1):
         return float(none if i < 0 else all_)
-    one, two = excess[i : i + 2]
-    if not np.isfinite(one - two):
+    before, two = excess[i : i + 2]
+    if not np.isfinite(before - two):
         return float(places[i + 1] if two <= 0 else places[i])
-    return float(places[i] + one / (one - two) * (places[i + 1] - places[i]))
+    return float(places[i] + before / (before - two) * (places[i + 1] - places[i]))
 
 
 def _check(value: float, places: Array, name: str, unit: str) -> None:

@@ -71,11 +71,11 @@ def curves(table: DataFrame, metric: str, x: str, by: Sequence[str]) -> list[Err
     groups: dict[tuple[Any, ...], Any] = {(): np.arange(len(values))}
     for name in by:
         groups = {
-            (*key, value): np.intersect1d(rows, mine)
+            (*key, value): np.intersect1d(rows, slot)
             for key, rows in groups.items()
-            for value, mine in _slots(table, name).items()
+            for value, slot in _slots(table, name).items()
         }
-    found = []
+    drawn = []
     for key, rows in groups.items():
         cells = [values[np.intersect1d(rows, place)] for place in places.values()]
         low, middle, high = np.array(
@@ -84,8 +84,8 @@ def curves(table: DataFrame, metric: str, x: str, by: Sequence[str]) -> list[Err
                 for cell in (cell[np.isfinite(cell)] for cell in cells)
             ]
         ).T
-        found.append(ErrorCurve(key, list(places), middle, low, high))
-    return found
+        drawn.append(ErrorCurve(key, list(places), middle, low, high))
+    return drawn
 
 
 def grid(table: DataFrame, metric: str, x: str, y: str) -> Grid:
@@ -113,21 +113,21 @@ def noise_spreads(table: DataFrame, by: str | None) -> list[ResidualRatio]:
     sigma, rms = _metric_column(table, 'noise_px'), _metric_column(table, 'localizer.rms_px')
     points = _metric_column(table, 'localizer.points')
     groups = _slots(table, by) if by else {'': np.arange(len(rms))}
-    found = []
+    ratios = []
     for label, rows in groups.items():
         kept = rows[(sigma[rows] > 0) & np.isfinite(rms[rows])]
         if len(kept):
             ratio = rms[kept] / sigma[kept]
-            at = np.linspace(0.0, max(2.5, min(1.1 * ratio.max(), 20.0)), 400)
+            axis = np.linspace(0.0, max(2.5, min(1.1 * ratio.max(), 20.0)), 400)
             counts, share = np.unique(points[kept], return_counts=True)
             # The ratio r is sqrt(chi^2 / N): density of chi^2 at N r^2, times 2 N r.
             density = sum(
-                part / len(kept) * _density_of_chi2(n * at**2, 2 * n - 6) * 2 * n * at
+                part / len(kept) * _density_of_chi2(n * axis**2, 2 * n - 6) * 2 * n * axis
                 for n, part in zip(counts, share, strict=True)
             )
             name = f'{by} {value_text(label)}' if by else ''
-            found.append(ResidualRatio(name, ratio, at, np.asarray(density)))
-    return found
+            ratios.append(ResidualRatio(name, ratio, axis, np.asarray(density)))
+    return ratios
 
 
 def _density_of_chi2(x: Array, freedom: float) -> Array:

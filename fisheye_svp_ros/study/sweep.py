@@ -168,8 +168,8 @@ def stereo_calibrator(batch: ScenarioBatch, settings: StereoCalibratorSettings) 
     for number in range(per_scenario):
         index = np.arange(scenarios) * per_scenario + number
         before = [list(window) for window in windows]
-        for window, one in zip(windows, index, strict=True):
-            window[:] = [*window, int(one)][-settings.views :]
+        for window, latest in zip(windows, index, strict=True):
+            window[:] = [*window, int(latest)][-settings.views :]
         lengths = np.array([len(window) for window in windows])
         for length in np.unique(lengths):
             for chunk in _chunks(index[lengths == length]):
@@ -269,9 +269,9 @@ def solvers_of(base: Scenario, sweep: Sweep) -> tuple[str, ...]:
 
 def idle_solvers(plan: Plan, nodes: Iterable[str]) -> list[str]:
     """Return a sentence for each node that has nothing to solve in a sweep."""
-    *others, last = STYLES
+    *styles, last = STYLES
     needed = {
-        node: MONO if node in _MONO_SOLVERS else f'{", ".join(others)} or {last}'
+        node: MONO if node in _MONO_SOLVERS else f'{", ".join(styles)} or {last}'
         for node in nodes
         if node not in (CAMERA, *plan.solvers)
     }

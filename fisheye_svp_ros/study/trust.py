@@ -96,7 +96,7 @@ class SharedTrust(NamedTuple):
     def rig_covariance(self) -> Array:
         """Return the covariances (C - 1, 6, 6) of the cameras but the first, m and rad."""
         ends = [slice(6 * i, 6 * i + 6) for i in range(len(self.lenses) - 1)]
-        return np.array([self.covariance[one, one] for one in ends]).reshape(-1, 6, 6)
+        return np.array([self.covariance[block, block] for block in ends]).reshape(-1, 6, 6)
 
 
 def assess_lens(observations: Observations, lens: Lens, names: Sequence[str]) -> LensTrust:
@@ -120,17 +120,17 @@ def assess_cameras(data: RigViews, state: RigState, names: Sequence[str]) -> Sha
     targets = _fit_targets(null, count)
     moved, covariance = _average_fits([_fit_without_random_parts(null, targets[0]), *targets])
     # What frames left out say of the errors holds for any target.
-    known = np.sqrt(np.diag(targets[0].covariance))
+    errors_of_noise = np.sqrt(np.diag(targets[0].covariance))
     larger = np.nan_to_num(standard_errors(null)[:count])
     # A broad image field turns a camera on the rig; of one by itself the poses take that up.
     larger[:start] = np.nan_to_num(errors[:start])
-    larger = np.maximum(larger, known) / np.maximum(known, 1e-300)
+    larger = np.maximum(larger, errors_of_noise) / np.maximum(errors_of_noise, 1e-300)
     covariance = covariance * np.outer(larger, larger)
     free, lenses, end = targets[-1], [], start
     spread = np.sqrt(np.diag(free.covariance))
     for lens, own in zip(state.lenses, state.lens_names(names), strict=True):
         at, end = slice(end, end + len(own)), end + len(own)
-        found = zip(
+        parameters = zip(
             own, parameter_values(lens, own), errors[at], free.step[at], spread[at], strict=True
         )
         lenses.append(
@@ -138,7 +138,7 @@ def assess_cameras(data: RigViews, state: RigState, names: Sequence[str]) -> Sha
                 dict(zip(own, errors[at].tolist(), strict=True)),
                 {
                     name: _admissible(name, (value, error), (value + step, width))
-                    for name, value, error, step, width in found
+                    for name, value, error, step, width in parameters
                 },
                 moved[at],
                 covariance[at, at],
@@ -162,7 +162,7 @@ def generalize_rig(
     if any(lens.check() for lens in moved.lenses):
         return state
     moved = adjust_poses(data, moved)
-    before, after = (Linearization(data, one, ()).rms_px for one in (state, moved))
+    before, after = (Linearization(data, variant, ()).rms_px for variant in (state, moved))
     return moved if after < _MAX_RMS_RATIO * before else state
 
 
@@ -218,8 +218,8 @@ def _fit_targets(null: NullModel, count: int) -> list[_ParameterFit]:
     deviation, from none to all; larger ones are no target that anybody would take for exact.
     count: of these parameters, the first of what is in the model.
     """
-    own, information = null.included_columns, null.information
-    columns, precision = [own], [np.zeros(null.column_count)]
+    included, information = null.included_columns, null.information
+    columns, precision = [included], [np.zeros(null.column_count)]
     for form, effect in enumerate(null.fixed.forms.effects):
         if effect.budget_stage() == 'target':
             columns.append(null.form_columns(form))
@@ -227,16 +227,16 @@ def _fit_targets(null: NullModel, count: int) -> list[_ParameterFit]:
     every, prior = np.concatenate(columns), np.concatenate(precision)
     scale, fits = null.scale[:count], []
     for share in _TARGET_SHARES:
-        at = every if share else own
-        more = prior[: len(at)] / share**2 if share else np.zeros(len(own))
-        inside = information[np.ix_(at, at)] + np.diag(more)
-        inverse, score = pseudo_inverse(inside, 1e-13), information[at, -1]
+        columns_in_use = every if share else included
+        more = prior[: len(columns_in_use)] / share**2 if share else np.zeros(len(included))
+        inside = information[np.ix_(columns_in_use, columns_in_use)] + np.diag(more)
+        inverse, score = pseudo_inverse(inside, 1e-13), information[columns_in_use, -1]
         sign, determinant = np.linalg.slogdet(inside)
         # Singular but for rounding, in data without noise: nothing tells such targets apart.
         evidence = score @ inverse @ score - determinant if sign > 0 else -np.inf
-        evidence += np.log(more[len(own) :]).sum()
-        mine = inverse[:count, :count] / np.outer(scale, scale)
-        fits.append(_ParameterFit((inverse @ score)[:count] / scale, mine, float(evidence) / 2))
+        evidence += np.log(more[len(included) :]).sum()
+        block = inverse[:count, :count] / np.outer(scale, scale)
+        fits.append(_ParameterFit((inverse @ score)[:count] / scale, block, float(evidence) / 2))
     return fits
 
 
@@ -246,12 +246,12 @@ def _fit_without_random_parts(null: NullModel, other: _ParameterFit) -> _Paramet
     Evidence by the restricted likelihood; a variance counts as a parameter (BIC): in data without
     anything of its own, chance calls for a small one.
     """
-    own, plain = null.included_columns, np.zeros_like(null.variances.alive)
+    included, plain = null.included_columns, np.zeros_like(null.variances.alive)
     bare = factor_equations(null.full.select(plain), null.variances.lam, null.variances.weight)
 
     def likelihood(f: FactoredEquations) -> float:
-        noise = null.remaining_information(f.information, own)[-1, -1] / null.freedom
-        determinant = np.linalg.slogdet(f.information[np.ix_(own, own)])[1]
+        noise = null.remaining_information(f.information, included)[-1, -1] / null.freedom
+        determinant = np.linalg.slogdet(f.information[np.ix_(included, included)])[1]
         return -float(f.log_determinant + determinant + null.freedom * np.log(noise)) / 2
 
     cost = int(null.variances.alive.sum()) * np.log(null.full.rows) / 2
@@ -306,9 +306,9 @@ def depth_errors(
     point is NaN or a camera does not see it.
     """
     noise = [max(errors.noise, sigma) for errors in (left, right)]
-    found = [np.full((len(points), 3, 3), np.nan) for _ in ErrorParts._fields]
-    known = np.flatnonzero(np.isfinite(points).all(axis=1))
-    for rows in (known[i : i + _MAX_POINTS] for i in range(0, len(known), _MAX_POINTS)):
+    totals = [np.full((len(points), 3, 3), np.nan) for _ in ErrorParts._fields]
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    for rows in (finite[i : i + _MAX_POINTS] for i in range(0, len(finite), _MAX_POINTS)):
         views = views_of(points[rows, None], np.zeros((len(rows), 1, 2)))
         pairs = [
             (errors, errors.linearize(views, pose))
@@ -327,11 +327,11 @@ def depth_errors(
             maps = np.linalg.solve(information * px, np.swapaxes(one, -1, -2))
             parts = errors.model.propagate(linear, np.asarray(maps))
             parts = parts._replace(noise=parts.noise * px**2)
-            for whole, part in zip(found, parts, strict=True):
+            for whole, part in zip(totals, parts, strict=True):
                 whole[rows] = np.nan_to_num(whole[rows]) + part
-        for whole in found:
+        for whole in totals:
             whole[rows[~seen]] = np.nan
-    return ErrorParts(*found)
+    return ErrorParts(*totals)
 
 
 def known_errors(
@@ -351,7 +351,7 @@ def known_errors(
     if after.data.cameras == 2 and not doubtful:
         measured['depth_error_m'] = _depth_errors
     pairs = [list(_train_folds(linear, free)) for linear in (before, after)] if measured else []
-    found = {
+    comparisons = {
         name: [
             np.concatenate([errors(held_out, state) for held_out, state in folds])
             for folds in pairs
@@ -360,7 +360,7 @@ def known_errors(
     }
     return {
         name: compare_errors(*both)
-        for name, both in found.items()
+        for name, both in comparisons.items()
         if np.isfinite(both[0] + both[1]).any()
     }
 
@@ -416,8 +416,8 @@ def _depth_errors(held_out: RigViews, state: RigState) -> Array:
 
 def _shared_points(data: RigViews, view: int) -> tuple[Array, Array, Array]:
     """Return what a view of the first camera shares with the second: points (N, 3), uv (N, 2)."""
-    other = np.flatnonzero((data.frame_of == data.frame_of[view]) & (data.camera_of == 1))
+    partner = np.flatnonzero((data.frame_of == data.frame_of[view]) & (data.camera_of == 1))
     ids = np.where(data.views.used, data.views.landmark, -1 - data.camera_of[:, None])
-    _, i, j = np.intersect1d(ids[view], ids[other], return_indices=True)
+    _, i, j = np.intersect1d(ids[view], ids[partner], return_indices=True)
     uv = data.views.uv
-    return data.views.points[view, i], uv[view, i], uv[other].reshape(-1, 2)[j]
+    return data.views.points[view, i], uv[view, i], uv[partner].reshape(-1, 2)[j]

@@ -116,7 +116,11 @@ class Foreign(NamedTuple):
     def deviation_px(self, lens: Lens) -> float:
         """Return how far a lens of the file is from what the file says, px."""
         return next(
-            (self.worst_px.get(camera, 0.0) for camera, one in self.lenses.items() if one == lens),
+            (
+                self.worst_px.get(camera, 0.0)
+                for camera, candidate in self.lenses.items()
+                if candidate == lens
+            ),
             0.0,
         )
 

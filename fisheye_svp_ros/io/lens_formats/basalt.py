@@ -57,11 +57,11 @@ def _basalt_lens(
             f'{where}: camera_type is {kind!r}; those that can be read are {", ".join(_MODELS)}'
         )
     names, distortion = _MODELS[kind]
-    given = fields.section(camera, 'intrinsics', where)
-    pinhole = fields.values(given, ('fx', 'fy', 'cx', 'cy'), where)
+    intrinsics = fields.section(camera, 'intrinsics', where)
+    pinhole = fields.values(intrinsics, ('fx', 'fy', 'cx', 'cy'), where)
     size = fields.numbers({'resolution': size}, 'resolution', 2, where)
     return models.nearest_lens(
-        name, size, pinhole, distortion(*fields.values(given, names, where)), where
+        name, size, pinhole, distortion(*fields.values(intrinsics, names, where)), where
     )
 
 
@@ -98,8 +98,8 @@ def write_chain(lenses: Sequence[Lens], rigs: Sequence[Pose]) -> str:
             )
             for place in places
         ],
-        'intrinsics': [{'camera_type': 'kb4', 'intrinsics': _intrinsics(one)} for one in near],
-        'resolution': [[one.width, one.height] for one in near],
+        'intrinsics': [{'camera_type': 'kb4', 'intrinsics': _intrinsics(lens)} for lens in near],
+        'resolution': [[lens.width, lens.height] for lens in near],
     }
     return json.dumps({'value0': document}, indent=4) + '\n'
 

@@ -82,11 +82,11 @@ def read(text: str, where: str) -> Foreign:
     """Read all cameras, by their ids; raises LensError, naming camera and model."""
     lenses = {}
     for row in filter(None, map(_ROW.fullmatch, _uncommented_lines(text))):
-        camera, model, rest = row.groups()
+        camera, model, numbers = row.groups()
         place = f'{where}: camera {camera}'
         try:
             width, height, *values = (
-                parse_number(word) for word in rest.replace(',', ' ').split()
+                parse_number(word) for word in numbers.replace(',', ' ').split()
             )
         except ValueError as cause:
             raise LensError(

@@ -73,13 +73,15 @@ def _in_root(
     """Return the camera to which a camera's extrinsics lead at last, and its pose in that one."""
     pose = identity()
     for _ in cameras:
-        given = cameras[socket].get('extrinsics') or {}
-        target = given.get('toCameraSocket', -1)
+        extrinsics = cameras[socket].get('extrinsics') or {}
+        target = extrinsics.get('toCameraSocket', -1)
         if target not in cameras:
             break
         place = f'{where}: extrinsics of socket {socket}'
-        shift = fields.values(fields.section(given, 'translation', place), tuple('xyz'), place)
-        turn = fields.matrix(given, 'rotationMatrix', (3, 3), place)
+        shift = fields.values(
+            fields.section(extrinsics, 'translation', place), tuple('xyz'), place
+        )
+        turn = fields.matrix(extrinsics, 'rotationMatrix', (3, 3), place)
         pose = fields.pose(_CENTIMETER * np.array(shift), turn, place).compose(pose)
         socket = target
     return socket, pose

@@ -20,18 +20,18 @@ _SLACK = 1e-3  # of the elements of a rotation
 
 def section(mapping: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
     """Return a mapping in a mapping; raise LensError naming the field."""
-    found = mapping.get(name)
-    if not isinstance(found, dict):
-        raise LensError(f'{where}: {name} is {found!r}; a mapping is needed')
-    return found
+    value = mapping.get(name)
+    if not isinstance(value, dict):
+        raise LensError(f'{where}: {name} is {value!r}; a mapping is needed')
+    return value
 
 
 def sections(mapping: Mapping[str, Any], name: str, where: str) -> list[Mapping[str, Any]]:
     """Return a list of mappings in a mapping; raise LensError naming the field."""
-    found = mapping.get(name)
-    if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
-        raise LensError(f'{where}: {name} is {found!r:.80}; a list of mappings is needed')
-    return found
+    entries = mapping.get(name)
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise LensError(f'{where}: {name} is {entries!r:.80}; a list of mappings is needed')
+    return entries
 
 
 def numbers(mapping: Mapping[str, Any], name: str, count: int, where: str) -> list[float]:
@@ -48,8 +48,8 @@ def numbers(mapping: Mapping[str, Any], name: str, count: int, where: str) -> li
 
 def number_list(mapping: Mapping[str, Any], name: str, where: str) -> list[float]:
     """Return a list of any length of numbers of a mapping; raise LensError naming the field."""
-    given = mapping.get(name)
-    return numbers(mapping, name, len(given) if isinstance(given, list) else 1, where)
+    entries = mapping.get(name)
+    return numbers(mapping, name, len(entries) if isinstance(entries, list) else 1, where)
 
 
 def matrix(mapping: Mapping[str, Any], name: str, shape: tuple[int, int], where: str) -> Array:
@@ -80,8 +80,8 @@ def coefficient_list(
     mapping: Mapping[str, Any], name: str, counts: Sequence[int], where: str
 ) -> list[float]:
     """Return as many numbers of a list as one of `counts`, or raise LensError; zeros follow."""
-    given = mapping.get(name)
-    count = len(given) if isinstance(given, list) else 0
+    entries = mapping.get(name)
+    count = len(entries) if isinstance(entries, list) else 0
     numbers_given = numbers(mapping, name, count or counts[0], where)
     if count > counts[-1] and not any(numbers_given[counts[-1] :]):
         count = counts[-1]
@@ -109,13 +109,13 @@ def pose(place: ArrayLike, turn: ArrayLike, where: str) -> Pose:
 
     Raises LensError where these are no numbers, or the turn is none.
     """
-    place, given = np.array(place), np.array(turn)
-    length = np.linalg.norm(given)
+    place, matrix = np.array(place), np.array(turn)
+    length = np.linalg.norm(matrix)
     if np.isfinite([*place, length]).all() and length > 0.5:
-        if given.ndim == 1:
-            return Pose(rotation_from_quaternion(given), place)
-        rotation = nearest_rotation(given)
-        if np.allclose(rotation, given, atol=_SLACK):
+        if matrix.ndim == 1:
+            return Pose(rotation_from_quaternion(matrix), place)
+        rotation = nearest_rotation(matrix)
+        if np.allclose(rotation, matrix, atol=_SLACK):
             return Pose(rotation, place)
     raise LensError(
         f'{where}: a translation and a quaternion of unit length or a rotation matrix are needed'
@@ -130,7 +130,9 @@ def rectified(r: Any, p: Any, where: str) -> tuple[Array, Array] | None:
     if r is None or p is None:
         return None
     lists = (('R', r, 9), ('P', p, 12))
-    turn, projection = (numbers({name: one}, name, count, where) for name, one, count in lists)
+    turn, projection = (
+        numbers({name: entries}, name, count, where) for name, entries, count in lists
+    )
     return np.reshape(turn, (3, 3)), np.reshape(projection, (3, 4))
 
 

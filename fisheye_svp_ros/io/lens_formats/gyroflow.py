@@ -33,10 +33,10 @@ def read(text: str, where: str) -> Foreign:
     size = fields.values(
         fields.section(document, 'calib_dimension', where), ('w', 'h'), f'{where}: calib_dimension'
     )
-    found = fields.section(document, 'fisheye_params', where)
+    parameters = fields.section(document, 'fisheye_params', where)
     place = f'{where}: fisheye_params'
-    k = fields.matrix(found, 'camera_matrix', (3, 3), place)
-    d = fields.number_list(found, 'distortion_coeffs', place)
+    k = fields.matrix(parameters, 'camera_matrix', (3, 3), place)
+    d = fields.number_list(parameters, 'distortion_coeffs', place)
     lens = models.nearest_lens(
         'camera',
         size,

@@ -57,9 +57,11 @@ def _kalibr_lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens
     model = str(camera.get('camera_model')).lower()
     if model not in _INTRINSICS:
         raise LensError(f'{where}: camera_model is {model!r}; known are {", ".join(_INTRINSICS)}')
-    *own, fx, fy, cx, cy = fields.numbers(camera, 'intrinsics', _INTRINSICS[model], where)
+    *model_numbers, fx, fy, cx, cy = fields.numbers(
+        camera, 'intrinsics', _INTRINSICS[model], where
+    )
     size = fields.numbers(camera, 'resolution', 2, where)
-    distortion = _kalibr_distortion(camera, model, own, where)
+    distortion = _kalibr_distortion(camera, model, model_numbers, where)
     return models.nearest_lens(name, size, (fx, fy, cx, cy), distortion, where)
 
 
@@ -98,7 +100,7 @@ def _neighbor_pose(
     """Return a camera's neighbor in it: as stated, or through the IMU of both; None: not known."""
     if 'T_cn_cnm1' in cameras[name]:
         return _transform(cameras[name], 'T_cn_cnm1', f'{where}: {name}')
-    poses = [_imu_in_camera(cameras[one], f'{where}: {one}') for one in (before, name)]
+    poses = [_imu_in_camera(cameras[camera], f'{where}: {camera}') for camera in (before, name)]
     if poses[0] is None or poses[1] is None:
         return None
     return poses[1].compose(poses[0].inverse())

@@ -36,7 +36,9 @@ def read(text: str, where: str) -> Foreign:
         [root]
         if root.tag == 'calibration'
         else [
-            one for one in root.iter('calibration') if one.get('class', 'adjusted') == 'adjusted'
+            element
+            for element in root.iter('calibration')
+            if element.get('class', 'adjusted') == 'adjusted'
         ]
     )
     if not values:
@@ -45,8 +47,8 @@ def read(text: str, where: str) -> Foreign:
     return Foreign.from_lenses(
         'Metashape',
         {
-            name: _metashape_lens(name, one, f'{where}: {name}' if len(values) > 1 else where)
-            for name, one in zip(names, values, strict=True)
+            name: _metashape_lens(name, element, f'{where}: {name}' if len(values) > 1 else where)
+            for name, element in zip(names, values, strict=True)
         },
     )
 

@@ -149,14 +149,15 @@ class Distortion:
         """Whether OpenCV's pinhole models hold all of it."""
         beyond = [part[_PINHOLE_TERMS:] for part in (self.stretch, self.below)]
         beyond += [part[_PRISM_TERMS:] for part in self.prism]
-        other = any(map(any, beyond)) or any(self.growth) or (self.late and self.sideways)
-        return self.base is PERSPECTIVE and not other
+        is_bent = any(map(any, beyond)) or any(self.growth) or (self.late and self.sideways)
+        return self.base is PERSPECTIVE and not is_bent
 
     def height(self, theta: Array) -> Array:
         """Return the image height for unit focal length, of incidence angles, rad."""
         height = self.base.height(theta)
         above, below = (
-            1 + _polynomial(one, height * height) for one in (self.stretch, self.below)
+            1 + _polynomial(coefficients, height * height)
+            for coefficients in (self.stretch, self.below)
         )
         return np.asarray(height * (above / below))
 
@@ -224,8 +225,8 @@ def stated_distortion(model: str, d: Sequence[float], where: str) -> Distortion:
     counts = _COUNTS[model]
     # A model may be stated without distortion, and carry zeros.
     if len(d) not in counts and any(d[counts[-1] :] or d):
-        known = ' or '.join(str(count) for count in counts if count)
-        raise LensError(f'{where}: {model} has {len(d)} coefficients; {known} are needed')
+        lengths = ' or '.join(str(count) for count in counts if count)
+        raise LensError(f'{where}: {model} has {len(d)} coefficients; {lengths} are needed')
     return opencv_distortion(d)
 
 
@@ -321,8 +322,10 @@ def _fit_corrections(
     ideal = project_corrected(lens, points).uv
     scene = Scene(views_of(points[None], uv[None]), lens, identity(1), ideal[None])
     columns = np.concatenate([effect.columns(scene) for effect in effects], axis=-1)[0]
-    found = np.linalg.lstsq(columns.reshape(len(points) * 2, -1), (uv - ideal).ravel(), rcond=None)
-    parts = np.split(found[0], range(2, 2 * len(effects), 2))
+    solution = np.linalg.lstsq(
+        columns.reshape(len(points) * 2, -1), (uv - ideal).ravel(), rcond=None
+    )
+    parts = np.split(solution[0], range(2, 2 * len(effects), 2))
     lens = replace(
         lens,
         corrections={
@@ -419,7 +422,7 @@ def nearest_kannala_brandt(lens: Lens) -> Lens:
     if isinstance(lens.image_height, KannalaBrandt):
         return lens
     value = lens.image_height.value_and_slope
-    found, worst = fit_curve(
+    fitted, worst = fit_curve(
         lens.name,
         (lens.width, lens.height),
         (lens.fx, lens.fy, lens.cx, lens.cy),
@@ -433,7 +436,7 @@ def nearest_kannala_brandt(lens: Lens) -> Lens:
             f'lens {lens.name!r}: its curve is {worst:.2g} px from any curve of this '
             'format; calibrate it as kannala_brandt'
         )
-    return found
+    return fitted
 
 
 def coefficients(lens: Lens) -> list[float]:

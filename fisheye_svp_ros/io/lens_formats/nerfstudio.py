@@ -27,18 +27,18 @@ def read(text: str, where: str) -> Foreign:
     document = parse_json(text, where, LensError)
     shared = {key: document[key] for key in _KEYS if key in document}
     frames = document.get('frames')
-    given = [
+    cameras = [
         {key: frame[key] for key in _KEYS if key in frame} | shared
         for frame in (frames if isinstance(frames, list) else [])
         if isinstance(frame, dict)
     ]
-    different = list({json.dumps(one): one for one in given}.values()) or [shared]
+    different = list({json.dumps(camera): camera for camera in cameras}.values()) or [shared]
     if len(different) == 1:
         lenses = {'camera': _nerfstudio_lens('camera', different[0], where)}
     else:
         lenses = {
-            f'camera{i}': _nerfstudio_lens(f'camera{i}', one, f'{where}: camera{i}')
-            for i, one in enumerate(different, start=1)
+            f'camera{i}': _nerfstudio_lens(f'camera{i}', camera, f'{where}: camera{i}')
+            for i, camera in enumerate(different, start=1)
         }
     return Foreign.from_lenses('nerfstudio', lenses)
 

@@ -222,7 +222,9 @@ def _read_matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> l
         if isinstance(sizes := value.get('sizes'), list):
             shape = tuple(map(int, [*sizes, 1][:2])) if 0 < len(sizes) < 3 else None
     elif isinstance(data, list):
-        shape = next((one for one in shapes if one[0] * one[1] == len(data)), None)
+        shape = next(
+            (candidate for candidate in shapes if candidate[0] * candidate[1] == len(data)), None
+        )
     if shape is None or shape not in shapes:
         raise LensError(
             f'{where}: a matrix of 3 x 3 and the four coefficients of cv2.fisheye are '
@@ -243,12 +245,12 @@ def _matrix_numbers(value: Any) -> Any:
 def _from_xml(text: str, where: str) -> dict[str, Any]:
     """Return the numbers, lists and matrices of a FileStorage in XML by name."""
     return {
-        one.tag: {
-            part.tag: _parse_numbers(part.text, part.tag in ('data', 'sizes')) for part in one
+        element.tag: {
+            part.tag: _parse_numbers(part.text, part.tag in ('data', 'sizes')) for part in element
         }
-        if str(one.get('type_id')).startswith('opencv-')
-        else _parse_numbers(one.text, False)
-        for one in fields.xml(text, where, 'OpenCV file')
+        if str(element.get('type_id')).startswith('opencv-')
+        else _parse_numbers(element.text, False)
+        for element in fields.xml(text, where, 'OpenCV file')
     }
 
 

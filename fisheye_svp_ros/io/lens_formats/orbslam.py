@@ -25,8 +25,8 @@ def read(text: str, where: str) -> Foreign:
     """Read one lens or two and the rig; raises LensError, naming the field."""
     document = fields.yaml(text, where)
     prefixes = {
-        camera: next((p for p in known if f'{p}fx' in document), '')
-        for camera, known in _CAMERAS.items()
+        camera: next((p for p in prefix if f'{p}fx' in document), '')
+        for camera, prefix in _CAMERAS.items()
     }
     if not prefixes['right']:
         return Foreign.from_lenses(

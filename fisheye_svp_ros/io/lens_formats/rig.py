@@ -49,7 +49,7 @@ def read(text: str, where: str) -> Foreign:
 
 def pose_keys(cameras: Sequence[str]) -> list[str]:
     """Return the key of each camera in the next one."""
-    return [f'{one}{SEPARATOR}{other}' for one, other in pairwise(cameras)]
+    return [f'{camera}{SEPARATOR}{other}' for camera, other in pairwise(cameras)]
 
 
 def cameras_of(keys: Sequence[str]) -> tuple[str, ...]:
@@ -57,10 +57,10 @@ def cameras_of(keys: Sequence[str]) -> tuple[str, ...]:
 
     A camera may have `_in_` in its name: the first division with which all keys agree counts.
     """
-    first, *others = keys
+    first, *names = keys
     for place in (match.start() for match in re.finditer(f'(?={SEPARATOR})', first)):
         cameras = [first[:place], first[place + len(SEPARATOR) :]]
-        for key in others:
+        for key in names:
             if not key.startswith(cameras[-1] + SEPARATOR):
                 break
             cameras.append(key.removeprefix(cameras[-1] + SEPARATOR))

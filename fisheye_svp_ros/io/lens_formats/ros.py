@@ -43,8 +43,8 @@ def read(text: str, where: str) -> Foreign:
         size = document['image_width'], document['image_height']
         name = str(document.get('camera_name', 'camera'))
         if 'distortion_model' not in document:
-            other = document.get('camera_model')
-            instead = f' in place of camera_model: {other}' if other else ''
+            tool = document.get('camera_model')
+            instead = f' in place of camera_model: {tool}' if tool else ''
             raise LensError(
                 f'{where}: distortion_model is missing; a fisheye camera_info has '
                 f'distortion_model: equidistant{instead}'
@@ -56,7 +56,7 @@ def read(text: str, where: str) -> Foreign:
         raise LensError(f'{where}: not a whole camera_info; {cause.args[0]} is missing') from cause
     except (TypeError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
-    given = Foreign.from_lenses(
+    foreign = Foreign.from_lenses(
         'ROS',
         {
             name: (
@@ -71,7 +71,7 @@ def read(text: str, where: str) -> Foreign:
         fields.section({key: {}, **document}, key, where).get('data')
         for key in ('rectification_matrix', 'projection_matrix')
     )
-    return given._replace(rectified=fields.rectified(r, p, where))
+    return foreign._replace(rectified=fields.rectified(r, p, where))
 
 
 def _read_message(text: str, where: str) -> Foreign:
@@ -86,8 +86,8 @@ def _read_message(text: str, where: str) -> Foreign:
         raise LensError(str(cause)) from cause
     except (LookupError, TypeError, ValueError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
-    given = Foreign.from_lenses('ROS', {name: (distortion_lens(*model, name, where), 0.0)})
-    return given._replace(rectified=fields.rectified(told.get('r'), told.get('p'), where))
+    foreign = Foreign.from_lenses('ROS', {name: (distortion_lens(*model, name, where), 0.0)})
+    return foreign._replace(rectified=fields.rectified(told.get('r'), told.get('p'), where))
 
 
 @lru_cache(maxsize=64)

@@ -51,17 +51,19 @@ def read(text: str, where: str) -> Foreign:
         )
     names, distortion = _MODELS[kind]
     size = fields.values(document, ('image_width', 'image_height'), where)
-    given, place = fields.section(document, 'intrinsics', where), f'{where}: intrinsics'
-    f, cx, cy = fields.values(given, ('focal_length', 'principal_pt_x', 'principal_pt_y'), place)
-    aspect, skew = fields.values(
-        {'aspect_ratio': 1.0, 'skew': 0.0, **given}, ('aspect_ratio', 'skew'), place
+    intrinsics, place = fields.section(document, 'intrinsics', where), f'{where}: intrinsics'
+    f, cx, cy = fields.values(
+        intrinsics, ('focal_length', 'principal_pt_x', 'principal_pt_y'), place
     )
-    bent = distortion(f, *fields.values(given, names, place))
+    aspect, skew = fields.values(
+        {'aspect_ratio': 1.0, 'skew': 0.0, **intrinsics}, ('aspect_ratio', 'skew'), place
+    )
+    bent = distortion(f, *fields.values(intrinsics, names, place))
     lens, worst = models.nearest_lens('camera', size, (f, f * aspect, cx, cy, skew), bent, where)
     if kind == _DIVISION:
         # It sees pixels: along v, where these are of another size, its curve is another one.
         theta = np.linspace(0.0, lens.max_incidence, _ANGLES)
         along_v = lens.fy * lens.image_height.value_and_slope(theta)[0]
-        right = distortion(f * aspect, *fields.values(given, names, place)).height(theta)
+        right = distortion(f * aspect, *fields.values(intrinsics, names, place)).height(theta)
         worst = max(worst, float(np.abs(along_v - f * aspect * right).max()))
     return Foreign.from_lenses('OpenImuCameraCalibrator', {'camera': (lens, worst)})

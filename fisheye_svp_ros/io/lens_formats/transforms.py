@@ -36,10 +36,13 @@ def read(text: str, where: str) -> Foreign:
     """Read the rig: the left camera in the right one; raises LensError, naming what is missing."""
     joints = list(_urdf(text, where) if '<robot' in text else _messages(text, where))
     left, right = (_joint_camera(side, joints, where) for side in ('left', 'right'))
-    (root, mine), (other, theirs) = _pose_in_root(left, joints), _pose_in_root(right, joints)
-    if root != other:
+    (root, left_pose), (right_root, theirs) = (
+        _pose_in_root(left, joints),
+        _pose_in_root(right, joints),
+    )
+    if root != right_root:
         raise LensError(f'{where}: no fixed transforms lead from {left} to {right}')
-    return Foreign('transforms', {}, (theirs.inverse().compose(mine),), {})
+    return Foreign('transforms', {}, (theirs.inverse().compose(left_pose),), {})
 
 
 def _joint_camera(side: str, joints: list[_Joint], where: str) -> str:
@@ -71,9 +74,9 @@ def _urdf(text: str, where: str) -> Iterator[_Joint]:
         ends = joint.find('parent'), joint.find('child')
         if joint.get('type') == 'fixed' and ends[0] is not None and ends[1] is not None:
             origin = joint.find('origin')
-            given = {} if origin is None else origin.attrib
+            attributes = {} if origin is None else origin.attrib
             place, turn = (
-                _split_numbers(given.get(name, '0 0 0'), f'{where}: {joint.get("name")}')
+                _split_numbers(attributes.get(name, '0 0 0'), f'{where}: {joint.get("name")}')
                 for name in ('xyz', 'rpy')
             )
             roll, pitch, yaw = rotation_from_vector(np.diag(turn))  # about fixed axes

@@ -18,12 +18,12 @@ _POWERS = ('k1', 'k2', 'k3', 'k4')  # of the incidence angle, rad: 1 to 4
 def read(text: str, where: str) -> Foreign:
     """Read the lens; raises LensError, naming the field."""
     document = parse_json(text, where, LensError)
-    given, place = fields.section(document, 'intrinsic', where), f'{where}: intrinsic'
+    intrinsics, place = fields.section(document, 'intrinsic', where), f'{where}: intrinsic'
     width, height, dx, dy = fields.values(
-        given, ('width', 'height', 'cx_offset', 'cy_offset'), place
+        intrinsics, ('width', 'height', 'cx_offset', 'cy_offset'), place
     )
-    (aspect,) = fields.values({'aspect_ratio': 1.0, **given}, ('aspect_ratio',), place)
-    f, *factors = fields.values(given, _POWERS, place)
+    (aspect,) = fields.values({'aspect_ratio': 1.0, **intrinsics}, ('aspect_ratio',), place)
+    f, *factors = fields.values(intrinsics, _POWERS, place)
     if not f > 0:
         raise LensError(f'{place}: k1 is {f}; a focal length above 0 px is needed')
 

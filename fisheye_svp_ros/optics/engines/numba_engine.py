@@ -127,8 +127,8 @@ def adjust_rigs(
     systems, views = state[0].shape[:2]
     poses = np.empty((systems, views + 1, *POSE))
     parts = poses[:, :-1, :3], poses[:, :-1, 3], poses[:, -1, :3], poses[:, -1, 3]
-    for part, given in zip(parts, state, strict=True):
-        part[...] = given
+    for part, start in zip(parts, state, strict=True):
+        part[...] = start
     normal, cost = np.empty((systems, views + 1, *NORMAL)), np.empty(systems)
     iterations = np.empty(systems, dtype=np.int64)
     if entries.adjust_rigs(
@@ -173,10 +173,10 @@ def _pack(lens: Lens) -> Array | None:
     if shift is not None:
         curves.append((shift, kernels.SHIFTS, kernels.SHIFT_KIND, kernels.SHIFT_K))
         numbers[kernels.NEAR] = caustic_range(shift, search_limit(shift, lens.max_incidence))
-    for curve, known, kind, first in curves:
-        if not _is_compiled(curve, known):
+    for curve, formulas, kind, first in curves:
+        if not _is_compiled(curve, formulas):
             return None
-        numbers[kind] = known.index(curve.formula)
+        numbers[kind] = formulas.index(curve.formula)
         numbers[first : first + len(curve.coefficients)] = curve.coefficients
     return numbers
 

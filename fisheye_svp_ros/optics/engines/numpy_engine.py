@@ -103,7 +103,7 @@ def pose_equations(
     cost, gram = np.zeros(systems), np.zeros((systems, 6, 7))
     sums, center = _sums(lens, rotation), _number_pair(lens.cx, lens.cy, 3)
     for part in _point_tiles(systems, count):
-        own, weights = part[0], weight[part]
+        tile, weights = part[0], weight[part]
         local = _to_cameras(rotation, position, points, part)
         if np.count_nonzero(weights) < weights.size:
             local[:, weights == 0] = np.array([[0.0], [0.0], [1.0]])
@@ -112,15 +112,15 @@ def pose_equations(
         height *= weights
         slope *= weights
         rows = np.empty((len(weights), 14, weights.shape[1]))
-        _add_up(sums[own], met, (height, slope), rows[:, :12], rows[:, 12:])
+        _add_up(sums[tile], met, (height, slope), rows[:, :12], rows[:, 12:])
         off = rows[:, 12:].transpose(1, 0, 2)
         off -= (uv[part].transpose(2, 0, 1) - center) * weights
         if np.count_nonzero(met.valid) < met.valid.size:
             off[:, ~met.valid] = np.nan
-        cost[own] += np.einsum('usn,usn->s', off, off)
+        cost[tile] += np.einsum('usn,usn->s', off, off)
         flat = rows.reshape(len(rows), 7, -1)
         # All seven times all seven would be BLAS's syrk, which is slower at this size.
-        gram[own] += flat[:, :6] @ flat.swapaxes(1, 2)
+        gram[tile] += flat[:, :6] @ flat.swapaxes(1, 2)
     outside = ~np.isfinite(cost)
     if np.count_nonzero(outside):
         cost[outside], gram[outside] = np.inf, np.eye(6, 7)
@@ -163,11 +163,11 @@ def _to_cameras(
     rotation: Array, position: Array, points: Array, part: tuple[slice, slice]
 ) -> Array:
     """Return a tile's points (3, S, N) in the frames of their cameras."""
-    own, seen = part[0], points[part].transpose(2, 0, 1)
+    systems, seen = part[0], points[part].transpose(2, 0, 1)
     arm = np.array(seen, order='C')  # faster copied than subtracted
-    arm -= position[own].T[..., None]
+    arm -= position[systems].T[..., None]
     local = np.empty_like(arm)
-    np.matmul(rotation[own].swapaxes(1, 2), arm.swapaxes(0, 1), out=local.swapaxes(0, 1))
+    np.matmul(rotation[systems].swapaxes(1, 2), arm.swapaxes(0, 1), out=local.swapaxes(0, 1))
     return local
 
 

@@ -56,9 +56,9 @@ def sight(lens: Lens, points: Array) -> Sight:
     across = _across(direction)
     more = 1 + len(lens.port.coefficients)
     side, off, slopes = _ray_miss(lens, points, direction, across, more)
-    by_turn, other = slopes[..., :2], slopes[..., 2:]
+    by_turn, by_lens = slopes[..., :2], slopes[..., 2:]
     # off = 0 stays so: what moves it otherwise is taken back by a turn of the ray.
-    turn = -_solve_2x2(by_turn, np.concatenate([side, other], axis=-1))
+    turn = -_solve_2x2(by_turn, np.concatenate([side, by_lens], axis=-1))
     change = np.swapaxes(across, -1, -2) @ turn
     size = np.linalg.norm(points, axis=-1)
     valid = np.asarray(np.linalg.norm(off, axis=-1) < _MAX_MISS * size)
@@ -80,8 +80,8 @@ def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
 
 def met(lens: Lens, sight: Sight, limited: bool) -> Incidence:
     """Return where rays in air meet the lens."""
-    found = numpy_engine.incidence(lens.svp(), sight.direction, limited)
-    return found._replace(valid=found.valid & sight.valid)
+    in_air = numpy_engine.incidence(lens.svp(), sight.direction, limited)
+    return in_air._replace(valid=in_air.valid & sight.valid)
 
 
 def port_columns(lens: Lens, sight: Sight) -> tuple[Array, Array]:
@@ -125,14 +125,14 @@ def _ray_miss(
     slopes (M, 2, 2 + more): of off by the turn of the ray in air along `across` (M, 2, 3), then by
     the lens's viewpoint shift and the coefficients of the port.
     """
-    at, way = trace_rays(lens, direction, across, more)
-    arm = points.T - at.value
+    exits, way = trace_rays(lens, direction, across, more)
+    arm = points.T - exits.value
     along = (arm * way.value).sum(axis=0)
     # A point between the camera and the port is not seen through it.
     along = np.where(along > 0, along, np.nan)
     side = _across(way.value.T)
     sides = np.ascontiguousarray(np.moveaxis(side, 0, -1))
-    slopes = (sides[:, None] * (at.slope + along * way.slope)).sum(axis=2)
+    slopes = (sides[:, None] * (exits.slope + along * way.slope)).sum(axis=2)
     return side, (sides * arm).sum(axis=1).T, -np.moveaxis(slopes, -1, 0)
 
 
@@ -167,9 +167,9 @@ def trace_rays(
 def _across(direction: Array) -> Array:
     """Return two unit vectors (M, 2, 3) across unit vectors (M, 3) and each other."""
     helper = np.where(np.abs(direction[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    one = np.cross(direction, helper)
-    one /= np.linalg.norm(one, axis=-1, keepdims=True)
-    return np.stack([one, np.cross(direction, one)], axis=1)
+    first = np.cross(direction, helper)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(direction, first)], axis=1)
 
 
 def _solve_2x2(matrix: Array, right: Array) -> Array:
