@@ -33,7 +33,7 @@ from rosbags.typesys import Stores, get_typestore
 from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.mcap import (
     MAX_BYTES,
-    RawMessage,
+    Record,
     database_messages,
     database_topics,
     listed_topics,
@@ -134,15 +134,6 @@ class _Storage(McapWriter):
         self.bio.seek(start + _CHECKSUM)
         self.bio.write(struct.pack('<I', checksum))
         self.bio.seek(end)
-
-
-class Record(NamedTuple):
-    """One message of a recording: the time it was recorded at, ns, and its fields."""
-
-    topic: str
-    typename: str
-    time: int
-    message: Any
 
 
 class BagWriter:
@@ -277,9 +268,7 @@ class Bag:
     def _files(self) -> list[Path]:
         return recording_files(self.path)
 
-    def _raw(
-        self, note: Callable[[str], None], passed: Callable[[int], None]
-    ) -> Iterator[RawMessage]:
+    def _raw(self, note: Callable[[str], None], passed: Callable[[int], None]) -> Iterator[Record]:
         """Yield all messages; raise BagError where nothing is whole."""
         problems, count = list[str](), 0
 

@@ -39,23 +39,21 @@ _COMPUTED_CELLS = (
 _COLUMN_TYPES = [str, str, int, bytes]
 
 
-class RawMessage(NamedTuple):
-    """One recorded message: time in ns, data as CDR."""
+class Record(NamedTuple):
+    """One message of a recording: the time it was recorded at, ns, and its CDR, or its fields."""
 
     topic: str
     typename: str
     time: int
-    data: bytes
+    message: Any
 
 
-def whole_messages(
-    path: Path, note: _Note, passed: _Passed = lambda _: None
-) -> Iterator[RawMessage]:
+def whole_messages(path: Path, note: _Note, passed: _Passed = lambda _: None) -> Iterator[Record]:
     """Yield every whole message of an MCAP file; by time, within chunks that follow each other.
 
     note: told what is damaged, and where; passed: told how many bytes more have been read.
     """
-    held: list[RawMessage] = []
+    held: list[Record] = []
     for batch in _chunk_messages(path, note, passed):
         first = min(message.time for message in batch)
         yield from (message for message in held if message.time <= first)
@@ -80,7 +78,7 @@ def listed_topics(path: Path) -> set[tuple[str, str]]:
     }
 
 
-def _chunk_messages(path: Path, note: _Note, passed: _Passed) -> Iterator[list[RawMessage]]:
+def _chunk_messages(path: Path, note: _Note, passed: _Passed) -> Iterator[list[Record]]:
     """Yield the messages of each chunk that holds any."""
     schemas: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}
@@ -99,7 +97,7 @@ def _chunk_messages(path: Path, note: _Note, passed: _Passed) -> Iterator[list[R
                     promised = record.message_count
                 elif isinstance(record, Message) and record.channel_id in channels:
                     where = channels[record.channel_id]
-                    batch.append(RawMessage(*where, record.log_time, record.data))
+                    batch.append(Record(*where, record.log_time, record.data))
             count += len(batch)
             if batch:
                 yield batch
@@ -173,7 +171,7 @@ def _decompress(chunk: Chunk) -> bytes:
 
 def database_messages(
     path: Path, note: Callable[[str], None], passed: Callable[[int], None] = lambda _: None
-) -> Iterator[RawMessage]:
+) -> Iterator[Record]:
     """Yield the messages of a database, by time, as far as it can be read.
 
     note: told why not further; passed: told how many bytes more have been read.
@@ -183,7 +181,7 @@ def database_messages(
             for row in database.execute(_MESSAGES):
                 _refuse_unless([type(cell) for cell in row] == _COLUMN_TYPES)
                 passed(len(row[-1]))
-                yield RawMessage(*row)
+                yield Record(*row)
     except (sqlite3.Error, BagError) as cause:
         note(f'it cannot be read on ({cause})')
 

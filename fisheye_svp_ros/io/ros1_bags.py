@@ -11,7 +11,7 @@ from typing import Any
 from rosbags.typesys import Stores, get_typestore
 
 from fisheye_svp_ros.errors import BagError
-from fisheye_svp_ros.io.mcap import RawMessage
+from fisheye_svp_ros.io.mcap import Record
 
 _REMEDY = 'copy it again, or run `rosbag reindex`'
 
@@ -30,7 +30,7 @@ def ros1_topics(path: Path) -> set[tuple[str, str]]:
 
 def ros1_messages(
     path: Path, note: Callable[[str], None], passed: Callable[[int], None]
-) -> Iterator[RawMessage]:
+) -> Iterator[Record]:
     """Yield the messages of a bag by time, as ROS 1 serializes them.
 
     note: told what is damaged; passed: told how many bytes more have been read.  Raises BagError
@@ -46,7 +46,7 @@ def ros1_messages(
             except Exception as cause:  # of whatever a damaged file leads a parser to
                 note(f'{path.name} is damaged ({cause!r:.100})')
                 break
-            yield RawMessage(connection.topic, connection.msgtype, when, data)
+            yield Record(connection.topic, connection.msgtype, when, data)
     passed(path.stat().st_size)
 
 

@@ -16,28 +16,21 @@ _SAMPLES = 48  # along the longer side of the image
 _NEAREST, _STEPS = 0.1, 81  # m; ranges, even in their inverse, at which the limit is looked for
 
 
-class ImageError(NamedTuple):
-    """Errors (R, N), px, at rectified pixels (N, 2) of points at ranges (R,), m; NaN: not seen."""
+class RangeErrors(NamedTuple):
+    """Errors (R, N), px, at rectified pixels (N, 2) of points at ranges (R,), m; NaN: not seen.
 
-    ranges: Array
-    pixels: Array
-    px: Array
-
-
-class PairError(NamedTuple):
-    """Errors (R, N) of what both cameras see at ranges (R,), m, from the middle of the baseline.
-
-    pixels (N, 2): of the left camera; row: of the right image minus the left one, px; depth: by
-    disparity, relative to the true depth.  NaN: not seen by both.
+    Of a pair: of what both cameras see, at ranges from the middle of the baseline and at pixels of
+    the left camera; px: row of the right image minus the left one; depth (R, N): by disparity,
+    relative to the true depth.
     """
 
     ranges: Array
     pixels: Array
-    row: Array
-    depth: Array
+    px: Array
+    depth: Array | None = None
 
 
-def image_error(side: Rectification, ranges: Array) -> ImageError:
+def image_error(side: Rectification, ranges: Array) -> RangeErrors:
     """Return how far points at other ranges lie from their places in the rectified camera.
 
     Of a sphere along great circles: near its poles a small angle takes many pixels of azimuth.
@@ -48,10 +41,10 @@ def image_error(side: Rectification, ranges: Array) -> ImageError:
         uv, seen = side.image_points(directions, range_m)
         points = side.rectified_points(np.where(seen[:, None], uv, np.nan))
         px[row] = _pixel_distances(side.camera, points, pixels)
-    return ImageError(ranges, pixels, px)
+    return RangeErrors(ranges, pixels, px)
 
 
-def pair_error(pair: RectifiedPair, ranges: Array) -> PairError:
+def pair_error(pair: RectifiedPair, ranges: Array) -> RangeErrors:
     """Return what is left of the difference of rows, and of depths by disparity, at ranges."""
     pixels, directions = _sample_pixels(pair.left)
     row, depth = np.full((2, len(ranges), len(pixels)), np.nan)
@@ -65,7 +58,7 @@ def pair_error(pair: RectifiedPair, ranges: Array) -> PairError:
         if np.isfinite(range_m):
             true = np.hypot(*(points @ pair.left.rotation.T)[:, 1:].T)
             depth[number] = pair.depth(*found) / true - 1
-    return PairError(ranges, pixels, row, depth)
+    return RangeErrors(ranges, pixels, row, depth)
 
 
 def tolerated_ranges(ranges: Array, px: Array, range_m: float, limit: float = LIMIT) -> Array:

@@ -329,7 +329,7 @@ def draw_groups(
             step = -(-len(ticks) // int(_TICKS * width / _WIDTH))
             axis.set_xticks(range(0, len(ticks), step), ticks[::step], rotation=90, fontsize=7)
         elif x is None:
-            axis.xaxis.get_major_locator().set_params(integer=True)
+            axis.locator_params('x', integer=True)
         _legend(figure, axis, narrow)
 
 

@@ -13,8 +13,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.image_files import to_color, write_png
 from fisheye_svp_ros.rectify.errors import (
     LIMIT,
-    ImageError,
-    PairError,
+    RangeErrors,
     image_error,
     pair_error,
     quantiles,
@@ -51,37 +50,29 @@ class Remaining(NamedTuple):
 
 def shift_left(side: Rectification) -> Remaining:
     """Return what the viewpoint shift leaves at other ranges than that of the maps."""
-    error = image_error(side, table_ranges(side))
-    curve = image_error(side, search_ranges(side))
-    return _remaining_errors(side, error, error.px, curve.ranges, curve.px)
+    ranges = table_ranges(side), search_ranges(side)
+    return _remaining_errors(side, *(image_error(side, part) for part in ranges))
 
 
 def rows_left(pair: RectifiedPair) -> Remaining:
     """Return how rows of both images differ at other ranges than that of the maps."""
-    error = pair_error(pair, table_ranges(pair.left))
-    curve = pair_error(pair, search_ranges(pair.left))
-    left = _remaining_errors(pair.left, error, error.row, curve.ranges, curve.row)
-    return left._replace(depth=quantiles(error.depth))
+    ranges = table_ranges(pair.left), search_ranges(pair.left)
+    return _remaining_errors(pair.left, *(pair_error(pair, part) for part in ranges))
 
 
-def _remaining_errors(
-    side: Rectification,
-    error: ImageError | PairError,
-    px: Array,
-    curve_ranges: Array,
-    curve_px: Array,
-) -> Remaining:
-    table = quantiles(px)
+def _remaining_errors(side: Rectification, error: RangeErrors, curve: RangeErrors) -> Remaining:
+    table = quantiles(error.px)
     worst = int(np.nanargmax(table[:, 2]))
     return Remaining(
         error.ranges,
         table,
-        curve_ranges,
-        quantiles(curve_px),
-        tolerated_ranges(curve_ranges, curve_px, side.range),
+        curve.ranges,
+        quantiles(curve.px),
+        tolerated_ranges(curve.ranges, curve.px, side.range),
         float(error.ranges[worst]),
         error.pixels,
-        np.abs(px[worst]),
+        np.abs(error.px[worst]),
+        None if error.depth is None else quantiles(error.depth),
     )
 
 

@@ -173,7 +173,7 @@ def ray_model(
     """
     count = len(covariance)
     base = points_on_rays(lens_of(np.zeros(count)), uv, ranges)
-    visible = np.asarray(np.isfinite(base).all(axis=(0, 2)))
+    visible: Mask = np.asarray(np.isfinite(base).all(axis=(0, 2)))
     sides = []
     variance = np.maximum(np.diag(covariance), 0.0)
     if others is not None:

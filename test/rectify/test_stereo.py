@@ -57,13 +57,13 @@ def test_rows_and_depths_at_the_range_are_those_of_one_viewpoint(projection: str
     camera = camera_for(lenses, projection, along_baseline=True)
     pair = rectify_pair(*lenses, RIG, camera, 0.5)
     error = pair_error(pair, np.array([0.25, 0.5, 2.0, np.inf]))
-    seen = np.isfinite(error.row)
+    seen = np.isfinite(error.px)
     assert seen.sum(axis=1).min() > 100
-    assert np.nanmax(np.abs(error.row[1])) < 1e-6
+    assert np.nanmax(np.abs(error.px[1])) < 1e-6
     assert np.nanmedian(np.abs(error.depth[1])) < 1e-9
     assert np.isnan(error.depth[3]).all()
     for other in (0, 2, 3):
-        assert np.nanmax(np.abs(error.row[other])) > 0.1
+        assert np.nanmax(np.abs(error.px[other])) > 0.1
     assert np.nanmedian(np.abs(error.depth[2])) > 1e-3
 
 
@@ -91,7 +91,7 @@ def test_cameras_that_are_exchanged_have_a_baseline_below_zero() -> None:
     pair = rectify_pair(RIGHT, LEFT, RIG.inverse(), camera)
     assert pair.baseline < 0 < pair.right.p[0, 3]
     assert pair.left.rotation[0, 0] > 0.9  # images stay upright
-    assert np.nanmax(np.abs(pair_error(pair, np.array([1.0])).row)) < 1e-6
+    assert np.nanmax(np.abs(pair_error(pair, np.array([1.0])).px)) < 1e-6
 
 
 class TestRendered:
