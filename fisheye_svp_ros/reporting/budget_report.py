@@ -186,6 +186,8 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: BudgetReque
             )
             axis.set_title(title, fontsize=9.5)
             axis.set(xscale='log', xlabel='range / m', ylabel='spread / degree')
+            # Limits end at the middles of the outer cells.
+            axis.set(xlim=budget.ranges[[0, -1]], ylim=np.degrees(budget.spreads[[0, -1]]))
             axis.grid(visible=False)
         _explain(axes.flat[len(points)], asked)
 

@@ -120,10 +120,11 @@ def draw_remaining(path: Path, side: Rectification, left: Remaining, what: str) 
     with picture(path, 10.0, 4.0) as figure:
         curve, image = figure.subplots(1, 2)
         near = np.isfinite(left.curve_ranges)
-        for i, (name, color) in enumerate(
-            (('median', FAINT), ('95 %', OURS), ('worst', PUBLISHED))
+        for i, (name, color, line) in enumerate(
+            (('median', FAINT, '-'), ('95 %', OURS, '-'), ('largest', PUBLISHED, '--'))
         ):
-            curve.plot(left.curve_ranges[near], left.curve[near, i], color=color, label=name)
+            values = left.curve[near, i]
+            curve.plot(left.curve_ranges[near], values, line, color=color, label=name)
         curve.axhline(LIMIT, color='#404850', linestyle='--', linewidth=0.9)
         if np.isfinite(side.range):
             curve.axvline(side.range, color='#404850', linestyle=':', linewidth=0.9)
@@ -136,10 +137,12 @@ def draw_remaining(path: Path, side: Rectification, left: Remaining, what: str) 
             title=tolerated_text(left),
         )
         curve.legend()
-        seen = np.isfinite(left.map_px)
-        shown = image.scatter(
-            *left.map_uv[seen].T, c=left.map_px[seen], s=14, marker='s', cmap='Blues', vmin=0.0
+        (u, column), (v, row) = (
+            np.unique(places, return_inverse=True) for places in left.map_uv.T
         )
+        values = np.full((len(v), len(u)), np.nan)
+        values[row, column] = left.map_px
+        shown = image.pcolormesh(u, v, values, shading='nearest', cmap='Blues', vmin=0.0)
         figure.colorbar(shown, ax=image, label=f'{what}, px')
         image.set(
             xlim=(-0.5, side.camera.width - 0.5),

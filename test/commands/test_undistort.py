@@ -98,7 +98,11 @@ def test_one_camera(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert shift['ranges_m'] == [0.3, 0.5, 1.0, 2.0, 5.0, None]
     assert shift['worst_px'][0] < 1e-6 < 0.5 < shift['worst_px'][-1]
     assert shift['below_m'][0] < 0.3 < shift['below_m'][1]
-    assert cv2.imread(str(tmp_path / 'shift.png')) is not None
+    picture = cv2.imread(str(tmp_path / 'shift.png'))
+    # The map is of one piece: white lines ran between its cells.
+    blue = (picture[..., 0].astype(int) - picture[..., 2] > 40)[:, picture.shape[1] // 2 : -250]
+    filled = cv2.morphologyEx(blue.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5)))
+    assert filled.sum() > 10_000 and (filled > blue).mean() < 0.01
     ideal = load_lens(tmp_path / 'camera_info.yaml')  # 9 decimals of a pixel from the ideal one
     assert (ideal.width, ideal.height) == (500, 300)
     point = np.array([[0.3, -0.2, 0.5]])

@@ -255,6 +255,13 @@ def test_the_picture_draws_the_limits_that_hold(tmp_path, monkeypatch):
     assert sum(': limit' in title for title in titles[1]) == 5
     texts = [' '.join(t.get_text() for a in figure.axes for t in a.texts) for figure in figures]
     assert ['caused by noise' in text for text in texts] == [False, True]
+    # Hatches ended half a cell before the border of the picture.
+    written = json.loads((tmp_path / 'budget.json').read_text(encoding='utf-8'))
+    shown = figures[0].axes[0]
+    assert list(shown.get_xlim()) == pytest.approx([written['ranges_m'][i] for i in (0, -1)])
+    assert list(np.radians(shown.get_ylim())) == pytest.approx(
+        [written['spreads_rad'][i] for i in (0, -1)]
+    )
 
 
 @pytest.mark.parametrize(

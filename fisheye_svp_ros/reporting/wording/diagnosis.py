@@ -33,8 +33,8 @@ from fisheye_svp_ros.scene.observations import frame_name
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
 
 CAPTIONS = {
-    'field': 'Residual vectors over the image; the scale is above each panel; dotted: equal '
-    'incidence angle. Above: single points. Below: means over cells of the image, which '
+    'field': 'Residual vectors over the image. The scale is in the upper right corner. Dotted: '
+    'equal incidence angle. Above: single points. Below: means over cells of the image, which '
     'show errors common to all frames.',
     'theta': 'Residuals against the incidence angle, along the radius from the principal point '
     '(above) and across it (below).',
