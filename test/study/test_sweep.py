@@ -62,9 +62,9 @@ synthetic_camera:
     noise_px: 0.5
     environment: inner
     sweep.radius: [2.0, 0.5, 0.3]
-    sweep.seed: {list(range(1700))}
+    sweep.seed: {list(range(850))}
 """
-TASKS = 10
+TASKS = 5
 
 
 @pytest.fixture(autouse=True)
@@ -346,7 +346,7 @@ def test_the_result_does_not_depend_on_who_works(
     sweep(write(LONG), '-o', tmp_path / 'two', '--workers', 2)
     assert files_of(tmp_path / 'two') == files_of(undisturbed)
     summary = json.loads((undisturbed / 'sweep.json').read_text())
-    assert summary['scenarios'] == summary['metrics']['localizer.rms_px']['solved'] == 5100
+    assert summary['scenarios'] == summary['metrics']['localizer.rms_px']['solved'] == 2550
 
 
 @pytest.mark.slow
