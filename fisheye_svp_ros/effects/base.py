@@ -139,15 +139,15 @@ class Effect(ABC):
     name: ClassVar[str]
     stage: ClassVar[str]
     of_target: ClassVar[bool] = False  # whether another target would not have it
-    rarer_than: ClassVar[str] = ''  # an effect that does nearly the same and is more common
-    of_motion: ClassVar[bool] = False  # whether it follows from how the camera moves
-    abrupt: ClassVar[bool] = False  # whether what changes smoothly is no sign of it
-    asked_after: ClassVar[tuple[str, ...]] = ()  # more common ones that it does, too, and more
-    of_frames: ClassVar[bool] = False  # whether its size hangs on how each frame was taken
-    asked_last: ClassVar[bool] = False  # whether what it is of stands out only beside all others
-    hides: ClassVar[tuple[str, ...]] = ()  # effects that cannot be told from it where it is
-    hidden_structure: ClassVar[tuple[str, ...]] = ()  # variables on which residuals depend by it
-    # How its displacements of landmarks are shown: 'smooth' over boards, 'single' ones; or not
+    rarer_than: ClassVar[str] = ''  # a more common effect with nearly the same residuals
+    of_motion: ClassVar[bool] = False  # whether it follows from the motion of the camera
+    abrupt: ClassVar[bool] = False  # whether smooth changes are no evidence of it
+    asked_after: ClassVar[tuple[str, ...]] = ()  # more common effects whose residuals it includes
+    of_frames: ClassVar[bool] = False  # whether its size depends on how each frame was taken
+    asked_last: ClassVar[bool] = False  # whether it is tested only beside all other effects
+    hides: ClassVar[tuple[str, ...]] = ()  # effects confounded with it where it is present
+    hidden_structure: ClassVar[tuple[str, ...]] = ()  # variables on which its residuals depend
+    # How a map of the target shows it: 'smooth' over boards, 'single' landmarks, '' not at all
     target_map: ClassVar[str] = ''
     when_untestable: ClassVar[str] = ''  # what to do where frames differ and have no time
     meaning: ClassVar[str] = ''  # what it is, as a sentence

@@ -13,11 +13,9 @@ from fisheye_svp_ros.io.share import config_path
 from fisheye_svp_ros.scene.observations import MOST_LANDMARK, SPREADS, Landmarks, check_landmarks
 
 
-def environment(spread: str, radius: float, layout: str | Path | None = None) -> Landmarks:
+def environment(spread: str, radius: float) -> Landmarks:
     """Return Kita's environment: `spread` whole, inner or outer, `radius` in m (section 3).
 
-    layout: YAML with the `directions` of the landmarks, default `config/environments/kita.yaml`.
-    Directions are given by incidence angle and azimuth around -z, degrees.
     Raises ObservationError for an unknown spread or an impossible radius.
     """
     if spread not in SPREADS:
@@ -25,16 +23,10 @@ def environment(spread: str, radius: float, layout: str | Path | None = None) ->
         raise ObservationError(f'environment {spread!r} is unknown; known are {names}')
     if not (np.isfinite(radius) and radius > 0):
         raise ObservationError(f'environment radius is {radius} m; it must be above 0')
-    path = config_path('environments/kita.yaml') if layout is None else Path(layout)
-    document = read_yaml(path, ObservationError)
-    try:
-        groups = {name: np.array(document[name], dtype=float) for name in ('inner', 'outer')}
-        counts = [len(groups['inner']), len(groups['outer'])]
-        incidence, azimuth = np.radians(np.concatenate(list(groups.values()))).T
-    except (KeyError, ValueError, IndexError, TypeError) as cause:
-        raise ObservationError(
-            f'{path}: inner and outer must each be a list of [incidence_deg, azimuth_deg]'
-        ) from cause
+    # Incidence angle and azimuth around -z, degrees
+    document = read_yaml(config_path('environments/kita.yaml'), ObservationError)
+    groups = [np.array(document[name], dtype=float) for name in ('inner', 'outer')]
+    incidence, azimuth = np.radians(np.concatenate(groups)).T
     directions = np.stack(
         [
             np.sin(incidence) * np.cos(azimuth),
@@ -43,9 +35,10 @@ def environment(spread: str, radius: float, layout: str | Path | None = None) ->
         ],
         axis=-1,
     )
-    chosen = np.repeat([spread in ('whole', 'inner'), spread in ('whole', 'outer')], counts)
-    landmarks = Landmarks(np.flatnonzero(chosen), radius * directions[chosen])
-    return check_landmarks(landmarks, str(path))
+    chosen = np.repeat(
+        [spread in ('whole', name) for name in ('inner', 'outer')], [*map(len, groups)]
+    )
+    return Landmarks(np.flatnonzero(chosen), radius * directions[chosen])
 
 
 def load_landmarks(path: str | Path) -> Landmarks:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 MAX_RMS_RATIO = 1.5  # a set may fit this much worse than the one before it, by chance
 MAX_POSE_CHANGE = 0.1  # rad, and of the distance of the nearest landmark
-PERFECT_FIT_PX = 1e-6  # px; what fits better fits perfectly
+PERFECT_FIT_PX = 1e-6  # px; smaller residuals are rounding
 _MAX_AHEAD = 2  # intervals between two sets, after which a motion is not carried on
 OUTLIER_SEARCH_INTERVAL = 10  # sets, of those that fit badly one after the other
 

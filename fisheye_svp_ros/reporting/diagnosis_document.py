@@ -1,4 +1,4 @@
-"""diagnosis.json: facts of a diagnosis by the keys of the design, with their sentences.
+"""diagnosis.json: the facts of a diagnosis by key, with their sentences.
 
 docs/reference/diagnosis.schema.json is generated from the keys here and the records that have
 them: python docs/diagnosis_schema.py

@@ -146,6 +146,7 @@ class Observations:
 STEREO = ('left', 'right')
 _MAX_CAMERA_NAME = 100  # bytes; of files that are named after cameras, file systems allow 255
 CAMERA_NAME = f'a printable name of at most {_MAX_CAMERA_NAME} bytes, without / and not .name,'
+_MAX_LISTED = 10  # frames in a sentence
 _HEADER = ('cameras', 'source', 'photographs')
 
 
@@ -429,8 +430,8 @@ def frame_name(table: Observations, frame: int, camera: str | None = None) -> st
     return ' and '.join(frame_names(table, frame, camera))
 
 
-def list_frames(table: Observations, frames: Sequence[int], most: int = 10) -> str:
-    """Return frames as one enumerates them, at most so many and the count of the others.
+def list_frames(table: Observations, frames: Sequence[int]) -> str:
+    """Return frames as one enumerates them: the first ten, and the count of the others.
 
     Photographs by name; `frames 1, 2 and 3` where no photograph is known.
     """
@@ -440,8 +441,8 @@ def list_frames(table: Observations, frames: Sequence[int], most: int = 10) -> s
     if names and all(name.startswith('frame ') for name in names):
         head = 'frames ' if len(names) > 1 else 'frame '
         names = [name.removeprefix('frame ') for name in names]
-    if len(names) > most:
-        return f'{head}{", ".join(names[:most])} and {len(names) - most} more'
+    if len(names) > _MAX_LISTED:
+        return f'{head}{", ".join(names[:_MAX_LISTED])} and {len(names) - _MAX_LISTED} more'
     return head + ' and '.join(filter(None, (', '.join(names[:-1]), *names[-1:])))
 
 

@@ -13,7 +13,7 @@ from benchmark.studies.paper.writing import (
     lens_document,
     whole_directions,
 )
-from fisheye_svp_ros.io.landmark_files import environment
+from fisheye_svp_ros.io import landmark_files
 from fisheye_svp_ros.io.lens_files import lens_from_dict, load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.paper.lens_evaluation import localize_spreads
@@ -51,7 +51,7 @@ def test_a_fit_is_deterministic(found):
     np.testing.assert_array_equal(again.lens_numbers, found[0].lens_numbers)
 
 
-def test_what_is_written_is_what_was_found(found, tmp_path):
+def test_what_is_written_is_what_was_found(found, tmp_path, monkeypatch):
     best = best_of(found)
     assert best is found[1]
     for lens, numbers in zip(LENS_PAIR, best.lens_numbers, strict=True):
@@ -67,7 +67,8 @@ def test_what_is_written_is_what_was_found(found, tmp_path):
         )
     layout = tmp_path / 'layout.yaml'
     layout.write_text(yaml.safe_dump(layout_document(best, 32)), encoding='utf-8')
-    written = environment('whole', 1.0, layout).points
+    monkeypatch.setattr(landmark_files, 'config_path', lambda _: layout)
+    written = landmark_files.environment('whole', 1.0).points
     np.testing.assert_allclose(written, whole_directions(best), atol=1e-12)
 
 

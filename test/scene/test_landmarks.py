@@ -48,38 +48,6 @@ def test_impossible_environment(spread, radius, reason):
         environment(spread, radius)
 
 
-@pytest.mark.parametrize(
-    ('content', 'reason'),
-    [
-        ('inner: [[0, 0]]\n', 'inner and outer must each be a list of'),
-        ('inner: [[0, 0]]\nouter: []\n', 'inner and outer must each be a list of'),
-        ('inner: [[0, 0]]\nouter: [[1, 2], [3]]\n', 'inner and outer must each be a list of'),
-        ('inner: [[0]]\nouter: [[1]]\n', 'inner and outer must each be a list of'),
-        ('inner: [[0, 0]]\nouter: [[a, b]]\n', 'inner and outer must each be a list of'),
-        ('inner: 3\nouter: 4\n', 'inner and outer must each be a list of'),
-        (
-            'inner: [[0, 0]]\nouter: [[.nan, 0]]\n',
-            'landmark 1 has a coordinate that is not a finite',
-        ),
-        ('- 1\n', 'a YAML mapping is expected'),
-    ],
-)
-def test_broken_layout(content, reason, tmp_path):
-    file = tmp_path / 'layout.yaml'
-    file.write_text(content)
-    with pytest.raises(ObservationError, match=reason) as caught:
-        environment('whole', 1.0, file)
-    assert str(caught.value).startswith(str(file))
-
-
-def test_own_layout(tmp_path):
-    file = tmp_path / 'layout.yaml'
-    file.write_text('inner: [[0, 0]]\nouter: [[90, 0], [90, 90]]\n')
-    np.testing.assert_allclose(
-        environment('whole', 2.0, file).points, [[0, 0, -2], [2, 0, 0], [0, 2, 0]], atol=1e-15
-    )
-
-
 def test_landmark_file_in_any_column_order(tmp_path):
     file = tmp_path / 'landmarks.csv'
     file.write_text('z,colour,landmark,y,x\n3,red,7,2,1\n-3e-1,blue,4,0,0\n')

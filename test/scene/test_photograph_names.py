@@ -67,7 +67,7 @@ def test_frames_without_photographs_keep_their_numbers() -> None:
     assert frame_name(bare, 1, 'left') == 'frame 1 of left'
     assert photograph_entry(bare, 1) == {}
     assert list_frames(bare, [3, 4, 5]) == 'frames 3, 4 and 5'
-    assert list_frames(bare, range(14), most=3) == 'frames 0, 1, 2 and 11 more'
+    assert list_frames(bare, range(14)) == 'frames 0, 1, 2, 3, 4, 5, 6, 7, 8, 9 and 4 more'
 
 
 def test_a_column_of_photographs_is_by_frame_or_by_view() -> None:
