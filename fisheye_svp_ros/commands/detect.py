@@ -176,7 +176,7 @@ def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False)
     )
     parser.add_argument(
         '--sync',
-        type=_seconds,
+        type=seconds,
         metavar='TIME',
         help='for a rig: largest difference between the stamps of simultaneous '
         'images (of messages, or in file names); default: 5ms',
@@ -381,7 +381,8 @@ def _note_alone(detection: Detection) -> None:
         )
 
 
-def _seconds(text: str) -> float:
+def seconds(text: str) -> float:
+    """Return a time, s, of a text such as 5ms."""
     match = _TIME.fullmatch(text)
     try:
         value = float(match[1]) * _UNITS[match[2]] if match else 0.0

@@ -17,6 +17,7 @@ from fisheye_svp_ros.commands.detect import (
     add_observation_arguments,
     note_side_by_side,
     read_input,
+    seconds,
 )
 from fisheye_svp_ros.commands.lenses import add_lens_argument, lenses_of, load_lenses
 from fisheye_svp_ros.commands.notes import (
@@ -70,6 +71,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'tags:36h11:160mm: from `map`, tags.yaml of apriltag_ros, or a field layout of WPILib',
     )
     parser.add_argument(
+        '--readout-time',
+        type=seconds,
+        default=0.0,
+        metavar='TIME',
+        help='time that a rolling shutter takes from the first row to the last, such as 30ms, if '
+        'the lens does not model it; needs times of frames (t)',
+    )
+    parser.add_argument(
         '--model-error',
         action='store_true',
         help='include in the covariances the errors stated in the lens file: of '
@@ -112,10 +121,14 @@ def run(args: argparse.Namespace) -> None:
                 from fisheye_svp_ros.diagnosis import LensErrors, pose_summary
                 from fisheye_svp_ros.study.trust import localize_with_errors
 
-                solved, parts = localize_with_errors(LensErrors.from_lens(lens), table, tags)
+                solved, parts = localize_with_errors(
+                    LensErrors.from_lens(lens), table, tags, readout_time=args.readout_time
+                )
                 uncertainty = pose_summary(parts)
             else:
-                solved = solve_table(table, ForwardModel(lens), tags)
+                solved = solve_table(
+                    table, ForwardModel(lens), tags, readout_time=args.readout_time
+                )
         note_extrapolated(name or 'image points', lens, solved.views.uv[solved.views.used])
         note_mirrored(name or 'image points', lens, table)
         title = ' '.join(filter(None, (args.observations, name)))
@@ -159,7 +172,9 @@ def _localize_rig(
     """Localize every frame of a rig, print the poses of its first camera, write the results."""
     cameras, places = load_cameras(args.rig)
     with progress('localizing'):
-        solved = solve_rig_table(table, lenses, cameras, places, tags)
+        solved = solve_rig_table(
+            table, lenses, cameras, places, tags, readout_time=args.readout_time
+        )
     for camera, (name, lens) in enumerate(lenses.items()):
         mine = table.take(table.camera == camera)
         note_extrapolated(name, lens, mine.uv)

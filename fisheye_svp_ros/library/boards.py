@@ -29,6 +29,7 @@ from fisheye_svp_ros.library.functions import (
     AnyObservations,
     AnyTagMap,
     check_images,
+    check_readout,
     load_lens,
     save_lens,
     table_of,
@@ -188,11 +189,12 @@ def localize_rig(
     rig: RigCalibration | str | Path,
     *,
     tag_map: AnyTagMap | None = None,
+    readout_time: float = 0.0,
 ) -> SolvedPoses:
     """Pose every frame from all cameras of a rig at once: its first camera in the world.
 
-    rig: from `calibrate_rig`, or a file or folder that `calibrate` has written; tag_map: as of
-    `localize`.
+    rig: from `calibrate_rig`, or a file or folder that `calibrate` has written; tag_map,
+    readout_time: as of `localize`.
     Raises ObservationError for a camera without a lens, or that the rig does not have, and
     GeometryError where no frame can be posed.
     """
@@ -200,7 +202,14 @@ def localize_rig(
     names, places = (
         (rig.cameras, rig.rig) if isinstance(rig, RigCalibration) else load_cameras(rig)
     )
-    return solve_rig_table(table, known, names, places, tag_map_of(tag_map))
+    return solve_rig_table(
+        table,
+        known,
+        names,
+        places,
+        tag_map_of(tag_map),
+        readout_time=check_readout(readout_time),
+    )
 
 
 def _inputs(

@@ -149,6 +149,7 @@ def localize(
     *,
     model_error: bool = False,
     tag_map: AnyTagMap | None = None,
+    readout_time: float = 0.0,
 ) -> Localized:
     """Pose every frame of one camera that can be posed; no start values are needed.
 
@@ -157,18 +158,22 @@ def localize(
     model_error: covariances with what the lens says of its own errors (`uncertainty`).
     tag_map: `tags` of `map`, or its file: where tags hang whose corners (4 id + 0 to 3) are the
     landmarks; its errors are in the covariances, and tags are rejected as wholes.
+    readout_time: of a rolling shutter that the lens does not know, s, from the first row to the
+    last: where frames have times, what it does to a pose in motion is in the covariance.
     Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed,
     LensError for a lens that does not know its errors.
     """
     table, known = table_and_lens(observations, lens)
-    tags = tag_map_of(tag_map)
+    tags, seconds = tag_map_of(tag_map), check_readout(readout_time)
     if model_error:
         from fisheye_svp_ros.diagnosis import LensErrors
         from fisheye_svp_ros.study.trust import localize_with_errors
 
-        solved, _ = localize_with_errors(LensErrors.from_lens(known), table, tags)
+        solved, _ = localize_with_errors(
+            LensErrors.from_lens(known), table, tags, readout_time=seconds
+        )
     else:
-        solved = solve_table(table, ForwardModel(known), tags)
+        solved = solve_table(table, ForwardModel(known), tags, readout_time=seconds)
     return Localized.from_solved(solved, len(table))
 
 
@@ -597,6 +602,14 @@ def tag_map_of(given: AnyTagMap | None) -> TagMap | None:
             f'tag_map is of type {type(given).__name__}; a map of tags or its file is needed'
         )
     return read_tag_map(given)
+
+
+def check_readout(seconds: float) -> float:
+    """Return the time of a readout, s; raise ParameterError for one that cannot be."""
+    value = check_number(seconds, 'readout_time', 'a number of s')
+    if not 0 <= value <= 1:
+        raise ParameterError(f'readout_time is {value!r}; 0 to 1 s are needed')
+    return value
 
 
 def check_images(given: AnyObservations, lenses: Mapping[str, Lens]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,12 +20,10 @@ from fisheye_svp_ros.nodes.detections import TagLimits, detections_reader
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.solver import SolverNode
 from fisheye_svp_ros.nodes.transforms import TransformPublisher
-from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.wording import inputs as wording
-from fisheye_svp_ros.reporting.wording.poses import rolling_shutter_note
 from fisheye_svp_ros.scene.pose_priors import PlanarPrior
 from fisheye_svp_ros.solve.pose_gate import GatedPose
-from fisheye_svp_ros.solve.readout import exceeds, readout_bias, steady_velocity
+from fisheye_svp_ros.solve.readout import Readout
 from fisheye_svp_ros.solve.solved_poses import SolvedPoses
 from fisheye_svp_ros.solve.weak_geometry import is_ambiguous
 from fisheye_svp_ros.study.settings import RobotSettings
@@ -47,8 +44,7 @@ class RobotNode(SolverNode):
         self._pose = self.announce(PoseWithCovarianceStamped, '~/pose')
         self._transforms = TransformPublisher(self, self.settings.publish_tf)
         self._base = BasePose(self, self.settings)
-        self._motion: deque[tuple[float, Pose]] = deque(maxlen=3)  # times, s, and poses
-        self._first_stamp = 0  # ns, from which these times count
+        self._first_stamp = 0  # ns, from which times count
 
     def start(self) -> None:
         """Take the parameters into use; show the map of tags."""
@@ -95,6 +91,11 @@ class RobotNode(SolverNode):
             raise ParameterError('planar without base_frame; name the base that drives on a plane')
         return super().prepare(settings)
 
+    def configure(self, settings: Any) -> None:
+        """Take the time of a readout into use, too."""
+        super().configure(settings)
+        self._readout = Readout(settings.readout_time)
+
     def prior(self, camera: str, stamp: int) -> PlanarPrior | None:
         """Return what is known of the camera (1,) of a base that drives on a plane, if it does."""
         settings = self.settings
@@ -117,8 +118,11 @@ class RobotNode(SolverNode):
         covariance (1, 6, 6): of the pose; world, camera: frame ids.
         """
         pose = solved.pose.take(0)
-        bias, rolling = self._readout_bias(stamp, solved, covariance)
-        covariance = covariance + bias[:, :, None] * bias[:, None, :]
+        rolling = ''
+        if self.settings.lens:  # a scenario simulates none
+            self._first_stamp = self._first_stamp or stamp
+            time = 1e-9 * (stamp - self._first_stamp)
+            covariance, rolling = self._readout.cover(time, solved, covariance)
         self._pose.publish(
             messages.pose_with_covariance_message(pose, covariance[0], stamp, world)
         )
@@ -132,26 +136,6 @@ class RobotNode(SolverNode):
         doubt = self._base.publish(gated, stamp, world, camera)
         self._transforms.publish(pose, stamp, world, camera)
         return '; '.join(filter(None, (solved.reasons[0], rolling, doubt)))
-
-    def _readout_bias(
-        self, stamp: int, solved: SolvedPoses, covariance: Array
-    ) -> tuple[Array, str]:
-        """Return what a rolling shutter may move a pose by, (1, 6), and what is to be told of it.
-
-        Zeros where that is less than the covariance (1, 6, 6) states, and where the lens knows.
-        """
-        seconds, nothing = self.settings.readout_time, np.zeros((1, 6))
-        self._first_stamp = self._first_stamp or stamp
-        self._motion.append((1e-9 * (stamp - self._first_stamp), solved.pose.take(0)))
-        velocity = steady_velocity(*zip(*self._motion, strict=True))
-        models_it = solved.model.without_motion() is not solved.model
-        if not seconds or not self.settings.lens or models_it or velocity is None:
-            return nothing, ''
-        bias = readout_bias(solved, velocity, seconds)
-        if not exceeds(bias[0], covariance[0]):
-            return nothing, ''
-        turn = float(np.linalg.norm(velocity[3:]))
-        return bias, rolling_shutter_note(turn, seconds, float(np.linalg.norm(bias[0, :3])))
 
     def report(self) -> tuple[Mapping[str, object], str]:
         """Return what became of every set, and which poses were kept back."""

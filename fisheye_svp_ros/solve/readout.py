@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -58,3 +59,53 @@ def readout_bias(solved: SolvedPoses, velocity: Array, seconds: float) -> Array:
 def exceeds(bias: Array, covariance: Array) -> bool:
     """Say whether a bias (6,) takes a pose out of its 99.9 % ellipsoid; covariance (6, 6)."""
     return bool(bias @ np.linalg.solve(covariance, bias) > CHI2_999)
+
+
+class Readout:
+    """Covers what a rolling shutter may do to poses that follow each other.
+
+    seconds: from the first row to the last; 0: a global shutter, nothing is covered.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._motion: deque[tuple[float, Pose]] = deque(maxlen=3)  # times, s, and poses
+
+    def cover(self, time: float, solved: SolvedPoses, covariance: Array) -> tuple[Array, str]:
+        """Return the covariance (1, 6, 6) of the next set with its bias, and what is to be said.
+
+        time: of the set, s.  As it is where the bias is less than it states, where the camera does
+        not move on as it did, and where the lens knows.
+        """
+        self._motion.append((time, solved.pose.take(0)))
+        velocity = steady_velocity(*zip(*self._motion, strict=True))
+        models_it = solved.model.without_motion() is not solved.model
+        if not self._seconds or models_it or velocity is None:
+            return covariance, ''
+        bias = readout_bias(solved, velocity, self._seconds)
+        if not exceeds(bias[0], covariance[0]):
+            return covariance, ''
+        turn, off = (float(np.linalg.norm(part)) for part in (velocity[3:], bias[0, :3]))
+        return covariance + bias[:, :, None] * bias[:, None, :], (
+            f'a rolling shutter of {1e3 * self._seconds:.0f} ms moves the pose by {1e3 * off:.2g} '
+            f'mm at {turn:.2g} rad/s, which the covariance now covers; set readout_time (0: '
+            'global shutter)'
+        )
+
+
+def cover_readouts(solved: SolvedPoses, seconds: float) -> SolvedPoses:
+    """Return poses (S,) of one camera or rig, by their times, with what a readout may do to them.
+
+    Sets without a time stay as they are.
+    """
+    time = np.fmax.reduce(solved.views.t, axis=1)  # NaN where none is known
+    readout, number = Readout(seconds), np.arange(len(time))
+    covariance, reasons = solved.covariance.copy(), list(solved.reasons)
+    for i in np.argsort(time, kind='stable'):
+        if np.isfinite(time[i]):
+            one = solved.select(number == i)
+            covariance[[i]], reason = readout.cover(float(time[i]), one, one.covariance)
+            reasons[i] = '; '.join(filter(None, (reasons[i], reason)))
+    added = solved.result.added + covariance - solved.covariance
+    result = solved.result._replace(covariance=covariance, added=added)
+    return solved._replace(result=result, reasons=tuple(reasons))

@@ -31,6 +31,7 @@ from fisheye_svp_ros.solve.measured_poses import (
 )
 from fisheye_svp_ros.solve.outliers import NO_OUTLIERS, Outliers, WrongLandmark, find_outliers
 from fisheye_svp_ros.solve.poses import solve_poses
+from fisheye_svp_ros.solve.readout import cover_readouts
 from fisheye_svp_ros.solve.rig_checks import is_unrelated, rig_differs
 from fisheye_svp_ros.solve.rig_model import RigModel
 from fisheye_svp_ros.solve.rig_state import RigState, group_by_frame
@@ -42,11 +43,16 @@ _SETTLED = 0.01  # relative
 
 
 def solve_table(
-    table: Observations, model: ForwardModel, tag_map: TagMap | None = None
+    table: Observations,
+    model: ForwardModel,
+    tag_map: TagMap | None = None,
+    *,
+    readout_time: float = 0.0,
 ) -> SolvedPoses:
     """Pose every frame of one camera's table that can be posed.
 
-    tag_map: where its landmarks hang, and how well that is known; tags stand or fall as wholes.
+    tag_map: where its landmarks hang, and how well that is known; tags stand or fall as wholes;
+    readout_time: of a rolling shutter that the lens does not know, s, see `solve.readout`.
     Raises ObservationError for rows of several cameras, or none of a tag of the map, GeometryError
     where no frame can be posed.
     """
@@ -56,7 +62,7 @@ def solve_table(
     views, left_out = posable_views(table, model, right)
     solved = _solve(model, views, table, tag_map, tag_map is not None)
     solved = solved._replace(left_out=left_out, landmarks=wrong)
-    return _posed_frames(solved, table.source, index)
+    return _posed_frames(solved, table.source, index, readout_time)
 
 
 def solve_rig_table(
@@ -68,11 +74,13 @@ def solve_rig_table(
     *,
     tags: bool = False,
     prior: PlanarPrior | None = None,
+    readout_time: float = 0.0,
 ) -> SolvedPoses:
     """Pose every frame of a rig from all of its cameras at once: its first camera in the world.
 
     cameras, rig (C,): names, and where each stands in the first one; tags: the boards of the table
-    are tags, which stand or fall as wholes, as those of a map do; prior (F,): of the poses.
+    are tags, which stand or fall as wholes, as those of a map do; prior (F,): of the poses;
+    readout_time: as of `solve_table`.
     Raises ObservationError for a camera that the rig does not have, GeometryError where no frame
     can be posed, or no pose explains what the cameras see together.
     """
@@ -109,7 +117,7 @@ def solve_rig_table(
         solved = solved._replace(contradicted=checks.is_contradicted())
     rejected = rejected._replace(rows=index[rejected.rows])
     solved = solved._replace(left_out=left_out, landmarks=wrong, rejected=rejected)
-    return _posed_frames(solved, table.source, index)
+    return _posed_frames(solved, table.source, index, readout_time)
 
 
 def _known_rows(table: Observations, tag_map: TagMap | None) -> tuple[Observations, Index]:
@@ -169,7 +177,9 @@ def _typical_sigma(cost: Array, freedom: Array) -> float:
     return float(np.sqrt(np.median(cost / freedom)))
 
 
-def _posed_frames(solved: SolvedPoses, source: str, index: Index) -> SolvedPoses:
+def _posed_frames(
+    solved: SolvedPoses, source: str, index: Index, readout_time: float
+) -> SolvedPoses:
     """Return the frames that have a pose, the others being left out; rows are those of a table.
 
     index (N,): which of its rows were solved.
@@ -183,7 +193,7 @@ def _posed_frames(solved: SolvedPoses, source: str, index: Index) -> SolvedPoses
         solved = solved.select(fixed)._replace(left_out=left_out)
     if not len(solved.frame):
         raise GeometryError(f'{source}: no frame has points that determine a pose')
-    return solved
+    return cover_readouts(solved, readout_time) if readout_time else solved
 
 
 def _wrong_landmarks(

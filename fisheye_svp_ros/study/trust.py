@@ -283,14 +283,18 @@ def _admissible(name: str, *found: tuple[float, float]) -> Admissible:
 
 
 def localize_with_errors(
-    errors: LensErrors, observations: Observations, tag_map: TagMap | None = None
+    errors: LensErrors,
+    observations: Observations,
+    tag_map: TagMap | None = None,
+    *,
+    readout_time: float = 0.0,
 ) -> tuple[SolvedPoses, ErrorParts]:
     """Pose every frame of one camera's table that can be posed, and say how far off each may be.
 
     Raises ObservationError and GeometryError as `solve_table` does.
     """
     allowed = replace(observations, sigma=np.asarray(errors.inflate_sigma(observations.sigma)))
-    solved = solve_table(allowed, ForwardModel(errors.lens), tag_map)
+    solved = solve_table(allowed, ForwardModel(errors.lens), tag_map, readout_time=readout_time)
     kept = solved.views._replace(weight=np.where(solved.outliers, 0.0, solved.views.weight))
     parts = errors.of_solved_poses(kept, solved.result, solved.sigma)
     return solved._replace(result=solved.result._replace(covariance=parts.total)), parts

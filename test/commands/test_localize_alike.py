@@ -48,6 +48,8 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.parametrize('kind', ['board', 'tags', 'model error', 'rig', 'rig with tags'])
 def test_command_and_library_say_the_same(kind: str, folder: Path) -> None:
     table = board_seen() if kind in ('board', 'model error') else ROOM.table(1 + ('rig' in kind))
+    seconds = 0.03 if 'tags' in kind else 0.0
+    table = replace(table, t=0.1 * table.frame)
     write_observations(folder / 'seen.csv', table)
     lens, tags, options = str(folder / 'lens.yaml'), None, []
     if kind == 'model error':
@@ -56,7 +58,7 @@ def test_command_and_library_say_the_same(kind: str, folder: Path) -> None:
         options += ['--model-error']
     if 'tags' in kind:
         tags = str(folder / 'tags.yaml')
-        options += ['--tag-map', tags]
+        options += ['--tag-map', tags, '--readout-time', '30ms']
     if 'rig' in kind:
         options += ['--rig', str(folder / 'rig.yaml')]
     command = ['localize', str(folder / 'seen.csv'), '--lens', lens, '-o', str(folder / 'out')]
@@ -64,12 +66,20 @@ def test_command_and_library_say_the_same(kind: str, folder: Path) -> None:
     if 'rig' in kind:
         names = load_cameras(folder / 'rig.yaml')[0]
         found = fsvp.localize_rig(
-            folder / 'seen.csv', dict.fromkeys(names, lens), folder / 'rig.yaml', tag_map=tags
+            folder / 'seen.csv',
+            dict.fromkeys(names, lens),
+            folder / 'rig.yaml',
+            tag_map=tags,
+            readout_time=seconds,
         )
         sigma = found.sigma
     else:
         found = fsvp.localize(
-            folder / 'seen.csv', lens, model_error=kind == 'model error', tag_map=tags
+            folder / 'seen.csv',
+            lens,
+            model_error=kind == 'model error',
+            tag_map=tags,
+            readout_time=seconds,
         )
         sigma = found.sigma_px
     poses = read_poses(folder / 'out' / 'poses.csv')

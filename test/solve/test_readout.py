@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.tag_room import LENS, TagRoom, oval
 
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.solve.poses import solve_poses
 from fisheye_svp_ros.solve.readout import exceeds, readout_bias, steady_velocity
+from fisheye_svp_ros.solve.table_poses import solve_table
 from fisheye_svp_ros.solve.weak_geometry import CHI2_999
 
 MODEL, ROOM = ForwardModel(LENS), TagRoom(16)
@@ -53,3 +57,29 @@ def test_a_velocity_is_that_of_a_steady_motion() -> None:
     assert steady_velocity(times[:2], poses[:2]) is None
     assert steady_velocity([1.0, 1.1, 1.9], poses) is None, 'long ago'
     assert steady_velocity(times, [poses[0], poses[2], poses[1]]) is None, 'noise'
+
+
+def test_poses_of_a_table_cover_the_readout_by_their_times() -> None:
+    """Frames that follow each other while the camera turns; without times there is no motion."""
+    velocity, found = np.array([0.3, 0.1, 0.0, 0.0, 0.0, 1.0]), []
+    for i in range(5):
+        camera = oval(0.1).retract(0.1 * i * velocity)
+        uv = rolled(camera, velocity, READOUT)
+        found.append(ROOM.views(camera, uv, ROOM.visible(camera), 1e-9, np.random.default_rng(i)))
+    frame = np.repeat(np.arange(5), [one.uv.shape[1] for one in found])
+    landmark, uv, xyz = (
+        np.concatenate([getattr(one, name)[0] for one in found])
+        for name in ('landmark', 'uv', 'points')
+    )
+    sigma = np.full(len(frame), 0.2)
+    table = make_observations(frame, landmark, uv, xyz, t=0.1 * frame, sigma=sigma)
+    plain, covered = (solve_table(table, MODEL, readout_time=s) for s in (0.0, READOUT))
+    told = ['a rolling shutter of 30 ms' in reason for reason in covered.reasons]
+    assert told == [False, False, True, True, True]
+    cameras = Pose.stack([oval(0.1).retract(0.1 * i * velocity) for i in range(5)])
+    off = plain.pose.difference(cameras)
+    for i, (before, after) in enumerate(zip(plain.covariance, covered.covariance, strict=True)):
+        assert off[i] @ np.linalg.solve(before, off[i]) > CHI2_999
+        assert (off[i] @ np.linalg.solve(after, off[i]) < CHI2_999) == told[i]
+    still = solve_table(replace(table, t=np.full(len(frame), np.nan)), MODEL, readout_time=READOUT)
+    np.testing.assert_array_equal(still.covariance, plain.covariance)

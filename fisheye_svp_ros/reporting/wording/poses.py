@@ -23,14 +23,6 @@ def second_pose_note(frames: str, count: int) -> str:
     )
 
 
-def rolling_shutter_note(turn: float, seconds: float, off: float) -> str:
-    """Say what a rolling shutter may do to a pose; turn: rad/s; off: m."""
-    return (
-        f'a rolling shutter of {1e3 * seconds:.0f} ms moves the pose by {1e3 * off:.2g} mm at '
-        f'{turn:.2g} rad/s, which the covariance now covers; set readout_time (0: global shutter)'
-    )
-
-
 def rig_reason(outliers: int, contradicted: bool) -> str:
     """Say why the pose of a rig should not be relied on; '' for a reliable one."""
     points = f'{outliers} outliers rejected' if outliers else ''
