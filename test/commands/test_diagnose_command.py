@@ -552,7 +552,7 @@ class TestWords:
         refuted = verdict_sentences(
             with_changes(found, causes=[cause], advice=[], lenses={'': shutter}, named=worse)
         )
-        assert 'do not correct' in refuted[1]
+        assert 'Do not correct' in refuted[1]
 
     def test_a_frame_that_several_cameras_saw_is_named_once(self):
         assert advice_text(Advice(Action.RETAKE, frames=[4, 1, 4])).endswith('(frames 4 and 1)')
@@ -565,8 +565,8 @@ class TestWords:
                 'depth_error_m': Comparison(0.0021, 0.002, 0.05, -0.1, 0.2),
             },
         )
-        assert 'the position error goes from 2 mm to 1 mm' in gained
-        assert 'the stereo error stays at 2 mm' in gained
+        assert 'The position error goes from 2 mm to 1 mm' in gained
+        assert 'The stereo error stays at 2 mm' in gained
 
     def test_many_causes_are_counted(self, found):
         wrong, *_ = verdict_sentences(with_changes(found, causes=5 * found.causes))

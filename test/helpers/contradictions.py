@@ -24,7 +24,7 @@ LENS = {
         'Use the lenses only where that is good enough',
         'Do not rely on the lens',
         'Do not use a lens that was calibrated from these data',
-        'cannot be judged before lengths are in m',
+        'cannot be judged until lengths are in m',
     ],
 }
 # Status: least and largest probability.

@@ -109,7 +109,9 @@ def test_the_terminal_names_photographs_after_what_to_do(found: Diagnosis) -> No
 
 def test_a_size_within_its_error_is_called_so(found: Diagnosis) -> None:
     """A cause may be certain by all its parameters together and each may be within its error."""
-    assert size(found, _tilt(-0.0005, 0.002)) == 'size within its error: x = -0.03 ± 0.11 deg'
+    assert (
+        size(found, _tilt(-0.0005, 0.002)) == 'its size is within its error: x = -0.03 ± 0.11 deg'
+    )
     assert size(found, _tilt(0.005, 0.002)) == 'x = 0.29 ± 0.11 deg'
 
 
@@ -122,15 +124,15 @@ def test_a_confounded_set_without_a_size_says_what_is_open(found: Diagnosis) -> 
     )
     alike = replace(found, causes=[tilt])
     table = (
-        'sensor_tilt (89 %) or dome_port (11 %) (likely, more than 99 %: one of them is there, '
-        'how large each is remains open: x = -0.03 ± 0.11 deg)'
+        'sensor_tilt (89 %) or dome_port (11 %) (likely, more than 99 %: one of them is present, '
+        'the size of each is unknown: x = -0.03 ± 0.11 deg)'
     )
     assert first_screen(alike, 'table').causes == table
     assert largest_cause(alike) == (
         'The sensor is tilted, 89 % sure, or the lens looks through a dome, away from its center '
-        '(11 %): one of them is there (likely, more than 99 %), how large each is remains open'
+        '(11 %): one of them is present (likely, more than 99 %), the size of each is unknown'
     )
-    assert wrong(alike).startswith('The sensor is tilted; alternatives below; left-out error ')
+    assert wrong(alike).startswith('The sensor is tilted; alternatives below; ')
 
 
 def test_an_impossible_shift_asks_for_the_unit_first(found: Diagnosis) -> None:
@@ -142,8 +144,8 @@ def test_an_impossible_shift_asks_for_the_unit_first(found: Diagnosis) -> None:
     adequacy = judge_data(found.evaluation, [], found.components, {}, [shift])
     assert adequacy.flaws[0] == Flaw(FlawKind.SHIFT_TOO_LARGE, 0.049, MAX_SHIFT)
     assert _flawed(found, adequacy)[0] == (
-        'The viewpoint would shift by 49 mm, more than in any real lens: x, y, z are probably not '
-        'in m. The lens cannot be judged before lengths are in m.'
+        'The viewpoint would shift by 49 mm, more than in any real lens; x, y, z are probably not '
+        'in m. The lens cannot be judged until lengths are in m.'
     )
 
 
@@ -169,12 +171,12 @@ def test_data_that_no_lens_fits_have_a_next_step(found: Diagnosis) -> None:
     mixed = Flaw(FlawKind.CAMERAS_MIXED, 4.5, 0.05, groups)
     said = _flawed(found, Adequacy((mixed,), 1.0))
     assert said[0] == (
-        'Two groups of frames are of two cameras. '
+        'Two groups of frames come from two cameras. '
         'Do not use a lens that was calibrated from these data.'
     )
     assert (
-        'Flaw: Two groups of frames are of two cameras, one lens leaves 4.5 px (noise 0.071 px): '
-        'frames 0, 2, … 14; frames 1, 3, … 15.'
+        'Flaw: Two groups of frames come from two cameras, and one lens for all leaves 4.5 px '
+        '(noise alone 0.071 px): frames 0, 2, … 14; frames 1, 3, … 15.'
     ) in said
     size = f'{found.lens.width}x{found.lens.height}'
     assert (
@@ -207,19 +209,21 @@ def test_accuracy_is_that_of_the_lens_to_be_used(found: Diagnosis, say: str, len
     """A reader did not know what error to reckon with."""
     said = first_screen(_deciding(found, 'lens', say=say), 'table').accuracy
     error = found.ray_error_mrad()[lens][1]
-    assert f'off by about {error["value"]:.2g} mrad at 1 m (95 %: {error["low"]:.2g} to ' in said
+    assert f'off by about {error["value"]:.2g} mrad at 1 m' in said
+    assert f'The 95 % interval is {error["low"]:.2g} to {error["high"]:.2g} mrad' in said
     assert f'Within {np.degrees(found.adequacy.reached):.0f} deg' in said
-    assert ('of the lens as given by' in said) == (say == 'use_extended')
+    assert ('and rays of the lens as given by' in said) == (say == 'use_extended')
 
 
 def test_an_undecided_lens_may_be_used_where_its_error_does_no_harm(found: Diagnosis) -> None:
     undecided = _deciding(found, 'lens', say='undecided')
     said = first_screen(undecided, 'table').accuracy
     assert 'rays of the lens as given' in said
-    assert '; meanwhile use it only where that is good enough' in said
+    assert '. Until then, use the lens only where that is good enough' in said
     high = found.ray_error_mrad()['given'][1]['high']
-    assert f'; until then it is good to {high:.2g} mrad at 1 m (95 % sure), out to ' in headline(
-        undecided
+    assert (
+        f'. Until then, rays are accurate to {high:.2g} mrad at 1 m (95 % sure), out to '
+        in headline(undecided)
     )
 
 
@@ -238,11 +242,11 @@ def test_what_a_lens_claims_beyond_its_points_is_extrapolated(found: Diagnosis) 
         first_screen(replace(found, adequacy=Adequacy((), reached)), 'table').accuracy
         for reached in (claimed / 2, claimed)
     )
-    assert f'; beyond, to {np.degrees(claimed):.0f} deg, it is extrapolated' in short
+    assert f' to {np.degrees(claimed):.0f} deg, the lens is extrapolated' in short
     assert 'extrapolated' not in whole
 
 
-@pytest.mark.parametrize(('bound', 'words'), [(1.2, 'known only to '), (0.9, 'good to ')])
+@pytest.mark.parametrize(('bound', 'words'), [(1.2, 'known only to '), (0.9, 'accurate to ')])
 def test_rays_that_may_be_off_by_over_a_millimeter_at_1_m_are_not_called_good(
     found: Diagnosis, monkeypatch: pytest.MonkeyPatch, bound: float, words: str
 ) -> None:
@@ -251,7 +255,7 @@ def test_rays_that_may_be_off_by_over_a_millimeter_at_1_m_are_not_called_good(
     given = [{**error, 'high': bound} for error in rays['given']]
     monkeypatch.setattr(Diagnosis, 'ray_error_mrad', lambda _: {**rays, 'given': given})
     kept = _deciding(found, 'lens', say='keep')
-    assert f'Keep the lens: {words}{bound:.2g} mrad at 1 m' in headline(kept)
+    assert f'Keep the lens. Rays are {words}{bound:.2g} mrad at 1 m' in headline(kept)
     varied = replace(kept, adequacy=replace(kept.adequacy, frames_error=2e-3))
     assert f'known only to {np.hypot(bound, 2):.2g} mrad' in headline(varied)
 
@@ -306,7 +310,9 @@ def test_what_is_wrong_counts_the_causes_that_it_does_not_name(
 ) -> None:
     tilt = _tilt(0.005, 0.002)
     more = [replace(tilt, form=name) for name in ('decentering', 'skew')]
-    assert '; also decentering and 1 more below; ' in wrong(replace(found, causes=[tilt, *more]))
+    assert '; also decentering and 1 more, see below; ' in wrong(
+        replace(found, causes=[tilt, *more])
+    )
 
 
 def test_the_headline_says_that_the_target_is_imperfect_too(found: Diagnosis) -> None:
@@ -318,7 +324,7 @@ def test_the_headline_says_that_the_target_is_imperfect_too(found: Diagnosis) ->
     )
     assert wrong(again).startswith(
         'The sensor is tilted (x = 0.29 ± 0.11 deg), and landmarks are displaced '
-        '(0.38 px); left-out error '
+        '(0.38 px); the held-out error '
     )
     assert 'landmarks' not in wrong(_deciding(again, 'target', say='keep'))
 
@@ -427,7 +433,7 @@ def test_a_likely_shift_is_not_told_as_no_model_error(found: Diagnosis) -> None:
     """The headline was "No model error shows in these data. Use extended_lens.yaml."."""
     likely = replace(_deciding(found, 'lens', say='use_extended'), causes=[], remaining=[])
     assert likely.verdict == 'adequate'
-    assert headline(likely).startswith('Use extended_lens.yaml: good to ')
+    assert headline(likely).startswith('Use extended_lens.yaml. Rays are accurate to ')
     assert wrong(likely) == 'No model error is confirmed in these data'
     assert verdict_words(likely) == 'Adequate: no model error is confirmed in these data'
     nothing, gained, _ = verdict_sentences(likely)
@@ -440,8 +446,8 @@ def test_a_lens_that_is_off_is_all_that_is_wrong(found: Diagnosis) -> None:
     off = replace(_deciding(found, 'lens', say='recalibrate'), causes=[], remaining=[])
     wrong, gained, _ = verdict_sentences(off)
     assert off.verdict == 'explained'
-    assert wrong.startswith('Nothing but the intrinsics as given is wrong in these data')
-    assert 'no extension improved' not in gained
+    assert wrong.startswith('Nothing except the intrinsics as given is wrong in these data')
+    assert 'no extension improves' not in gained
     assert verdict_words(off) == 'Explained: the lens as given is off'
     more = replace(off, remaining=[Structure('theta', 1e-9, 0.1)])
     assert 'intrinsics as given are wrong. Fitted' in verdict_sentences(more)[0]
@@ -460,7 +466,7 @@ def test_an_imperfect_target_is_told_in_every_sentence(found: Diagnosis) -> None
     )
     assert again.verdict == 'adequate'
     wrong, *_ = verdict_sentences(again)
-    assert wrong.startswith('Nothing but the target is wrong in these data')
+    assert wrong.startswith('Nothing except the target is wrong in these data')
     assert wrong.endswith(' and displaced landmarks.')
 
 
@@ -592,7 +598,7 @@ def test_one_frame_does_not_blame_the_target(found: Diagnosis) -> None:
         verdict='adequate',
         decision=_deciding(found, 'target', figure=figure).decision,
     )
-    assert largest_cause(one) == ('Errors show in one frame, which does not tell their cause')
+    assert largest_cause(one) == 'There are errors, but one frame cannot show their cause'
 
 
 def test_evidence_tells_what_was_not_confirmed_in_the_end(

@@ -91,8 +91,8 @@ def test_every_reason_is_a_short_clause(
         (
             LensReason.PREDICTS_BETTER,
             LENS,
-            'it predicts held-out frames to 0.081 px, the lens as given to 0.123 px, each '
-            'landmark where the other frames see it',
+            'it predicts held-out frames to 0.081 px, compared with 0.123 px for the lens as '
+            'given. Landmarks are placed where the other frames see them',
         ),
         (
             LensReason.EFFECT_POSSIBLE,
@@ -115,14 +115,14 @@ def test_every_reason_is_a_short_clause(
         (
             LensReason.NO_CAUSE_CONFIRMED,
             LENS._replace(offset=LensOffset(0.3, 0.8, 0.6, 0.1)),
-            'no error of the lens is confirmed and its parameters agree with these data within '
+            'no error of the lens is confirmed, and its parameters agree with these data within '
             'their errors',
         ),
         (
             TargetReason.OFFSETS_HARMLESS,
             TARGET,
-            'landmarks are displaced by 0.04 mm rms, which causes 0.05 px and only 0.4 mrad in '
-            'poses on it',
+            'landmarks are displaced by 0.04 mm rms, which causes 0.05 px and only 0.4 mrad of '
+            'pose error',
         ),
         (
             TargetReason.CORRECTION_GAINS,
@@ -137,7 +137,7 @@ def test_every_reason_is_a_short_clause(
         (
             PhotographsReason.FRAMES_NOT_PREDICTED,
             PHOTOGRAPHS,
-            '1 of 26 is not predicted by the others',
+            'the others do not predict 1 of 26',
         ),
         (
             PhotographsReason.TOO_FEW_FRAMES,
@@ -147,8 +147,13 @@ def test_every_reason_is_a_short_clause(
         (
             PhotographsReason.FRAMES_PREDICTED,
             PHOTOGRAPHS,
-            '26 frames; the error on left-out ones is 10.0 times that of noise and scatter (1 is '
-            'ideal); the target causes the rest',
+            '26 frames; the error on held-out ones is 10.0 times what noise and scatter would '
+            'leave; the rest comes from the target',
+        ),
+        (
+            PhotographsReason.FRAMES_PREDICTED,
+            PHOTOGRAPHS._replace(heldout_px=0.09),
+            '26 frames; the error on held-out ones is what noise and scatter would leave',
         ),
     ],
 )

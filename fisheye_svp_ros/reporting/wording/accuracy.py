@@ -14,8 +14,8 @@ from fisheye_svp_ros.solve.ray_errors import MAX_RAY_ERROR
 _EXTRAPOLATED_RATIO = 1.1  # of the angle that a lens claims to that of the points
 _REMAINING_PARTS = {
     'lens': '{} of that stays in the image ({})',
-    'frame': '{} of that changes with the view ({}), not with the lens: `localize --model-error` '
-    'counts it in poses',
+    'frame': '{} of that changes with the view ({}), not with the lens. `localize --model-error` '
+    'includes it in the errors of poses',
 }
 _NEARLY_ALL, _MOST = 0.8, 0.5  # of the squares
 
@@ -43,13 +43,13 @@ class UsedRays(NamedTuple):
     def bound(self) -> str:
         """How good the lens is at a range."""
         most = hypot(self.used['high'], self.frames_mrad)
-        how = 'known only' if most > 1e3 * MAX_RAY_ERROR else 'good'
+        how = 'known only' if most > 1e3 * MAX_RAY_ERROR else 'accurate'
         return f'{how} to {most:.2g} mrad at {self.range_m:g} m'
 
     @property
     def quality(self) -> str:
         """How good the lens is, how sure that is, and where."""
-        return f'{self.bound} (95 % sure), out to {degrees(self.reached):.0f} deg off the axis'
+        return f'{self.bound} (95 % sure), out to {degrees(self.reached):.0f} deg from the axis'
 
 
 def used_rays(d: Diagnosis) -> UsedRays | None:
@@ -78,23 +78,27 @@ def accuracy(d: Diagnosis) -> str:
     which, other = 'the lens as given', ''
     if d.offers_extended:
         which = 'the extended lenses' if several else LENS_FILE
-        other = f'; of the lens as given by {rays.given["value"]:.2g} mrad'
+        other = f', and rays of the lens as given by {rays.given["value"]:.2g} mrad'
     words = (
         f'Within {degrees(rays.reached):.0f} deg, rays of {which}'
         f'{" (the worst camera)" if several else ""} are off by about {used["value"]:.2g} mrad '
-        f'at {rays.range_m:g} m (95 %: {used["low"]:.2g} to {used["high"]:.2g}), {rays.ratio:.1f} '
-        f'times the noise of a point{other}{_whichever(d)}'
+        f'at {rays.range_m:g} m{other}. The 95 % interval is {used["low"]:.2g} to '
+        f'{used["high"]:.2g} mrad; one point has a noise of {rays.point_mrad:.2g} '
+        f'mrad{_whichever(d)}'
     )
     if d.adequacy.frames_error:
         words += (
-            f'; those of a single frame by {1e3 * d.adequacy.frames_error:.2g} mrad more, since '
-            'the camera changes from frame to frame'
+            f'. In a single frame, they are off by {1e3 * d.adequacy.frames_error:.2g} mrad '
+            'more, because the camera changes from frame to frame'
         )
     if d.decision['lens'].say == 'undecided' and not d.adequacy.flaws:
-        words += '; meanwhile use it only where that is good enough'
+        words += '. Until then, use the lens only where that is good enough'
     claimed = min(lens.max_incidence for lens in d.lenses.values())
     if claimed > _EXTRAPOLATED_RATIO * rays.reached and not d.adequacy.flaws:
-        words += f'; beyond, to {degrees(claimed):.0f} deg, it is extrapolated'
+        words += (
+            f'. From {degrees(rays.reached):.0f} to {degrees(claimed):.0f} deg, the lens is '
+            'extrapolated'
+        )
     return '. '.join(filter(None, [words, _remains(d)]))
 
 
@@ -105,7 +109,7 @@ def _whichever(d: Diagnosis) -> str:
         for cause in d.causes
         if cause.stage == 'lens' and cause.indistinguishable_from
     ]
-    return f'; this holds whichever of {"; of ".join(sets)} is there' if sets else ''
+    return f'. This holds whichever of {"; of ".join(sets)} is present' if sets else ''
 
 
 def _remains(d: Diagnosis) -> str:
@@ -132,7 +136,8 @@ def _remains(d: Diagnosis) -> str:
     if share > _MOST:
         how_much = 'nearly all' if share > _NEARLY_ALL else f'most ({how_much})'
     largest = max((name for name in squares if squares[name][0] == stage), key=squares.__getitem__)
-    return f'{words}; {_REMAINING_PARTS[stage].format(how_much, COMPONENTS[largest])}'
+    text = _REMAINING_PARTS[stage].format(how_much, COMPONENTS[largest])
+    return f'{words}. {text[0].upper()}{text[1:]}'
 
 
 def single_points(d: Diagnosis, remaining: RemainingError) -> str:

@@ -19,30 +19,31 @@ _REMEDIES = {
     FlawKind.MIRRORED: f'{MIRROR_REMEDY}, and diagnose again',
     FlawKind.TARGET_TOO_LARGE: _UNIT_REMEDY,
     FlawKind.SHIFT_TOO_LARGE: _UNIT_REMEDY,
-    FlawKind.CAMERAS_MIXED: 'calibrate each group of frames by itself, a table for each',
-    FlawKind.FOCAL_VARIES: 'switch off zoom, autofocus and stabilization, and take all again; '
-    'if two cameras are mixed, calibrate each by itself',
-    FlawKind.CENTER_VARIES: 'switch off stabilization and cropping, and take all again',
-    FlawKind.FRAMES_DIFFER: 'check that all frames are of one camera, one size and one board',
-    FlawKind.NO_FIT: 'check order and units of the points, image size and model',
+    FlawKind.CAMERAS_MIXED: 'calibrate each group of frames separately, from a table of its own',
+    FlawKind.FOCAL_VARIES: 'switch off zoom, autofocus, and stabilization, and retake all '
+    'photographs; if two cameras are mixed, calibrate each one separately',
+    FlawKind.CENTER_VARIES: 'switch off stabilization and cropping, and retake all photographs',
+    FlawKind.FRAMES_DIFFER: 'check that all frames show one board through one camera at one '
+    'image size',
+    FlawKind.NO_FIT: 'check the order and the units of the points, the image size, and the model',
     FlawKind.FEW_FRAMES: f'take {MIN_FRAMES} or more, tilted, and out to the edges of the image',
-    FlawKind.SIDES_DIFFER: 'number the corners alike in all frames, none of them mirrored',
-    FlawKind.NOISE_TOO_LARGE: 'check sharpness, detector and the order of the corners',
+    FlawKind.SIDES_DIFFER: 'number the corners in the same order in all frames, without mirroring',
+    FlawKind.NOISE_TOO_LARGE: 'check the sharpness, the detector, and the order of the corners',
     FlawKind.LENS_UNKNOWN: 'take more near and tilted views, out to the edges of the image',
     FlawKind.ANGLE_SHORT: 'take photographs with the board near the edges of the image',
-    FlawKind.OFF_CENTER: 'check the image size, and that images are not cropped',
+    FlawKind.OFF_CENTER: 'check the image size, and whether images are cropped',
 }
 _OF_LENS_MISFIT = {
     False: 'a lens from other photographs is neither confirmed nor refuted',
     True: 'until then, trust no lens, pose or size from these data',
 }
 _OF_LENS = {
-    FlawKind.FEW_FRAMES: 'so few frames do not tell its errors from those of the board',
+    FlawKind.FEW_FRAMES: 'so few frames cannot separate its errors from those of the board',
     FlawKind.SIDES_DIFFER: 'its rays may be right, but the poses of some frames are mirrored',
-    FlawKind.NOISE_TOO_LARGE: 'such points may be wrong in ways that no noise is',
+    FlawKind.NOISE_TOO_LARGE: 'points with so much noise may have systematic errors, too',
     FlawKind.LENS_UNKNOWN: 'more photographs would make it better',
     FlawKind.ANGLE_SHORT: 'beyond its points, its curve is extrapolated',
-    FlawKind.OFF_CENTER: 'no sound image has its center there',
+    FlawKind.OFF_CENTER: 'no valid image has its center there',
 }
 
 
@@ -50,8 +51,8 @@ def flaw_statement(flaw: Flaw) -> str:
     """Return what is wrong as a clause, with the frames that it is about."""
     groups = [frame_list(*pair) for pair in zip(flaw.groups, _names(flaw), strict=True)]
     frames = {
-        FlawKind.CAMERAS_MIXED: f', one lens leaves {flaw.size:.2g} px ({_noise(flaw)}): '
-        f'{"; ".join(groups)}',
+        FlawKind.CAMERAS_MIXED: f', and one lens for all leaves {flaw.size:.2g} px '
+        f'({_noise(flaw)}): {"; ".join(groups)}',
         FlawKind.FOCAL_VARIES: f': {" against ".join(groups)}',
         FlawKind.SIDES_DIFFER: f', so their corners are in mirrored order: {"".join(groups)}',
     }
@@ -71,13 +72,14 @@ def flaw_summary(flaw: Flaw) -> str:
         FlawKind.TARGET_TOO_LARGE: f'the target is {flaw.size:.0f} m across: x, y, z must be in '
         'm, not in mm',
         FlawKind.SHIFT_TOO_LARGE: f'the viewpoint would shift by {1e3 * flaw.size:.0f} mm, more '
-        'than in any real lens: x, y, z are probably not in m',
-        FlawKind.CAMERAS_MIXED: f'{count} groups of frames are of {count} cameras',
+        'than in any real lens; x, y, z are probably not in m',
+        FlawKind.CAMERAS_MIXED: f'{count} groups of frames come from {count} cameras',
         FlawKind.FOCAL_VARIES: f'the focal length{of} differs from frame to frame by '
         f'{100 * flaw.size:.2g} %',
         FlawKind.CENTER_VARIES: f'the image{of} is shifted by {px} rms from frame to frame',
-        FlawKind.FRAMES_DIFFER: f'frames contradict each other: {px} are left ({_noise(flaw)})',
-        FlawKind.NO_FIT: f'no camera fits: {px} are left ({_noise(flaw)})',
+        FlawKind.FRAMES_DIFFER: f'frames contradict each other: residuals are {px} '
+        f'({_noise(flaw)})',
+        FlawKind.NO_FIT: f'no camera model fits: residuals are {px} ({_noise(flaw)})',
         FlawKind.FEW_FRAMES: (f'{flaw.size:.0f} frames are' if flaw.size > 1 else 'one frame is')
         + ' too few to judge the lens',
         FlawKind.SIDES_DIFFER: f'{flaw.size:.0f} of {flaw.beside:.0f} frames see the board from '
@@ -85,9 +87,9 @@ def flaw_summary(flaw: Flaw) -> str:
         FlawKind.NOISE_TOO_LARGE: f'the noise of the image points is {flaw.size:.1f} px, far more '
         'than a detector leaves (0.02 to 0.3 px)',
         FlawKind.LENS_UNKNOWN: f'these views leave rays{of} uncertain by up to {mrad} at 1 m',
-        FlawKind.ANGLE_SHORT: f'points{of} reach {angle:.0f} of the {degrees(flaw.beside):.0f} '
-        'deg claimed',
-        FlawKind.OFF_CENTER: f'the principal point{of} lies {flaw.size:.0f}, {flaw.beside:.0f} px '
+        FlawKind.ANGLE_SHORT: f'image points{of} reach only {angle:.0f} of the '
+        f'{degrees(flaw.beside):.0f} deg that the lens claims',
+        FlawKind.OFF_CENTER: f'the principal point{of} is {flaw.size:.0f}, {flaw.beside:.0f} px '
         'off the center of the image',
     }
     return texts[flaw.kind]
@@ -112,12 +114,12 @@ def flaw_reason(flaws: Sequence[Flaw], about: str) -> str:
         return '; '.join([first, *map(flaw_statement, flaws[1:])])
     if about == 'target':
         if worst.is_unit:
-            return 'not judged before lengths are in m'
+            return 'it cannot be judged until lengths are in m'
         if worst.is_misfit:
-            return 'nothing is known of it while one lens does not fit the frames'
+            return 'it cannot be judged while no single lens fits the frames'
         if worst.is_of_table:
-            return 'not judged before that is corrected'
-        return 'such views do not tell its errors from those of the lens'
+            return 'it cannot be judged until that is corrected'
+        return 'these views cannot separate its errors from those of the lens'
     return '; '.join(dict.fromkeys(flaw_remedy(flaw) for flaw in flaws))
 
 
@@ -164,7 +166,7 @@ def _first_frames(flaw: Flaw) -> str:
 
 def _noise(flaw: Flaw) -> str:
     """Return what noise alone would leave, as the rms of both coordinates."""
-    return f'noise {2**0.5 * flaw.beside:.2g} px'
+    return f'noise alone {2**0.5 * flaw.beside:.2g} px'
 
 
 def _names(flaw: Flaw) -> tuple[tuple[str, ...], ...]:

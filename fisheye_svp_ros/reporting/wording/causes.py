@@ -19,13 +19,13 @@ _CERTAIN = 0.99  # more cannot be said of models and bootstraps
 
 _REASONS = {
     Reason.PREDICTS_BETTER: 'significant and predicts better',
-    Reason.BEYOND_BULK: 'further off than the bulk of landmarks',
+    Reason.BEYOND_BULK: 'farther off than most landmarks',
     Reason.NO_CONVINCING_GAIN: 'does not predict better',
     Reason.EXPLAINED_BY_OTHER_CAUSES: 'removed: the other causes explain it',
-    Reason.NO_LASTING_GAIN: 'removed: it does not predict better any more',
+    Reason.NO_LASTING_GAIN: 'removed: it no longer predicts better',
     Reason.REFUTED_BY_FRAMES: 'held-out frames refute it',
     Reason.REFUTED_BY_FILE: 'the held-out file refutes it',
-    Reason.NO_GAIN: 'does not improve the prediction of left-out frames',
+    Reason.NO_GAIN: 'does not improve the prediction of held-out frames',
     Reason.NO_OTHER_FRAME: 'there is no other frame to confirm it',
     Reason.NEEDLESS_BESIDE_RIVAL: 'not significant if {effect} replaces {replaced}',
     Reason.NO_GAIN_BESIDE_RIVAL: 'no significant gain on held-out frames if {effect} replaces '
@@ -52,28 +52,28 @@ COMPONENTS = {
     'named_lens': 'lens, identified',
     'named_target': 'target, identified',
     'named_frame': 'frames, identified',
-    'image_broad': 'image field, correlated over 1/3 of the width',
-    'image_coarse': 'image field, correlated over 1/6 of the width',
-    'image_fine': 'image field, correlated over 1/14 of the width',
-    'image_finest': 'finer image field',
-    'landmark_in_plane': 'landmarks along their board',
-    'landmark_normal': 'landmarks off their board',
+    'image_broad': 'smooth image error, correlation length 1/3 of the width',
+    'image_coarse': 'smooth image error, correlation length 1/6 of the width',
+    'image_fine': 'smooth image error, correlation length 1/14 of the width',
+    'image_finest': 'finer image error',
+    'landmark_in_plane': 'landmarks, in the plane of their board',
+    'landmark_normal': 'landmarks, out of the plane of their board',
     'landmark': 'landmarks',
     'board_stretch': 'stretch of the board',
-    'board_in_plane': 'board field along it',
-    'board_normal': 'board field off it',
+    'board_in_plane': 'smooth error of the board, in its plane',
+    'board_normal': 'smooth error of the board, out of its plane',
     'frame_focal': 'focal length of each frame',
     'frame_centre': 'principal point of each frame',
-    'frame_linear': 'linear field of each frame',
-    'frame_quadratic': 'quadratic field of each frame',
-    'frame_bumps': 'image field of each frame',
+    'frame_linear': 'linear image error of each frame',
+    'frame_quadratic': 'quadratic image error of each frame',
+    'frame_bumps': 'smooth image error of each frame',
     'frame_bend': 'bend of the board in each frame',
     'frame_sag': 'bend of the board that follows its tilt',
     'frame_similar': 'landmarks in similar views',
     'noise': 'noise of image points',
 }
 # Of a confounded set: with another one in its place, each may be nothing.
-ONE_IS_THERE, SIZE_OPEN = 'one of them is there', 'how large each is remains open'
+ONE_IS_THERE, SIZE_OPEN = 'one of them is present', 'the size of each is unknown'
 _MAX_LANDMARKS = 6  # landmarks named in a row
 
 
@@ -146,7 +146,7 @@ def size(diagnosis: Diagnosis, cause: Cause) -> str:
         return text
     if cause.indistinguishable_from:
         return f'{ONE_IS_THERE}, {SIZE_OPEN}: {text}'
-    return f'size within its error: {text}'
+    return f'its size is within its error: {text}'
 
 
 def most_significant(parameters: Mapping[str, Mapping[str, Any]], least: float) -> str:

@@ -28,38 +28,39 @@ from fisheye_svp_ros.reporting.wording.adequacy import flaw_reason
 from fisheye_svp_ros.reporting.wording.causes import chance, pixels
 from fisheye_svp_ros.solve.outliers import FRAME, VIEW
 
+_IDEAL_RATIO = 0.05  # so near to 1, a held-out error is what noise leaves
 _SUBJECTS = {LensFacts: 'lens', TargetFacts: 'target', PhotographsFacts: 'photographs'}
-_ONE_FRAME = 'one frame does not tell errors of the lens from those of the target'
+_ONE_FRAME = 'one frame cannot separate errors of the lens from those of the target'
 _ACTIONS = {
     Action.USE_EXTENDED: 'solve with the extended lens file',
-    Action.DIAGNOSE_AIR: 'diagnose the photographs in air first, then these with the extended '
-    'lens of that run: the lens already has errors in air',
+    Action.DIAGNOSE_AIR: 'the lens already has errors in air: diagnose photographs in air '
+    'first, then these with the extended lens of that run',
     Action.CALIBRATE_AIR: 'the lens was adjusted within the errors of its calibration in air: '
-    'take photographs in air that fill the image, or measure the target better',
+    'take photographs in air that fill the image, or measure the target more precisely',
     Action.MEASURE_BOARD: 'measure the board, or flatten or replace it',
-    Action.MEASURE_LANDMARKS: 'measure the landmarks of the target, first those that are '
-    'displaced most',
-    Action.SUPPORT_BOARD: 'support the board or hold it upright: it bends by {mm:.1f} mm between '
-    'lying face up and upright',
-    Action.VARY_VIEWS: 'take photographs from more different poses: errors of landmarks repeat in '
-    'similar ones{soon} and do not average out. Check that the paper is flat, nothing reflects, '
-    'and nothing is printed near the corners',
+    Action.MEASURE_LANDMARKS: 'measure the landmarks of the target, starting with the largest '
+    'errors',
+    Action.SUPPORT_BOARD: 'support the board or hold it upright: lying face up, it bends by '
+    '{mm:.1f} mm',
+    Action.VARY_VIEWS: 'take photographs from more different poses: errors of landmarks repeat '
+    'in similar ones{soon} and do not average out. Check that the paper is flat, that nothing '
+    'reflects, and that nothing is printed near the corners',
     Action.RETAKE: 'look at these photographs: they scatter more than the others (light, blur)',
     Action.CHECK_VIEWS: f'check these photographs: {VIEW}',
     Action.CHECK_FRAMES: f'check these photographs: {FRAME}',
     Action.CHECK_HELD_OUT_VIEWS: f'check these held-out photographs: {VIEW}',
     Action.CHECK_HELD_OUT_FRAMES: f'check these held-out photographs: {FRAME}',
     Action.CHECK_HELD_OUT_RIG: 'check these held-out photographs: their relative camera poses '
-    'differ from the others, so each view has its own pose. Check that the rig was not touched, '
-    'the cameras are not exchanged, simultaneous photographs have one number, and points are '
-    'numbered from the same end',
-    Action.HOLD_OUT_SAME_TARGET: 'hold out photographs of the same target: in these, landmarks of '
-    'the same numbers have other coordinates, so errors of the target are not predicted there',
+    'differ from the others, so each view has its own pose. Check that the rig was not '
+    'moved and the cameras were not exchanged. Check that simultaneous photographs have the '
+    'same number, and that points are numbered from the same end',
+    Action.HOLD_OUT_SAME_TARGET: 'hold out photographs of the same target: in these, the same '
+    'landmark numbers have other coordinates, so the errors of the target cannot be predicted',
     Action.TAKE_MORE_LIKE_THESE: 'take more photographs like these: the others do not predict '
-    'them. Either only they cover a part of the image, or they are wrong; the held-out rms '
+    'them. Either they alone cover a part of the image, or they are wrong. The held-out rms '
     'excludes them',
     Action.NUMBER_LIKE_OTHERS: 'corners are numbered from another end of the board (odds '
-    '{value:.2g} to 1 or more): they were reordered like the others; number them so',
+    '{value:.2g} to 1 or more): they were reordered like the others; number them that way',
     Action.CHECK_NUMBERS: 'corners may be numbered from another end of the board (odds '
     '{value:.2g} to 1 or more): they were not reordered; check them',
     Action.SEPARATE_CAUSE: '{effect}: {how}',
@@ -85,21 +86,21 @@ def _lens_reasons(facts: LensFacts) -> dict[LensReason, str]:
     """Return the clause of each reason."""
     file = facts.file
     return {
-        LensReason.FITTED_ERROR_RISES: 'the error on the fitted frames rises with the causes in '
-        'the model, so nothing is recommended',
+        LensReason.FITTED_ERROR_RISES: 'with the causes in the model, the error on the fitted '
+        'frames rises, so nothing is recommended',
         LensReason.LENS_IS_OFF: _offset(facts),
         LensReason.ONE_FRAME: f'{_ONE_FRAME}; take {MIN_FRAMES} frames or more',
         LensReason.INTRINSICS_WRONG: 'the lens as given is wrong in '
         f'{", ".join(facts.wrong_intrinsics)}',
         LensReason.PREDICTS_BETTER: f'it predicts held-out frames to {pixels(file.extended_px)} '
-        f'px, the lens as given to {pixels(file.given_px)} px, each landmark where the other '
-        f'frames see it{_unconfirmed_clause(facts)}',
-        LensReason.RAYS_BETTER: 'the expected error of its rays is '
-        f'{facts.rays[1]:.2g} mrad, of the lens as given {facts.rays[0]:.2g} mrad'
-        f'{_unconfirmed_clause(facts)}',
-        LensReason.GAIN_UNCERTAIN: f'it is not certain that {", ".join(facts.lens_causes)} in the '
-        f'lens reduces the held-out error ({pixels(file.given_px)} → '
-        f'{pixels(file.extended_px)} px): its probability is {100 * file.sure:.0f} %',
+        f'px, compared with {pixels(file.given_px)} px for the lens as given. Landmarks are '
+        f'placed where the other frames see them{_unconfirmed_clause(facts)}',
+        LensReason.RAYS_BETTER: f'the expected error of its rays is {facts.rays[1]:.2g} mrad, '
+        f'compared with {facts.rays[0]:.2g} mrad for the lens as '
+        f'given{_unconfirmed_clause(facts)}',
+        LensReason.GAIN_UNCERTAIN: f'it is uncertain whether {", ".join(facts.lens_causes)} in '
+        f'the lens reduces the held-out error ({pixels(file.given_px)} → '
+        f'{pixels(file.extended_px)} px): the probability is {100 * file.sure:.0f} %',
         LensReason.EFFECT_POSSIBLE: _possible_effects(facts),
         LensReason.NO_CAUSE_CONFIRMED: _no_cause_clause(facts),
     }
@@ -109,10 +110,10 @@ def _unconfirmed_clause(facts: LensFacts) -> str:
     """Return what the extended lens has without a confirmed cause, as a clause; '' for nothing."""
     if facts.written:
         parts = ' and '.join(f'the {name.replace("_", " ")}' for name in facts.written)
-        return f'; for part of the gain, {parts}, the cause is not known'
+        return f'. Part of the gain comes from {parts}, whose cause is unknown'
     if facts.lens_causes:
         return ''
-    return '; its parameters are estimated with errors of the target'
+    return '. Its parameters are estimated together with errors of the target'
 
 
 def _offset(facts: LensFacts) -> str:
@@ -150,7 +151,7 @@ def _possible_effects(facts: LensFacts) -> str:
 
 def _no_cause_clause(facts: LensFacts) -> str:
     agrees = facts.offset is not None and facts.offset.is_chance
-    fit = ' and its parameters agree with these data within their errors' if agrees else ''
+    fit = ', and its parameters agree with these data within their errors' if agrees else ''
     return f'no error of the lens is confirmed{fit}'
 
 
@@ -173,16 +174,16 @@ def _target_reasons(facts: TargetFacts) -> dict[TargetReason, str]:
         )
     largest = target_error(facts.largest) if facts.largest else ''
     reasons = {
-        TargetReason.CAMERAS_CONTRADICT: 'the cameras contradict each other about its shape',
+        TargetReason.CAMERAS_CONTRADICT: 'the cameras disagree about its shape',
         TargetReason.CORRECTION_GAINS: f'{largest}; held-out frames confirm it',
         TargetReason.CORRECTION_GAINS_NOTHING: f'{largest}; the correction does not lower the '
         'held-out error significantly',
         TargetReason.CAUSE_AND_OFFSETS: f'{largest}; in addition, {local} and '
-        f'{1e3 * facts.pose_error:.2g} mrad in poses on it',
+        f'{1e3 * facts.pose_error:.2g} mrad of pose error',
         TargetReason.ONE_FRAME: f'its errors are unknown: {_ONE_FRAME}',
-        TargetReason.OFFSETS_COST: f'{local} and {1e3 * facts.pose_error:.2g} mrad in poses on it',
-        TargetReason.OFFSETS_HARMLESS: f'{local} and only {1e3 * facts.pose_error:.2g} mrad in '
-        'poses on it',
+        TargetReason.OFFSETS_COST: f'{local} and {1e3 * facts.pose_error:.2g} mrad of pose error',
+        TargetReason.OFFSETS_HARMLESS: f'{local} and only {1e3 * facts.pose_error:.2g} mrad of '
+        'pose error',
         TargetReason.BELOW_NOISE: 'its errors are below the noise',
     }
     bend = frame_bend(facts)
@@ -195,7 +196,8 @@ def frame_bend(facts: LensFacts | TargetFacts | PhotographsFacts) -> str:
         return ''
     return (
         f'the board bends from frame to frame by {1e3 * facts.bend_m:.2g} mm rms '
-        f'({100 * facts.bend_share:.0f} % of what is left beside noise): mount it on a stiff plate'
+        f'({100 * facts.bend_share:.0f} % of the error above the noise): mount it on a stiff '
+        'plate'
     )
 
 
@@ -220,18 +222,18 @@ def _photographs_reasons(facts: PhotographsFacts) -> dict[PhotographsReason, str
     bad, unlike = len(facts.bad), len(facts.unlike)
     wrong = 'are outliers' if bad > 1 else 'is an outlier'
     few = f'one {unit} is' if count == 1 else f'{count} {unit}s are'
-    remedy = 'cover the image to its edge, at different distances'
+    remedy = 'cover the image out to its edges, at different distances'
     if facts.plannable:
-        remedy = '--next 6 lists the views that decide it'
-    rest = '; the target causes the rest' if facts.target_causes_rest else ''
+        remedy = '--next 6 lists the views that would decide it'
+    rest = '; the rest comes from the target' if facts.target_causes_rest else ''
+    times = f'{facts.ratio:.1f} times ' if abs(facts.ratio - 1) >= _IDEAL_RATIO else ''
     return {
         PhotographsReason.SOME_ARE_WRONG: f'{bad} of {count} {wrong} as a whole',
         PhotographsReason.TOO_FEW_FRAMES: f'{few} too few; take {MIN_FRAMES} or more',
         PhotographsReason.LENS_UNDECIDED: f'the lens is undecided; {remedy}',
-        PhotographsReason.FRAMES_NOT_PREDICTED: f'{unlike} of {count} '
-        f'{"are" if unlike > 1 else "is"} not predicted by the others',
-        PhotographsReason.FRAMES_PREDICTED: f'{count} {unit}s; the error on left-out ones is '
-        f'{facts.ratio:.1f} times that of noise and scatter (1 is ideal){rest}',
+        PhotographsReason.FRAMES_NOT_PREDICTED: f'the others do not predict {unlike} of {count}',
+        PhotographsReason.FRAMES_PREDICTED: f'{count} {unit}s; the error on held-out ones is '
+        f'{times}what noise and scatter would leave{rest}',
     }
 
 

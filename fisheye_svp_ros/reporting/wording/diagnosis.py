@@ -33,19 +33,19 @@ from fisheye_svp_ros.scene.observations import frame_name
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
 
 CAPTIONS = {
-    'field': 'Residual vectors over the image. The scale is in the upper right corner. Dotted: '
+    'field': 'Residual vectors over the image. The scale is in the upper right corner. Dotted lines: '
     'equal incidence angle. Above: single points. Below: means over cells of the image, which '
     'show errors common to all frames.',
     'theta': 'Residuals against the incidence angle, along the radius from the principal point '
     '(above) and across it (below).',
     'range': 'Residuals against the distance of the landmark. If the viewpoint of the lens moves, '
     'the radial residuals change with the distance.',
-    'landmark': 'Residuals of each landmark. One that stands out is displaced.',
+    'landmark': 'Residuals of each landmark. A landmark that stands out is displaced.',
     'frame': 'Residuals of each frame. A step or a drift indicates a change of the camera.',
     'phase': 'Residuals against the fractional part of the image point. Waves come from the '
     'detector.',
-    'histogram': 'Residuals divided by the noise; the end bins include all beyond 6. Wide tails '
-    'are outliers, or noise that varies.',
+    'histogram': 'Residuals divided by the noise. The end bins include everything beyond 6. '
+    'Wide tails are outliers, or noise that varies.',
 }
 LENS_FILE = 'extended_lens.yaml'
 LENS = {
@@ -73,7 +73,7 @@ _STRUCTURE_TEXTS = {
     'outliers': 'a few points are outliers',
     'scatter_vs_theta': 'the scatter changes with the incidence angle',
     'scatter_vs_frame': 'the scatter differs from frame to frame',
-    'size': 'the residuals do not match the stated sigma',
+    'size': 'the residuals do not agree with the stated sigma',
 }
 _MEASURES = {
     'position_error_m': ('position error', 1e3, 'mm'),
@@ -105,7 +105,7 @@ def lens_words(d: Diagnosis) -> str:
     several = 'es' if len(d.lenses) > 1 else ''
     if d.adequacy.is_misfit:
         if d.adequacy.flaws[0].kind.is_unit:
-            return f'The lens{several} cannot be judged before lengths are in m'
+            return f'The lens{several} cannot be judged until lengths are in m'
         return 'Do not use a lens that was calibrated from these data'
     decision = d.decision['lens']
     words = (_OF_RIG if several else LENS)[decision.say]
@@ -174,13 +174,13 @@ def remaining_text(diagnosis: Diagnosis, variable: str) -> str:
         where = worst.get('photograph') or f'frame {worst["frame"]}'
         which = f'{where} landmark {worst["landmark"]} ({pixels(worst["px"])} px)'
         return (
-            f'{count} points are outliers, the largest {which}'
+            f'{count} points are outliers; the largest is {which}'
             if count > 1
-            else f'one point is an outlier, {which}'
+            else f'one point is an outlier: {which}'
         )
     if variable == 'size':
         ratio = math.sqrt(diagnosis.figures.extended.chi2_per_dof or math.nan)
-        return f'the residuals are {ratio:.2g} times as large as sigma states'
+        return f'the residuals are {ratio:.2g} times as large as sigma'
     depends = f'residuals depend on {VARIABLES.get(variable, variable)}'
     return _STRUCTURE_TEXTS.get(variable, depends)
 
@@ -234,8 +234,8 @@ def _field_sentence(d: Diagnosis) -> str:
         return ''
     refuted = frame_ranges(d, field.refuted)
     return (
-        f' The lens file holds an image field: it predicts frames left out to '
-        f'{pixels(field.after)} px rms instead of {pixels(field.before)}'
+        ' The lens file holds an image field. With it, held-out frames are predicted to '
+        f'{pixels(field.after)} px rms, compared with {pixels(field.before)} px without it'
         + (f', but {refuted} worse' if refuted else '')
         + '.'
     )
@@ -244,7 +244,7 @@ def _field_sentence(d: Diagnosis) -> str:
 def _wrong(d: Diagnosis) -> str:
     if d.adequacy.is_misfit:
         return ' '.join(f'{flaw_headline(flaw)}.' for flaw in d.adequacy.flaws)
-    noise = f'noise of {pixels(d.noise_px)} px a coordinate'
+    noise = f'noise of {pixels(d.noise_px)} px per coordinate'
     if _shows_no_cause(d):
         but = [
             what
@@ -255,19 +255,19 @@ def _wrong(d: Diagnosis) -> str:
             )
             if told
         ]
-        nothing = f'Nothing but {join_names(but)}' if but else 'Nothing'
+        nothing = f'Nothing except {join_names(but)}' if but else 'Nothing'
         likely = d.verdict == 'adequate' and d.offers_extended
         wrong = 'confirmed to be wrong' if likely else 'wrong'
         rest = ' and displaced landmarks' if _is_target_off(d) else ', without a pattern'
         return (
-            f'{nothing} is {wrong} in these data: in {d.observations} points of '
-            f'{count_frames(d)} the residuals are {noise}{rest}.'
+            f'{nothing} is {wrong} in these data. The residuals of {d.observations} points in '
+            f'{count_frames(d)} are {noise}{rest}.'
         )
     if not d.causes:
-        off = 'The intrinsics as given are wrong. Fitted to these data, the'
+        off = 'The intrinsics as given are wrong. Fitted to these data, the lens'
         return (
-            f'{off if d.is_lens_off else "The"} simulation leaves residuals of '
-            f'{pixels(d.figures.base.rms_px)} px rms, and no effect of the catalog explains them: '
+            f'{off if d.is_lens_off else "The lens"} model leaves residuals of '
+            f'{pixels(d.figures.base.rms_px)} px rms. No effect of the catalog explains them: '
             f'{remains(d, 7)}{_almost(d)}.'
         )
     causes = '; '.join(
@@ -276,7 +276,7 @@ def _wrong(d: Diagnosis) -> str:
     )
     more = len(d.causes) - _MAX_CAUSES
     rest = f'; the table lists {more} more cause{"s" * (more > 1)}' if more > 0 else ''
-    return f'Besides {noise}, these errors are found: {causes}{rest}.'
+    return f'In addition to {noise}, there are these errors: {causes}{rest}.'
 
 
 def _shows_no_cause(d: Diagnosis) -> bool:
@@ -294,8 +294,8 @@ def _almost(d: Diagnosis) -> str:
     for step in d.trace:
         if step.reason is Reason.NO_CONVINCING_GAIN:
             return (
-                f'; {step.effect} is significant ({probability(step.p_corrected)}), but does not '
-                'improve the prediction of left-out frames significantly: take more '
+                f'. {step.effect} is significant ({probability(step.p_corrected)}), but it does '
+                'not significantly improve the prediction of held-out frames: take more '
                 'photographs'
             )
     return ''
@@ -320,37 +320,39 @@ def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
     local = ''
     if best < 0.99 * named:
         local = (
-            f'; with the random effects of single landmarks and of the image, to {pixels(best)} px'
+            '. With the random effects of single landmarks and of the image, the error is '
+            f'{pixels(best)} px'
         )
     elif best > 1.01 * named:
         local = (
-            '; the random effects of single landmarks and of the image do not transfer to '
-            f'it: with them {pixels(best)} px'
+            '. The random effects of single landmarks and of the image do not transfer to it: '
+            f'with them, the error is {pixels(best)} px'
         )
     if not moving:
-        why, times = 'no extension improved on it', before / max(2**0.5 * d.noise_px, 1e-3)
+        why, times = 'no extension improves on that', before / max(2**0.5 * d.noise_px, 1e-3)
         if _shows_no_cause(d):
             why = 'that is the noise' if times < _NOISE_RATIO else _poor_prediction(d, times)
         if d.causes:
             why = 'the cause is in the image points, not in the lens'
         which = (
-            'The lens, fitted to these data,' if d.evaluation.intrinsics else 'The lens as it is'
+            'The lens, fitted to these data,' if d.evaluation.intrinsics else 'The lens as given'
         )
-        text = f'{which} predicts held-out data to {pixels(before)} px rms; {why}{local}'
+        text = f'{which} predicts held-out data to {pixels(before)} px rms: {why}{local}'
         return text + (_file_clause(d) if d.offers_extended else '') + '.'
     if named >= before:
         return (
-            f'Held-out data do not confirm it: {pixels(named)} px rms instead of {pixels(before)}'
-            f'; do not correct for the causes{local}.'
+            f'Held-out data do not confirm this: {pixels(named)} px rms, compared with '
+            f'{pixels(before)} px. Do not correct for the causes{local}.'
         )
     text = (
-        f'Corrected, held-out data are predicted to {pixels(named)} px rms instead of '
-        f'{pixels(before)}{local}'
+        f'With the correction, held-out data are predicted to {pixels(named)} px rms, compared '
+        f'with {pixels(before)} px without it{local}'
     )
     if d.figures.gain.value > 0:
         value, low, high = map(percent, d.figures.gain.interval.values())
         text += (
-            f'; this removes {value} (95 % interval {low} to {high}) of the error above the noise'
+            f'. The correction removes {value} (95 % interval {low} to {high}) of the error '
+            'above the noise'
         )
     if 'target' in {c.stage for c in moving}:
         text += _file_clause(d)
@@ -359,7 +361,7 @@ def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
     ):
         changed = compared.low > 0 or compared.high < 0
         text += (
-            f'; the {label} '
+            f'. The {label} '
             + (f'goes from {base} to' if changed else 'stays at')
             + (f' {extended}')
         )
@@ -378,16 +380,16 @@ def _poor_prediction(d: Diagnosis, times: float) -> str:
 
 def _file_clause(d: Diagnosis) -> str:
     return (
-        f'; on the same corrected target the extended lens leaves '
-        f'{pixels(d.file.extended_px)} px, the lens as given {pixels(d.file.given_px)} px'
+        f'. On the same corrected target, the extended lens leaves {pixels(d.file.extended_px)} '
+        f'px and the lens as given {pixels(d.file.given_px)} px'
     )
 
 
 def _rig_advice(d: Diagnosis) -> list[str]:
     """Return what to find out of cameras that no rig holds together."""
     return [
-        f'find out why {join_names(pair.cameras)} have no constant relative pose (check frame '
-        'numbers, the end from which points are numbered, exchanged cameras, the mount)'
+        f'find out why the relative pose of {join_names(pair.cameras)} is not constant (check '
+        'the frame numbers, the order of the points, exchanged cameras, and the mount)'
         for pair in d.cameras
         if pair.posed_alone and pair.rig
     ]
@@ -403,9 +405,9 @@ def _next_step(d: Diagnosis) -> str:
         return '; '.join([lens, *_rig_advice(d), *turned]) + f'{blind}.'
     steps = [lens, *_rig_advice(d)]
     steps += [
-        f'find out why {join_names(pair.cameras)} contradict each other about the target: check '
-        'that it was not bent or exchanged in between, and that both number its landmarks alike. '
-        'Use no correction of it until then'
+        f'find out why {join_names(pair.cameras)} disagree about the target. Was it bent or '
+        'exchanged in between? Do both number its landmarks in the same way? Do not correct it '
+        'until then'
         for pair in d.cameras
         if pair.verdict == 'contradict'
     ]

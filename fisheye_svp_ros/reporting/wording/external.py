@@ -18,8 +18,8 @@ CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'les
 _SIGNIFICANT_RATIO, _MAX_PARAMETERS = 3.0, 4
 _MIN_HEIGHT = 1e-9  # m, rms: less is rounding
 _NO_RIG_NOTE = (
-    '; their relative pose is not constant, the photographs are not simultaneous, or the two see '
-    'different boards, so each view has its own pose and no result depends on the rig'
+    '. Their relative pose is not constant, their photographs are not simultaneous, or they '
+    'see different boards. So each view has its own pose, and no result depends on the rig'
 )
 ROBOT_TITLE = 'Poses of the robot'
 SETS_TITLE = 'Another data set of this camera'
@@ -122,7 +122,7 @@ def _agreement(pair: TwoCameras) -> str:
     if pair.verdict == 'undecided':
         return f'{both} are undecided: {carried}, not significant in both{alike}'
     gone = f', so that {join_names(pair.withdrawn)} is withdrawn' if pair.withdrawn else ''
-    return f'{both} contradict each other about the target: {carried}{alike}{gone}'
+    return f'{both} disagree about the target: {carried}{alike}{gone}'
 
 
 def _has_height(pair: TwoCameras) -> bool:
@@ -131,7 +131,7 @@ def _has_height(pair: TwoCameras) -> bool:
 
 def _rig(pair: TwoCameras) -> str:
     if not pair.rig:
-        return '; too few frames are shared to estimate the scatter of the rig'
+        return '. Too few frames are shared to estimate the scatter of the rig'
     if pair.posed_alone:
         return _NO_RIG_NOTE
     if pair.verdict in ('nothing', 'contradict'):
@@ -141,7 +141,7 @@ def _rig(pair: TwoCameras) -> str:
     for (label, before, after, less), change in rows:
         how = f'reduced by {less}' if change.low > 0 else 'not significantly reduced'
         said.append(f'{label} {before} before, {after} after ({how})')
-    return '; estimated view by view, the rig scatters: ' + join_names(said)
+    return '. Estimated view by view, the rig scatters: ' + join_names(said)
 
 
 def _rig_rows(rig: dict[str, Comparison]) -> Iterable[tuple[str, str, str, str]]:
@@ -191,9 +191,9 @@ def _lens_holds(against: TwoDatasets) -> str:
     said = {
         'agree': 'The causes in the lens hold in both sets',
         'undecided': 'It is undecided whether the causes in the lens hold in both sets',
-        'contradict': 'The two sets contradict each other about the lens',
+        'contradict': 'The two data sets disagree about the lens',
     }[against.verdict]
-    gone = f'; {join_names(against.withdrawn)} is withdrawn' if against.withdrawn else ''
+    gone = f'. {join_names(against.withdrawn)} is withdrawn' if against.withdrawn else ''
     return f'{said}: estimated from one set, they change the held-out error of {tried}{gone}'
 
 
@@ -204,13 +204,13 @@ def _difference_text(against: TwoDatasets) -> str:
     for of_causes, meaning in (
         (
             False,
-            'the intrinsics of the two sets differ ({}): focus or mount changed in between, '
-            'or they absorb an unexplained error',
+            'the intrinsics of the two sets differ ({}): the focus or the mount changed in '
+            'between, or they absorb an unexplained error',
         ),
         (
             True,
-            'sizes of causes differ by more than their errors ({}): one set states too small '
-            'errors',
+            'sizes of causes differ by more than their errors ({}): the errors stated for one '
+            'set are too small',
         ),
     ):
         sizes = [
@@ -236,10 +236,10 @@ def _follows(against: TwoDatasets) -> str:
         return ''
     if any(transfer.improves for transfer in there):
         return (
-            '; the correction of the target also holds in the other set: the target is the '
+            '. The correction of the target also holds in the other set: the target is the '
             'same, or the error belongs to the lens'
         )
-    return '; the correction of the target does not transfer to the other target, as expected'
+    return '. The correction of the target does not transfer to the other target, as expected'
 
 
 def travel_sentence(against: TwoDatasets) -> str:
@@ -248,8 +248,8 @@ def travel_sentence(against: TwoDatasets) -> str:
         return ''
     given, extended = map(_error, against.travel)
     return (
-        f'{given} as given, {extended} extended: errors of the lenses on '
-        f'{Path(against.source).name}, its poses and landmark offsets fitted anew'
+        f'On {Path(against.source).name}, the lens as given leaves {given} and the extended lens '
+        f'{extended}; poses and landmark offsets are refitted'
     )
 
 

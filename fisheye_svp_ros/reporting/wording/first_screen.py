@@ -31,6 +31,7 @@ from fisheye_svp_ros.diagnosis import (
 )
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.blocks import image_uri
+from fisheye_svp_ros.reporting.terminal import with_error
 from fisheye_svp_ros.reporting.wording.accuracy import accuracy, used_rays
 from fisheye_svp_ros.reporting.wording.adequacy import flaw_headline, flaw_statement
 from fisheye_svp_ros.reporting.wording.causes import (
@@ -75,7 +76,7 @@ _LENS = 'Lens'
 _THUMBNAIL = 96  # px, the longer side
 MAX_WORDS = 25  # of the headline, and of each line below it
 _VERDICTS = {
-    'adequate': 'Adequate: the simulation of the lens describes these data',
+    'adequate': 'Adequate: the lens model describes these data',
     'explained': 'Explained: the model error is identified',
     'partly_explained': 'Partly explained: some of the residual error is unexplained',
     'unexplained': 'Unexplained: no effect of the catalog explains the residual error',
@@ -89,7 +90,7 @@ TARGET = {
 PHOTOGRAPHS = {
     'enough': 'Enough for this answer',
     'more': 'Take more',
-    'retake': 'For a better answer, take some again',
+    'retake': 'For a better answer, retake some',
 }
 NO_CONFIRMED_ERROR = 'no model error is confirmed in these data'
 
@@ -188,7 +189,7 @@ def _reason(decision: Decision, d: Diagnosis) -> str:
         return why
     done = {
         True: 'numbered from another end of the board, and reordered',
-        False: 'perhaps numbered from another end of the board, and used as they are',
+        False: 'perhaps numbered from another end of the board, but used unchanged',
     }
     for corrected, words in done.items():
         names = [frame.photograph for frame in d.turned if frame.corrected == corrected]
@@ -210,7 +211,7 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
         sure = f' ({action.sure})' if action.sure else ''
         why = f'{action.why}{sure}.'
         if action.about == _LENS:
-            details.append(f'{_LENS}: {action.do}. {why}')
+            details.append(f'{_LENS}: {action.do}{sure}. {action.why}.')
             details += [f'Accuracy: {screen.accuracy}.'] if screen.accuracy else []
         elif len(f'{do} {why}'.split()) <= MAX_WORDS:
             first.append(f'{do} {why}')
@@ -236,8 +237,8 @@ def _facts(d: Diagnosis, source: str) -> str:
     if d.causes and not d.adequacy.is_misfit:
         errors.append(f'{pixels(named)} px with the causes corrected')
     return (
-        f'{source}: {d.observations} points in {count_frames(d)}; held-out error '
-        f'{", ".join(errors)}; noise alone {pixels(2**0.5 * d.noise_px)} px'
+        f'{source}: {d.observations} points in {count_frames(d)}. Held-out error: '
+        f'{", ".join(errors)}. Noise alone would leave {pixels(2**0.5 * d.noise_px)} px.'
     )
 
 
@@ -313,7 +314,7 @@ def _candidates(d: Diagnosis) -> str:
     words = []
     for shift in shifts:
         status = status_of(shift.weight, False)
-        size_of = f'e0 = {1e3 * shift.e0:.2g} ± {1e3 * shift.stderr:.2g} mm'
+        size_of = f'e0 = {" ± ".join(with_error(1e3 * shift.e0, 1e3 * shift.stderr))} mm'
         told = f': {included}{size_of}' if included or status is not Status.NOT_NEEDED else ''
         camera = f'{shift.camera} ' if shift.camera else ''
         words.append(f'{camera}viewpoint_shift ({belief(status, shift.weight)}{told})')
@@ -373,11 +374,11 @@ def headline(d: Diagnosis) -> str:
     """Return whether the lens may be used, how good it is and where, or what is wrong instead."""
     lens, rays = lens_words(d), used_rays(d)
     if d.adequacy.flaws:
-        known = f'; within it is {rays.bound}' if rays and is_short_of_angle(d) else ''
+        known = f'. Within, rays are {rays.bound}' if rays and is_short_of_angle(d) else ''
         return f'{flaw_headline(d.adequacy.flaws[0])}. {lens}{known}.'
     if d.decision['lens'].say != 'recalibrate' and rays:
         undecided = d.decision['lens'].say == 'undecided'
-        lens += f'; until then it is {rays.quality}' if undecided else f': {rays.quality}'
+        lens += f'. {"Until then, rays" if undecided else "Rays"} are {rays.quality}'
     return f'{lens}.'
 
 
@@ -413,15 +414,22 @@ def _gain(d: Diagnosis) -> str:
     """Return what correcting the causes gains on frames left out: the one pair of figures."""
     base, named = (quality.heldout_rms_px for quality in (d.figures.base, d.figures.named))
     moving = any(cause.effect_class.stage != 'noise' for cause in d.causes)
-    figures = f'{pixels(base)} px, corrected {pixels(named)} px'
-    return f'left-out error {figures}' if moving else ''
+    before, after = pixels(base), pixels(named)
+    if not moving:
+        return ''
+    if before == after:
+        return f'the held-out error stays at {after} px'
+    return (
+        f'correction {"lowers" if named < base else "raises"} the held-out error from {before} '
+        f'to {after} px'
+    )
 
 
 def _other_causes(d: Diagnosis, count: int) -> str:
     """Return the next one of the causes that are not told in full, and how many there are."""
     causes = sorted(d.causes, key=lambda cause: (-cause.share, cause.p_value))
     name = causes[-count].effect.replace('_', ' ')
-    return f'also {name}' + (f' and {count - 1} more below' if count > 1 else ', see below')
+    return f'also {name}' + (f' and {count - 1} more, see below' if count > 1 else ', see below')
 
 
 def verdict_words(d: Diagnosis) -> str:
@@ -429,7 +437,7 @@ def verdict_words(d: Diagnosis) -> str:
     if d.adequacy.is_misfit:
         return f'Inadequate data: {flaw_statement(d.adequacy.flaws[0])}'
     if d.verdict == 'adequate' and d.adequacy.flaws:
-        return f'Adequate where points are; {flaw_statement(d.adequacy.flaws[0])}'
+        return f'Adequate where there are points; {flaw_statement(d.adequacy.flaws[0])}'
     if d.verdict == 'unexplained' and only_gross(d):
         return 'Unexplained: outliers; nothing else is wrong'
     if d.verdict == 'adequate' and d.offers_extended:
@@ -456,16 +464,16 @@ def target_words(d: Diagnosis) -> str:
     """Return what to do about the target."""
     say = d.decision['target'].say
     if say == 'keep' and frame_bend(d.decision['target'].facts):
-        return 'Stiffen it before the next photographs; the lens stands without new ones'
+        return 'Mount it on a stiff plate before you take more. The lens does not need more'
     if say in ('keep', 'undecided'):
         return TARGET[say]
     by_file = d.offers_extended or say != 'correct'
     words = TARGET[say] if by_file else 'For better poses, correct the target: measure it'
     if d.causes and _headline_causes(d)[0].effect == 'board_pose':
-        return f'{words}, or measure how its boards stand to each other'
+        return f'{words}, or measure how its boards are mounted to each other'
     bent = any(cause.effect == 'target_shape' for cause in d.causes)
     words = f'{words}, or {"flatten or " if bent else ""}replace it'
-    holds = ' (the lens in that file serves any scene, the correction this target only)'
+    holds = '. The lens works anywhere; the target correction, only on this target'
     return words + (holds if say == 'correct' and by_file else '')
 
 
@@ -480,7 +488,7 @@ def largest_cause(d: Diagnosis) -> str:
             [causes[0], *(f'{other[0].lower()}{other[1:]}' for other in causes[1:])]
         )
     if d.frames < 2 and (d.candidates or d.decision['target'].figure.value > 0):
-        return 'Errors show in one frame, which does not tell their cause'
+        return 'There are errors, but one frame cannot show their cause'
     if d.decision['lens'].say == 'recalibrate':
         return _capital(decision_reason(d.decision['lens']))
     if d.open_lens is not None:
@@ -504,7 +512,7 @@ def largest_cause(d: Diagnosis) -> str:
         return (
             _capital(NO_CONFIRMED_ERROR)
             if d.offers_extended
-            else 'No model error shows in these data'
+            else 'No model error is visible in these data'
         )
     return 'No effect of the catalog explains the residual error'
 
