@@ -21,19 +21,22 @@ from fisheye_svp_ros.io.streams import tolerant_streams
 from fisheye_svp_ros.process import draw_to_files, set_thread_count
 
 _DESCRIPTION = (
-    'Measure what the single-viewpoint (SVP) approximation of a fisheye lens costs, and find the '
-    'model errors in calibration data.'
+    'Measure the error of the single-viewpoint (SVP) approximation of a fisheye lens, and find '
+    'the model errors in calibration data.'
 )
 COMMANDS = {
     'budget': 'find the range and the angle at which the SVP error exceeds your limits',
-    'calibrate': 'calibrate a lens, or a rig, from observations; no poses, no initial guess',
-    'demo': 'run all nodes on simulated scenarios; record, tabulate and plot the errors',
-    'detect': 'find the points of a board in photographs, videos or recordings',
-    'diagnose': 'find the model errors in measured observations and name their causes',
-    'example': 'write example photographs: a bent board, a lens with a moving viewpoint',
-    'lens': 'show, check or convert a lens file, also those of other tools',
-    'localize': 'estimate one pose per frame, with residuals and covariance; no initial guess',
-    'map': 'map loose tags from photographs, a video or a recording of a walk',
+    'calibrate': 'calibrate a lens or a rig from photographs or observations, without an '
+    'initial guess',
+    'demo': "run all nodes on simulated cameras, and compare the errors with those of Kita's "
+    'paper',
+    'detect': 'find the points of a board in photographs, videos, or recordings',
+    'diagnose': 'find the model errors in your data and name their causes',
+    'example': 'write example photographs of a bent board through a lens with a moving viewpoint',
+    'lens': 'show, check, or convert a lens file of this package or of another tool',
+    'localize': 'estimate one pose per frame, with residuals and covariance, without an initial '
+    'guess',
+    'map': 'map loose tags from photographs, a video, or a recording of a walk',
     'paper': "reproduce the tables and figures of Kita's paper, and extend them",
     'plan': 'plan the photographs that calibrate a lens; print them as a shot list',
     'plot': 'plot a recording, a table or a sweep',
@@ -43,7 +46,7 @@ COMMANDS = {
     'run': 'run one node, as `ros2 run` does, or several in one process',
     'sweep': 'run a sweep of simulated scenarios offline; write one row per scenario',
     'table': 'turn a recording into a table with one row per stamp of the input',
-    'undistort': 'undistort photographs, rectify stereo pairs, write maps for cv2.remap',
+    'undistort': 'undistort photographs, rectify stereo pairs, and write maps for cv2.remap',
     'watch': 'show the results of running nodes live in the terminal',
 }
 # One for the help of each command.
@@ -157,8 +160,8 @@ def _run(arguments: Sequence[str]) -> None:
         commands.choices[named].add_argument(
             '--engine',
             choices=('auto', 'numpy', 'numba'),
-            help='numpy, or numba (extra `fast`), which compiles for about a minute at its first '
-            'use on a machine; auto: numba for long work, numpy otherwise; default: '
+            help='numpy or numba (extra `fast`). numba compiles for about a minute at its first '
+            'use on a machine. auto: numba for long work, numpy otherwise. Default: '
             'FISHEYE_SVP_ENGINE, or auto',
         )
     parsed, unknown = parser.parse_known_args(arguments)

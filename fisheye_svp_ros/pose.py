@@ -58,7 +58,8 @@ class Pose(_Pose, Batch):
             turned = np.linalg.det(turn) < 0
         if (np.abs(gram - _IDENTITY) > _ORTHONORMAL).any() or turned.any():
             raise GeometryError(
-                'a pose has a matrix that is no rotation; R RT = 1 and det R = 1 are needed'
+                'the rotation of a pose is not a rotation matrix; R RT = 1 and det R = 1 are '
+                'needed'
             )
         return super().__new__(cls, turn, place)
 

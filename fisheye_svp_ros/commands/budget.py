@@ -37,9 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--spread',
         type=float,
         metavar='DEG',
-        help='largest angle of the landmarks from the axis; default: 1 degree '
-        'less than the field of view, or, for a lens from `calibrate`, the '
-        'largest angle of its image points',
+        help='largest angle of the landmarks from the axis. Default: the largest angle of the '
+        'image points of a lens from `calibrate`, otherwise 1 degree less than its field '
+        'of view',
     )
     parser.add_argument(
         '--noise',

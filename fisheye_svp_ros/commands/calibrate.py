@@ -63,46 +63,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--image-size',
         type=image_sizes,
         metavar='WxH',
-        help='image size, px; if the cameras differ, left=1280x960,right=640x480; '
-        'not needed for photographs and for observations from `detect`',
+        help='image size, px. If the cameras differ: left=1280x960,right=640x480. Not needed '
+        'for photographs and for observations from `detect`',
     )
     parser.add_argument(
         '--free',
         type=_names,
         metavar='NAME,...',
-        help='parameters to fit: f (or fx,fy), cx, cy, the coefficients of the '
-        'model, of a viewpoint shift (e0,e1,e2 or '
-        'thickness,refractive_index), of a port (port_medium_index, ...); '
-        'default: all except the viewpoint shift; of a port, only its place',
+        help='parameters to fit: f (or fx,fy), cx, cy, and coefficients of the model. Of a '
+        'viewpoint shift: e0,e1,e2 or thickness,refractive_index. Of a port: '
+        'port_medium_index, ... Default: all except the viewpoint shift; of a port, only '
+        'its position',
     )
     add_port_arguments(parser)
     parser.add_argument(
         '--lens',
         metavar='AIR.yaml',
         type=Path,
-        help='the same camera calibrated in air; with --medium or --port, only '
-        'the place of the port is fitted',
+        help='the lens file of the same camera calibrated in air. With --medium or --port, only '
+        'the position of the port is then fitted',
     )
     parser.add_argument(
         '--poses',
         metavar='POSES.csv',
-        help='poses of the robot flange that carries the camera, in the robot '
-        'base; also fits the pose of the camera in the flange',
+        help='poses of the robot flange that carries the camera, in the robot base. The pose of '
+        'the camera in the flange is then fitted, too',
     )
     parser.add_argument(
         '--plain',
         action='store_true',
-        help='write the least-squares estimate, which bends the lens to errors of the board',
+        help='write the plain least-squares estimate, which absorbs board errors into the lens',
     )
     parser.add_argument(
         '-o',
         '--output',
         type=output_path,
         metavar='LENS.yaml',
-        help='lens file to write; covariances are written next to it as '
-        '.calibrate.json, the report as .calibrate.html; for a rig, a '
-        'folder: one lens per camera, calibration.html, rig.yaml, rig.json, '
-        'rig.urdf, tf_static.yaml and camchain.yaml',
+        help='lens file to write. Covariances are written next to it as .calibrate.json, and '
+        'the report as .calibrate.html. For a rig, a folder: one lens per camera, '
+        'calibration.html, rig.yaml, rig.json, rig.urdf, tf_static.yaml, and camchain.yaml',
     )
 
 

@@ -54,8 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     add_output_folder(
         parser,
-        'folder to write the recording (replaces an earlier one), demo.json, '
-        'table.csv, table.parquet and pictures to; default: demo',
+        'folder to write errors.png, the recording (it replaces an earlier one), demo.json, '
+        'table.csv, table.parquet, and more pictures to. Default: demo',
         default='demo',
     )
     parser.add_argument(
@@ -113,8 +113,8 @@ def run(args: argparse.Namespace) -> None:
     note_formats()
     _print(rows)
     print_remaining(
-        f'A pair of {lenses[0]}, rectified at {range_text(pair.left.range)}: '
-        'difference between the rows of left and right',
+        f'A pair of {lenses[0]}, rectified at {range_text(pair.left.range)}: row difference '
+        'between left and right',
         apart,
     )
     print(f'  {"" if reason else "recording, "}table, pictures: {args.output}')

@@ -57,8 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--output',
         type=output_file,
         metavar='OBS.csv',
-        help='observations to write; the details by photograph are written next '
-        'to them as .detect.json',
+        help='observations to write. The details of each photograph are written next to them as '
+        '.detect.json',
     )
     parser.add_argument(
         '--overlays',
@@ -111,8 +111,8 @@ def _print(detection: Detection, board: str) -> None:
     sure = detection.certainty[[one.points is not None for one in detection.searched]]
     if np.isnan(sure).any():
         print(
-            '  the board looks the same when turned; too few photographs to determine its '
-            'orientation'
+            '  the board looks the same when turned, and the photographs are too few to '
+            'determine its orientation'
         )
     elif (sure < 1).any():
         print(
@@ -155,11 +155,10 @@ def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False)
         '--board',
         required=required,
         metavar='SPEC',
-        help='the board in the photographs: chessboard:9x6:24.23mm (inner '
-        'corners), charuco:7x5:30mm:22mm:DICT_5X5_100 (of a second board :17, the id of its first '
-        'marker), tags:tags.yaml (loose tags of a map), '
-        'aprilgrid:target.yaml, circles:7x5:20mm[:asymmetric], '
-        'squares:3x4:30mm:30mm (side, gap)',
+        help='the board in the photographs: chessboard:9x6:24.23mm (inner corners), '
+        'charuco:7x5:30mm:22mm:DICT_5X5_100 (:17 at the end: the id of its first marker), '
+        'aprilgrid:target.yaml, circles:7x5:20mm[:asymmetric], squares:3x4:30mm:30mm '
+        '(side, gap). Loose tags of a map: tags:tags.yaml',
     )
     parser.add_argument(
         '--detector',
@@ -178,22 +177,22 @@ def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False)
         '--sync',
         type=seconds,
         metavar='TIME',
-        help='for a rig: largest difference between the stamps of simultaneous '
-        'images (of messages, or in file names); default: 5ms',
+        help='for a rig: largest difference between the stamps of simultaneous images, in '
+        'messages or in file names; default: 5ms',
     )
     add_split_argument(parser)
 
 
 def add_split_argument(
-    parser: argparse.ArgumentParser, default: str = '2 where both halves show the board'
+    parser: argparse.ArgumentParser, default: str = '2 if both halves show the board'
 ) -> None:
     """Declare --split, of photographs in which several cameras lie side by side."""
     parser.add_argument(
         '--split',
         type=positive_count,
         metavar='N',
-        help='cameras side by side in each image: it is cut into N parts of equal width, left '
-        f'and right or cam0, cam1, ...; default: {default}',
+        help='number of cameras side by side in each image. The image is cut into N parts of '
+        f'equal width: left and right, or cam0, cam1, ...; default: {default}',
     )
 
 
@@ -307,8 +306,8 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     unsure = int((detection.certainty < _UNCERTAIN).sum())
     if unsure:
         say(
-            f'{unsure} photographs: their orientation is less than {100 * _UNCERTAIN:.0f} % sure, '
-            f'since {args.board} looks the same when turned'
+            f'{unsure} photographs: their orientation is less than {100 * _UNCERTAIN:.0f} % '
+            f'sure, because {args.board} looks the same when turned'
         )
     unknown = [
         Path(one.name).name
@@ -318,15 +317,15 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     if unknown:
         more = ', ...' if len(unknown) > _MAX_LISTED else ''
         say(
-            f'{len(unknown)} photographs have centers of unknown sigma, since no lens fits each '
-            f'by itself: {", ".join(unknown[:_MAX_LISTED])}{more}'
+            f'{len(unknown)} photographs have centers of unknown sigma, because no lens fits '
+            f'each of them separately: {", ".join(unknown[:_MAX_LISTED])}{more}'
         )
     detected = sum(one.points is not None for one in detection.searched)
     larger = sum(LARGER_BOARD in one.notes for one in detection.searched)
     if larger and larger >= _MIN_LARGER_SHARE * detected:
         say(
-            f'{larger} of {detected} boards look larger than {args.board}; count its inner '
-            'corners again, otherwise photographs may number different corners alike'
+            f'{larger} of {detected} boards look larger than {args.board}. Count the inner '
+            'corners again; otherwise, photographs may give different corners the same number'
         )
     _note_tags(detection, pattern)
     note_side_by_side(detection.observations, detection.image_sizes)
@@ -369,7 +368,7 @@ def _note_alone(detection: Detection) -> None:
     alone = [detection.searched[i].name for i in detection.pairing.alone]
     if len(alone) == len(detection.searched):
         say(
-            f'no photographs of two cameras are simultaneous, by {detection.pairing.way}; give '
+            f'no photographs of two cameras are simultaneous, by {detection.pairing.way}. Give '
             'simultaneous ones the same name or number, or name them by their stamps and raise '
             '--sync'
         )

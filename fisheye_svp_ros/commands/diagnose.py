@@ -59,14 +59,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--poses',
         metavar='POSES.csv',
-        help='poses of the camera (of a rig: the right one), or of the robot '
-        'flange that carries it; the data tell which; default: unknown, and '
-        'fitted',
+        help='poses of the camera (of a rig: the right one), or of the robot flange that '
+        'carries it. The data show which of the two. Default: unknown, and fitted',
     )
     parser.add_argument(
         '--free',
         choices=['intrinsics'],
-        help='fit the intrinsics too; a lens from `calibrate` always does',
+        help='fit the intrinsics, too. Those of a lens from `calibrate` are always fitted',
     )
     parser.add_argument(
         '--held-out',
@@ -77,8 +76,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--against',
         metavar='OTHER',
-        help='other observations of the same camera, with another target or of '
-        'another day; causes in the lens must hold there too',
+        help='other observations of the same camera, with another target or from another day. '
+        'Causes in the lens must hold there, too',
     )
     parser.add_argument(
         '--with',
@@ -100,15 +99,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--quick',
         action='store_true',
-        help='a first answer in seconds: one round on 1500 to 3000 points, '
-        'selection without held-out frames',
+        help='a first answer in less time: one round on 1500 to 3000 points, selection without '
+        'held-out frames',
     )
     parser.add_argument(
         '--range',
         type=float,
         metavar='M',
         dest='range_m',
-        help='state the ray errors at this distance too, m, besides 0.3, 1 and 5 m',
+        help='also state the ray errors at this distance, m, in addition to 0.3, 1, and 5 m',
     )
     parser.add_argument(
         '--next',
@@ -129,14 +128,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=2,
         metavar='M',
-        help='with --next: nearest and furthest distance at which the board is '
-        'sharp; default: slightly beyond the distances in OBS',
+        help='with --next: nearest and farthest distance at which the board is sharp. Default: '
+        'slightly more than the distances in OBS',
     )
     add_output_folder(
         parser,
-        'folder to write report.html and its pictures, diagnosis.json, '
-        'extended_lens.yaml and residuals.csv to; for a rig, also rig.yaml '
-        'and a subfolder for the lens of each camera',
+        'folder to write report.html and its pictures, diagnosis.json, extended_lens.yaml, and '
+        'residuals.csv to. For a rig, also rig.yaml and a subfolder for the lens of each camera',
     )
 
 

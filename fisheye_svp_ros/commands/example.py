@@ -18,8 +18,8 @@ from fisheye_svp_ros.simulate.targets import board, board_views
 
 _README = """# Fourteen photographs of a bent board
 
-Rendered, with noise, through a fisheye lens whose viewpoint moves (e0 = 4 mm), of a chessboard
-that stands out by 1.5 mm in the middle.  `truth/` holds lens, poses and true corners.
+Rendered, with noise, through a fisheye lens whose viewpoint moves (e0 = 4 mm).  The chessboard
+is bowed by 1.5 mm in the middle.  `truth/` holds the lens, the poses, and the true corners.
 
 ```bash
 fisheye-svp detect photographs --board chessboard:9x6:25mm -o observations.csv --overlays overlays
@@ -27,7 +27,7 @@ fisheye-svp calibrate observations.csv -o lens.yaml
 fisheye-svp diagnose observations.csv --lens lens.yaml -o diagnosis
 ```
 
-`calibrate`, `localize` and `diagnose` take photographs as well: add `--board chessboard:9x6:25mm`.
+`calibrate`, `localize`, and `diagnose` accept photographs, too: add `--board chessboard:9x6:25mm`.
 """
 
 

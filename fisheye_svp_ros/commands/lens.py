@@ -47,8 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'lens',
         metavar='LENS',
-        help='lens file of this package or of another tool (FILE#cam1: another '
-        'camera than the first), or the name of a lens of this package',
+        help='lens file of this package or of another tool, or the name of a lens of this '
+        'package. FILE#cam1 selects another camera than the first',
     )
     parser.add_argument('-o', '--output', type=output_file, metavar='FILE', help='file to write')
     parser.add_argument(
@@ -68,18 +68,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--crop',
         type=_crop,
         metavar='X,Y,W,H',
-        help='show and write the lens of a part of the image, px: first column and row, size',
+        help='show and write the lens of a part of the image, px: first column and row, width '
+        'and height',
     )
     size = parser.add_mutually_exclusive_group()
     size.add_argument(
         '--scale',
         type=_scale,
         metavar='FACTOR',
-        help='of an image resized by a factor, such as 1/2, after --crop (pixel centers are at '
-        'whole numbers: cx becomes (cx + 0.5) / 2 - 0.5, as binning and cv2.INTER_AREA do)',
+        help='the lens of an image resized by a factor, such as 1/2, after --crop. Pixel '
+        'centers are at whole numbers, so cx becomes (cx + 0.5) / 2 - 0.5, as for binning '
+        'and cv2.INTER_AREA',
     )
     size.add_argument(
-        '--size', type=image_size, metavar='WxH', help='of an image resized to a size, px'
+        '--size',
+        type=image_size,
+        metavar='WxH',
+        help='the lens of an image resized to this size, px',
     )
 
 
@@ -142,12 +147,12 @@ def _changed(lens: Lens, args: argparse.Namespace) -> Lens:
     change = ImageChange.of((lens.width, lens.height), args.crop, args.scale, args.size)
     resized, lost = change_image(lens, change)
     if lost:
-        say(f'left out, since the pixels have another size: {", ".join(lost)}')
+        say(f'left out, because the pixels have another size: {", ".join(lost)}')
     if abs(np.log(change.scale[0] / change.scale[1])) > _STRETCH:
         say(
-            f'{args.size[0]}x{args.size[1]} px stretches the image by '
-            f'{change.scale[0]:.4g} along u and {change.scale[1]:.4g} along v; if it was cut, '
-            'state the part by --crop'
+            f'{args.size[0]}x{args.size[1]} px stretches the image by {change.scale[0]:.4g} '
+            f'along u and {change.scale[1]:.4g} along v; if it was cropped, give the part with '
+            '--crop'
         )
     return resized
 
@@ -168,7 +173,7 @@ def _scale(text: str) -> float:
     except (ValueError, ZeroDivisionError, OverflowError):
         factor = 0.0
     if not 0 < factor < np.inf:
-        raise argparse.ArgumentTypeError(f'{text!r} is no factor above 0, such as 1/2 or 0.5')
+        raise argparse.ArgumentTypeError(f'{text!r} is not a factor above 0, such as 1/2 or 0.5')
     return factor
 
 

@@ -30,9 +30,8 @@ def add_lens_argument(parser: argparse.ArgumentParser, purpose: str = '') -> Non
         required=True,
         action='append',
         metavar='[CAMERA=]LENS',
-        help=f'{purpose}lens file, also of other tools, or the name of a lens of '
-        'this package; for a rig, left=LENS and right=LENS, or a file or '
-        'folder that holds both',
+        help=f'{purpose}lens file of this package or of another tool, or the name of a lens of '
+        'this package. For a rig: left=LENS and right=LENS, or a file or folder with both',
     )
 
 
@@ -55,8 +54,8 @@ def note_odd(lens: Lens, path: str | Path, worst: float) -> None:
     elif size := probable_size(lens):
         off = lens.cx - (lens.width - 1) / 2, lens.cy - (lens.height - 1) / 2
         say(
-            f'{path}: the principal point lies {off[0]:.0f}, {off[1]:.0f} px off the center of '
-            f'{lens.width}x{lens.height} px; it would be the center of {size[0]}x{size[1]} px: '
+            f'{path}: the principal point is {off[0]:.0f}, {off[1]:.0f} px off the center of '
+            f'{lens.width}x{lens.height} px. It would be the center of {size[0]}x{size[1]} px: '
             'check the image size'
         )
     limit = np.degrees(lens.max_incidence)
@@ -70,14 +69,14 @@ def note_odd(lens: Lens, path: str | Path, worst: float) -> None:
         known = np.degrees(lens.calibrated_angle)
         say(
             f'{path}: image points of its calibration reach {known:.0f} deg of {limit:.0f} deg; '
-            'nothing is known beyond'
+            'beyond, the lens is extrapolated'
         )
     if limit < _MIN_FIELD_DEG:
         say(f'{path}: max_incidence_deg is {limit:.3g}; it is in degrees')
     if worst > LARGE_DEVIATION:
         say(
             f'{path}: the nearest lens is {worst:.2g} px off the model of this file; calibrate '
-            'again from its photographs'
+            'again from the photographs'
         )
 
 
@@ -183,7 +182,7 @@ def port_of(args: argparse.Namespace) -> Port | None:
         index = MEDIA.get(medium) or float(medium)
     except ValueError as cause:
         raise ParameterError(
-            f'--medium {medium}: known are {", ".join(MEDIA)}, and refractive indices'
+            f'--medium {medium}: choose from {", ".join(MEDIA)}, and refractive indices'
         ) from cause
     kind, *numbers = (args.port or 'flat').split(':')
     try:
@@ -212,9 +211,9 @@ def add_dome_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--port',
         metavar='SPEC',
-        help='dome in front of the camera: dome:60mm:4mm:1.5 (inner radius, '
-        'glass, index), or dome for 50 mm with 4 mm of glass; the offset of its '
-        'center from the axis is estimated',
+        help='dome in front of the camera: dome:60mm:4mm:1.5 (inner radius, glass, index), or '
+        'dome for 50 mm with 4 mm of glass. The offset of its center from the axis is '
+        'estimated',
     )
 
 

@@ -68,7 +68,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--tag-map',
         metavar='TAGS.yaml',
         help='map of the loose tags in the photographs, with --board tags:36h11 or '
-        'tags:36h11:160mm: from `map`, tags.yaml of apriltag_ros, or a field layout of WPILib',
+        'tags:36h11:160mm. Either from `map`, or tags.yaml of apriltag_ros, or a field '
+        'layout of WPILib',
     )
     parser.add_argument(
         '--readout-time',
@@ -81,21 +82,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--model-error',
         action='store_true',
-        help='include in the covariances the errors stated in the lens file: of '
-        'its parameters and, by diagnose, unexplained; noise at least as measured',
+        help='include the errors stated in the lens file in the covariances: those of its '
+        'parameters and, if `diagnose` wrote it, the unexplained ones. The noise is at '
+        'least the measured one',
     )
     parser.add_argument(
         '--rig',
         metavar='RIG',
-        help='poses of the cameras of a rig: rig.yaml from `calibrate`, its '
-        'folder, or a camchain; gives one pose per frame from all cameras, '
-        'that of the first camera',
+        help='relative poses of the cameras of a rig: rig.yaml from `calibrate`, its folder, or '
+        'a camchain. All cameras then give one pose per frame, that of the first camera',
     )
     add_output_folder(
         parser,
-        'folder to write localize.json, poses.csv, residuals.csv and '
-        'covariance.csv to; for several cameras without --rig, one subfolder '
-        'each',
+        'folder to write localize.json, poses.csv, residuals.csv, and covariance.csv to. '
+        'Several cameras without --rig have one subfolder each',
     )
 
 

@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'recording',
         nargs='+',
         metavar='RECORDING',
-        help='photographs (files, folders), a video or a rosbag2 recording of a walk; each tag '
+        help='photographs (files, folders), a video, or a rosbag2 recording of a walk. Each tag '
         'must share an image with another one',
     )
     parser.add_argument(
@@ -41,8 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--output',
         type=output_file,
         metavar='TAGS.yaml',
-        help='tag map to write; next to it the errors of all tags as .covariance.npz, the poses '
-        'of the camera as .poses.csv',
+        help='tag map to write. The errors of all tags are written next to it as '
+        '.covariance.npz, and the poses of the camera as .poses.csv',
     )
 
 

@@ -64,7 +64,9 @@ def _check_names(pattern: str, values: Mapping[str, Any], space: str) -> None:
     """Refuse what means nothing to any node; the nodes themselves would only warn."""
     nodes = [node for node in TABLES if node_parameters(f'{space}/{node}', {pattern: values})]
     if values and not nodes:
-        raise ParameterError(f'{pattern} is not a node of a sweep; known are {", ".join(TABLES)}')
+        raise ParameterError(
+            f'{pattern} is not a node of a sweep; choose from {", ".join(TABLES)}'
+        )
     known = {row.name for node in nodes for row in rows(TABLES[node])}
     for name in values:
         swept = name.startswith(SWEEP) and CAMERA in nodes  # the camera's own table says more
@@ -75,7 +77,7 @@ def _check_names(pattern: str, values: Mapping[str, Any], space: str) -> None:
             )
         if name not in known and not swept:
             raise ParameterError(
-                f'{name} is not a parameter of {", ".join(nodes)}; known are '
+                f'{name} is not a parameter of {", ".join(nodes)}; choose from '
                 + ', '.join(sorted(known))
             )
 

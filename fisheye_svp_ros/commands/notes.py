@@ -90,8 +90,8 @@ def note_left_out(table: Observations, frames: Sequence[int]) -> None:
     """Name the frames of a table that could not be posed, if there are any."""
     if frames:
         say(
-            'left out, their points do not determine a pose (all near one line, or of another '
-            f'lens?): {list_frames(table, frames)}'
+            'left out, because their points do not determine a pose (all near one line, or of '
+            f'another lens?): {list_frames(table, frames)}'
         )
 
 
@@ -99,7 +99,7 @@ def note_copies(table: Observations, frames: Sequence[int]) -> None:
     """Name the frames of a table that are other frames once more, if there are any."""
     if frames:
         say(
-            'left out, their image points repeat those of an earlier frame: '
+            'left out, because their image points repeat those of an earlier frame: '
             f'{list_frames(table, frames)}'
         )
 
@@ -140,8 +140,8 @@ def note_gross_errors(table: Observations, gross: Outliers) -> None:
             else ''
         )
         say(
-            f'{len(gross.rows)} of {len(table)} points are outliers and are rejected, '
-            f'furthest {worst}{views}'
+            f'{len(gross.rows)} of {len(table)} points are outliers and are rejected; the '
+            f'largest: {worst}{views}'
         )
 
 

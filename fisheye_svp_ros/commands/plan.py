@@ -38,8 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--fov',
         type=float,
         metavar='DEG',
-        help='in place of --lens: field of view over the width of the image; no '
-        'corner is planned beyond it',
+        help='instead of --lens: horizontal field of view. No corner is planned beyond it',
     )
     parser.add_argument('--image-size', metavar='WxH', help='with --fov: 1280x800')
     parser.add_argument(
@@ -54,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs=2,
         required=True,
         metavar='M',
-        help='nearest and furthest distance at which the board is sharp and fits into the room',
+        help='nearest and farthest distance at which the board is sharp and fits into the room',
     )
     parser.add_argument(
         '--count',
@@ -156,7 +155,7 @@ def _note_guessed(lens: Lens, wanted: NextViews) -> None:
     if further:
         edge = np.degrees(lens.calibrated_angle)
         say(
-            f'lens {lens.name!r} was calibrated up to {edge:.0f} degrees off the axis; views '
+            f'lens {lens.name!r} was calibrated up to {edge:.0f} degrees off the axis. Views '
             f'{", ".join(further)} reach up to {np.degrees(angle.max()):.0f}, where the drawn '
             'place of the board may be wrong'
         )

@@ -42,8 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--sweep',
         metavar='FILE',
-        help='sweep file, or the name of one in config/sweeps: start the nodes, '
-        'record them in lock-step through the sweep, and end',
+        help='sweep file, or the name of one in config/sweeps: start the nodes, record them in '
+        'lockstep through the sweep, and end',
     )
     parser.add_argument(
         '--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...', help='as for `ros2 run`'

@@ -57,15 +57,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_output_folder(
         parser,
-        'folder to write the photographs (of a rig, one subfolder per '
-        'camera), observations.csv (the true corners) and poses.csv to',
+        'folder to write the photographs (of a rig, one subfolder per camera), '
+        'observations.csv (the true corners), and poses.csv to',
         required=True,
     )
     parser.add_argument(
         '--poses',
         metavar='POSES.csv',
-        help='poses of the camera (of a rig, the first one) in the frame of the '
-        'board or target; default: random',
+        help='poses of the camera (of a rig, the first one) in the frame of the board or '
+        'target. Default: random',
     )
     parser.add_argument(
         '--count',
@@ -78,8 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=2,
         metavar='M',
-        help='nearest and furthest distance of random poses, m; of a cube, to its '
-        'center; default: 0.12 0.35',
+        help='nearest and farthest distance of random poses, m (of a cube: to its center). '
+        'Default: 0.12 0.35',
     )
     parser.add_argument(
         '--bow',

@@ -17,9 +17,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'arguments',
         nargs=argparse.REMAINDER,
         metavar='[NODE ...] --ros-args ...',
-        help='more nodes for the same process; then arguments as for `ros2 run`: -p NAME:=VALUE, '
-        '--params-file FILE, -r FROM:=TO, -r __ns:=/NAMESPACE; --help lists the parameters '
-        'of the nodes',
+        help='more nodes for the same process, and then arguments as for `ros2 run`: -p '
+        'NAME:=VALUE, --params-file FILE, -r FROM:=TO, -r __ns:=/NAMESPACE. --help lists '
+        'the parameters of the nodes',
     )
 
 

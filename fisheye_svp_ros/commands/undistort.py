@@ -72,30 +72,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'inputs',
         nargs='*',
         metavar='LENS PHOTOS',
-        help='lens file, also of other tools, or the name of a lens of this '
-        'package; for a stereo pair, a file or folder with both lenses and '
-        'the rig; then photographs: files, folders (left/ and right/ for a '
-        'rig), videos, recordings; without photographs, only the maps are '
-        'written',
+        help='lens file of this package or of another tool, or the name of a lens of this '
+        'package. For a stereo pair: a file or folder with both lenses and the rig. Then '
+        'photographs: files, folders (left/ and right/ for a rig), videos, recordings. '
+        'Without photographs, only the maps are written',
     )
     parser.add_argument(
         '--lens',
         action='append',
         metavar='CAMERA=LENS',
-        help='left=LENS and right=LENS, in place of the argument LENS',
+        help='left=LENS and right=LENS, instead of the argument LENS',
     )
     parser.add_argument(
         '--rig',
         metavar='FILE',
-        help='pose of the left camera in the right one: a file, or a folder with '
-        'rig.yaml; if the lens files do not hold it',
+        help='pose of the left camera in the right one, if the lens files do not hold it: a '
+        'file, or a folder with rig.yaml',
     )
     add_output_folder(
         parser,
-        'folder to write the photographs, maps.npz and maps.yml (map1 and '
-        'map2 for cv2.remap, mask, K, R, P), mask.png, camera_info.yaml, '
-        'pictures of the remaining errors and undistort.json to; for a rig, '
-        'one subfolder per camera',
+        'folder to write the photographs, undistort.json, camera_info.yaml, mask.png, and '
+        'pictures of the remaining errors to. Also maps.npz and maps.yml (map1 and map2 for '
+        'cv2.remap, mask, K, R, P). For a rig, one subfolder per camera',
         required=True,
     )
     add_split_argument(parser, '1')
@@ -106,23 +104,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='PROJECTION',
         dest='projections',
         help='projection of the rectified camera: pinhole (default), cylindrical, '
-        'equirectangular, fisheye (equidistant); perspective:YAW,PITCH,FOV: a turned pinhole, in '
-        'degrees to the right and upwards, may be given several times; cubemap: six such views. '
-        'For views, cameras of COLMAP and nerfstudio are written, too',
+        'equirectangular, or fisheye (equidistant). perspective:YAW,PITCH,FOV: a turned '
+        'pinhole, in degrees to the right and upward; can be given several times. cubemap: '
+        'six such views. For views, cameras of COLMAP and nerfstudio are written, too',
     )
     parser.add_argument(
         '--fov',
         type=float,
         metavar='DEG',
-        help='its field of view over the width; default: 90 for a pinhole, a '
-        'face of a cube and a cylindrical pair, otherwise that of the lens',
+        help='its horizontal field of view. Default: 90 for a pinhole, a face of a cube, and a '
+        'cylindrical pair, otherwise that of the lens',
     )
     parser.add_argument(
         '--size',
         type=image_size,
         metavar='WxH',
-        help='size of the rectified images, px; default: that of the photographs, of faces of a '
-        'cube as fine as these at their middle',
+        help='size of the rectified images, px. Default: that of the photographs; for faces of '
+        'a cube, a resolution like that of the photographs in their middle',
     )
     parser.add_argument(
         '--range',
@@ -130,9 +128,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=RANGE,
         metavar='M',
         dest='range_m',
-        help='range at which the maps of a lens with a moving viewpoint are '
-        'exact, m or inf; of a pair, from the middle of the baseline; '
-        f'default: {RANGE:g}',
+        help='range at which the maps of a lens with a moving viewpoint are exact, m or inf. '
+        f'For a pair, it is measured from the middle of the baseline. Default: {RANGE:g}',
     )
 
 
@@ -144,7 +141,7 @@ def _projection(text: str) -> str:
         _view(text)
     except ValueError:
         raise argparse.ArgumentTypeError(
-            f'{text!r} is unknown; known are {", ".join((*PROJECTIONS, CUBEMAP))} and '
+            f'{text!r} is unknown; choose from {", ".join((*PROJECTIONS, CUBEMAP))} and '
             'perspective:YAW,PITCH,FOV in degrees, for example perspective:45,0,90'
         ) from None
     return text
@@ -235,8 +232,7 @@ def run(args: argparse.Namespace) -> None:
         _print_camera(side, name, left.get(name))
     if pair and rows:
         print_remaining(
-            f'baseline {1000 * pair.baseline:.2f} mm; difference between the rows of '
-            'left and right',
+            f'baseline {1000 * pair.baseline:.2f} mm; row difference between left and right',
             rows,
         )
         print(f'  {tolerated_text(rows)}')
@@ -358,7 +354,7 @@ def _note_unrectified(cameras: Sequence[str]) -> None:
     """Say why the photographs of several cameras are not rectified as those of a pair."""
     if len(cameras) == 2:
         say(
-            f'{" and ".join(cameras)} are not rectified as a pair, since no rig is named; add '
+            f'{" and ".join(cameras)} are not rectified as a pair, because no rig is named; add '
             '--rig FILE'
         )
     elif len(cameras) > 2:

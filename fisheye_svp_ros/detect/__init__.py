@@ -56,8 +56,8 @@ class _CallablePackage(ModuleType):
         able = [name for name, (kinds, _) in DETECTORS.items() if pattern.kind in kinds]
         if detector and detector not in able:
             raise ParameterError(
-                f'detector {detector!r} does not find {pattern.spec}; take one '
-                f'of {", ".join(able)}'
+                f'detector {detector!r} does not find {pattern.spec}; choose from '
+                f'{", ".join(able)}'
             )
         if not paths:
             raise ParameterError('no photographs; give at least one file or folder')

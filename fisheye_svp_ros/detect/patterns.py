@@ -191,7 +191,7 @@ def _charuco(spec: str, words: list[str]) -> Pattern:
         raise ParameterError(f'board {spec!r}: the marker must be smaller than its square')
     if dictionary not in _MARKERS:
         raise ParameterError(
-            f'board {spec!r}: OpenCV has no dictionary {dictionary}; known are '
+            f'board {spec!r}: OpenCV has no dictionary {dictionary}; choose from '
             f'{", ".join(_MARKERS)}'
         )
     needed, there = first + columns * rows // 2, _MARKERS[dictionary]

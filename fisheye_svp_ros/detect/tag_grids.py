@@ -234,5 +234,5 @@ def _ambiguity(layouts: frozenset[TagLayout]) -> str:
     if not layouts:
         return 'no board found: ids of its tags are beyond the grid'
     if len({layout.turn for layout in layouts}) > 1:
-        return 'no board found: a single tag does not tell how the grid is printed'
+        return 'no board found: a single tag does not show how the grid is printed'
     return 'no board found: ids do not begin at 0; show the whole grid in at least one photograph'

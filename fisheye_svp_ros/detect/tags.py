@@ -92,8 +92,8 @@ def tags_of_board(spec: str, words: Sequence[str]) -> TagMap:
         size = tag_size(f'{LOOSE_TAGS}:{left.pop(0)}')
     if not left:
         raise ParameterError(
-            f'board {spec!r}: loose tags hang where a map says; add its file, as in '
-            'tags:tags.yaml, or --tag-map tags.yaml'
+            f'board {spec!r}: loose tags need a map; add its file, as in tags:tags.yaml, or '
+            '--tag-map tags.yaml'
         )
     try:
         tags = read_tag_map(':'.join(left), size)

@@ -373,9 +373,8 @@ def calibrated_covariance(lens: Lens) -> tuple[tuple[str, ...], Array] | None:
             raise ValueError
     except (KeyError, TypeError, ValueError) as cause:
         raise LensError(
-            f'lens {lens.name!r}: calibration: covariance is no matrix of finite '
-            'numbers, a row and a column for each name in stderr; calibrate anew, or '
-            'leave it out'
+            f'lens {lens.name!r}: calibration: covariance is not a matrix of finite numbers '
+            'with a row and a column for each name in stderr. Calibrate again, or leave it out'
         ) from cause
     return names, whole
 

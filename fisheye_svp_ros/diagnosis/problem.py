@@ -109,7 +109,7 @@ class DiagnosisOptions:
         for name in (*self.included, *self.left_out):
             if name not in CATALOGUE:
                 known = ', '.join(CATALOGUE)
-                raise ParameterError(f'effect {name!r} is unknown; known are {known}')
+                raise ParameterError(f'effect {name!r} is unknown; choose from {known}')
         for name in self.included:
             if not can_be_included(name):
                 raise ParameterError(
@@ -306,8 +306,9 @@ def find_hand_eye(linear: Linearization, poses: dict[int, Pose]) -> HandEye:
         return fit_hand_eye(data, linear.state, linear.free, *flange_poses(data, poses))[1]
     except GeometryError as cause:
         raise ObservationError(
-            f'{data.observations.source}: the given poses fit neither the camera in the world nor '
-            f'a flange that carries it or the target: {cause}; or leave the poses out'
+            f'{data.observations.source}: the given poses are neither those of the camera nor '
+            f'those of a flange that carries the camera or the target: {cause}; or leave the '
+            'poses out'
         ) from cause
 
 

@@ -64,6 +64,6 @@ def load_effects(entries: Mapping[str, Any], where: str) -> tuple[ModelTerm, ...
     for name, entry in entries.items():
         if name not in CATALOGUE:
             names = ', '.join(CATALOGUE)
-            raise LensError(f'{where}: effect {name!r} is unknown; known are {names}')
+            raise LensError(f'{where}: effect {name!r} is unknown; choose from {names}')
         terms.append(ModelTerm(*CATALOGUE[name].from_dict(entry, where)))
     return tuple(terms)

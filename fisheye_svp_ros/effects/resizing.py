@@ -53,8 +53,8 @@ class ImageChange(NamedTuple):
             whole = np.round(wanted)
             if not (np.abs(wanted - whole) < 1e-9 * wanted).all() or whole.min() < 1:
                 raise ParameterError(
-                    f'{width}x{height} px times {scale:.6g} is no whole number of pixels; give '
-                    'the size of the image, for example '
+                    f'{width}x{height} px times {scale:.6g} is not a whole number of pixels; '
+                    'give the size of the image, for example '
                     f'{max(int(whole[0]), 1)}x{max(int(whole[1]), 1)}'
                 )
             size = int(whole[0]), int(whole[1])

@@ -307,7 +307,7 @@ def compose_yaml(text: str, where: str | Path, error: type[FisheyeSvpError]) -> 
             depth += opens - isinstance(event, yaml.CollectionEndEvent)
             values += opens or isinstance(event, yaml.ScalarEvent)
             if isinstance(event, yaml.AliasEvent):
-                raise _yaml_error('an alias; write out what it stands for', event)
+                raise _yaml_error('an alias; YAML aliases are not supported', event)
             if depth > _DEEPEST or values > _MOST_VALUES:
                 raise _yaml_error(
                     f'more than {_MOST_VALUES} values, or nested deeper than {_DEEPEST}', event
@@ -387,6 +387,6 @@ def _convert_errors(where: str | Path, error: type[FisheyeSvpError]) -> Iterator
     except (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError) as cause:
         # What PyYAML lets out for a value that is none of its own tag
         raise error(
-            f'{where}: broken YAML: a value is not what it is tagged as, or has too many '
-            f'digits ({cause})'
+            f'{where}: broken YAML: a value does not match its tag, or has too many digits '
+            f'({cause})'
         ) from cause

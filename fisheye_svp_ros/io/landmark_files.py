@@ -20,7 +20,7 @@ def environment(spread: str, radius: float) -> Landmarks:
     """
     if spread not in SPREADS:
         names = ', '.join(SPREADS)
-        raise ObservationError(f'environment {spread!r} is unknown; known are {names}')
+        raise ObservationError(f'environment {spread!r} is unknown; choose from {names}')
     if not (np.isfinite(radius) and radius > 0):
         raise ObservationError(f'environment radius is {radius} m; it must be above 0')
     # Incidence angle and azimuth around -z, degrees

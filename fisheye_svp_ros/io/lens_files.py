@@ -268,7 +268,7 @@ def _curve(
     values = dict(section)
     name = values.pop('model', None)
     if not isinstance(name, str) or name not in registry:
-        raise LensError(f'{where}.model is {name!r}; known are {", ".join(registry)}')
+        raise LensError(f'{where}.model is {name!r}; choose from {", ".join(registry)}')
     kind = registry[name]
     numbered = _three_numbers(values.pop(listed, []), f'{where}.{listed}')
     names = kind.coefficient_names
@@ -359,5 +359,5 @@ def _refuse_unknown(
     unknown = sorted(set(map(str, mapping)) - known - unsaid)
     if unknown:
         raise LensError(
-            f'{where}: unknown field {unknown[0]!r}; known are ' + ', '.join(sorted(known))
+            f'{where}: unknown field {unknown[0]!r}; choose from ' + ', '.join(sorted(known))
         )

@@ -28,6 +28,8 @@ _TRUE_STRINGS = {'Y', 'y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'O
 _FALSE_STRINGS = {'N', 'n', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF'}
 _PATTERN = re.compile(r'(/(\*\*?|\w+))+')
 _INTEGER = re.compile(r'[+-]?(0[xX][0-9a-fA-F]+|[0-9]+)')
+# By type, what a message says is needed.
+_NEEDED = {float: 'a number', int: 'a whole number', bool: 'true or false', str: 'text'}
 _NOT_FINITE = re.compile(r'([+-]?)\.(inf|Inf|INF|nan|NaN|NAN)')
 
 
@@ -74,7 +76,7 @@ class Row(NamedTuple):
         if kind is float and type(value) is int:
             value = float(value)
         if type(value) is not kind:
-            raise ParameterError(f'{self.name} is {value!r}; {kind.__name__} is needed')
+            raise ParameterError(f'{self.name} is {value!r}; {_NEEDED[kind]} is needed')
         if kind is float and not math.isfinite(value):
             raise ParameterError(f'{self.name} is {value}; a finite number is needed')
         outside = self.low is not None and not self.low <= value <= (self.high or 0)
@@ -167,7 +169,7 @@ def sweep_of(table: Any, parameters: Mapping[str, Any], excluded: Collection[str
         row = points.get(name.removeprefix(SWEEP))
         if row is None:
             raise ParameterError(
-                f'{name}: no such parameter to sweep; known are ' + ', '.join(points)
+                f'{name}: no such parameter to sweep; choose from ' + ', '.join(points)
             )
         if values is None:  # as a parameter file has an empty list
             values = []

@@ -69,7 +69,7 @@ def check_numbers(values: Any, name: str, needed: str) -> Array:
             return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
         pass
-    raise ParameterError(f'{name} is no array of numbers; {needed} is needed')
+    raise ParameterError(f'{name} is not an array of numbers; {needed} is needed')
 
 
 def check_whole_numbers(values: Any, name: str) -> Index:
@@ -98,7 +98,7 @@ def check_pair(values: Any, name: str, needed: str) -> tuple[float, float]:
 
 def check_room(room: Any) -> tuple[float, float]:
     """Return two distances, m; raise ParameterError where they are none."""
-    near, far = check_pair(room, 'room', '(nearest, furthest) in m')
+    near, far = check_pair(room, 'room', '(nearest, farthest) in m')
     if not 0 < near < far < np.inf:
         raise ParameterError(
             f'room is {room!r}; two distances above 0, m, are needed, the nearer first'

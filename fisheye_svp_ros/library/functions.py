@@ -580,7 +580,7 @@ def _check_names(node: str, values: Mapping[str, Any]) -> None:
     for name in (given.removeprefix(SWEEP) for given in values):
         if name not in known:
             raise ParameterError(
-                f'{name!r} is not a parameter of {node}; known are {", ".join(known)}'
+                f'{name!r} is not a parameter of {node}; choose from {", ".join(known)}'
             )
 
 

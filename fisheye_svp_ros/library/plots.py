@@ -76,7 +76,7 @@ def plot_budget(budget: Budgeted, quantity: str = 'position') -> Figure:
     check_type(budget, Budgeted, 'budget', 'the result of fsvp.budget')
     if quantity not in budget.error:
         raise ParameterError(
-            f'{quantity!r} is no quantity of a budget; known are {", ".join(budget.error)}'
+            f'{quantity!r} is not a quantity of a budget; choose from {", ".join(budget.error)}'
         )
     unit, factor = DISPLAY_UNITS[UNITS[quantity]]
     figure = Figure(figsize=(8, 5), layout='constrained')

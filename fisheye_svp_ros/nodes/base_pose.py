@@ -198,9 +198,9 @@ class BasePose:
         if not (abs(up) < _ON_SIDE and optical[2, 2] > _UPRIGHT):
             return ''
         return (
-            f'base_pose: {self._base!r} lies {np.degrees(np.arccos(up)):.0f} deg on its side, as '
-            f'where frame_id {one.camera!r} is not optical; name the optical frame (REP 103: x '
-            'right, y down, z ahead)'
+            f'base_pose: {self._base!r} lies {np.degrees(np.arccos(up)):.0f} deg on its side, '
+            f'as if frame_id {one.camera!r} were not optical. Name the optical frame (REP 103: '
+            'x right, y down, z ahead)'
         )
 
     def _drop_expired(self, now: float) -> None:

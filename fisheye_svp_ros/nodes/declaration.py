@@ -74,7 +74,7 @@ def unknown_parameters(node: Any, given: Mapping[str, Any], known: Sequence[str]
         if meant:
             yield f'parameter {name!r} is unknown to this node; did you mean {meant[0]!r}?'
         elif name not in for_all:
-            yield f'parameter {name!r} is unknown to this node; known are {", ".join(known)}'
+            yield f'parameter {name!r} is unknown to this node; choose from {", ".join(known)}'
 
 
 def _names_for_all(arguments: Sequence[str]) -> set[str]:
@@ -132,6 +132,6 @@ def check_access(name: str, folder: str, what: str) -> str:
         )
     if not 0 <= size <= MAX_FILE_BYTES:
         raise ParameterError(
-            f'{what}: {name[:100]!r} is no file, or above {MAX_FILE_BYTES >> 20} MB'
+            f'{what}: {name[:100]!r} is not a file, or above {MAX_FILE_BYTES >> 20} MB'
         )
     return name

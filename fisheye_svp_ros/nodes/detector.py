@@ -55,46 +55,46 @@ class DetectorSettings(Settings):
 
     board: str = parameter(
         'chessboard:9x6:25mm',
-        'The board: chessboard:COLUMNSxROWS:SIZE (inner corners), '
-        'charuco:..., aprilgrid:FILE, circles:..., squares:..., as for `fisheye-svp detect`; '
-        'tags:FILE: loose tags of a tag map, whose corners are the landmarks',
+        'The board, as for `fisheye-svp detect`: chessboard:COLUMNSxROWS:SIZE (inner corners), '
+        'charuco:..., aprilgrid:FILE, circles:..., squares:... tags:FILE: loose tags of a tag '
+        'map, whose corners are the landmarks',
     )
     board_frame: str = parameter('board', 'Frame id of the landmarks', frame=True)
     longest_search: float = parameter(
         1.0,
-        'Longest search in one image; after it, the image counts as without board',
+        'Longest search in one image. After that, the image counts as one without a board',
         's',
         (0.05, 60.0),
     )
     detections: bool = parameter(
         False,
-        'Use AprilTags found by another node in raw (not rectified) images, from the topic '
-        '`detections`, in place of images; needs apriltag_msgs',
+        'Instead of images, use AprilTags that another node found in raw (not rectified) '
+        'images, from the topic `detections`. Needs apriltag_msgs',
         fixed=True,
     )
     guide: str = parameter(
         '',
-        'Parameter of the lens that the live guide determines (e0: the viewpoint shift); '
-        'empty: no guide',
+        'Parameter of the lens that the live guide determines (e0: the viewpoint shift). '
+        'Empty: no guide',
         choices=('', *_GUIDE_PARAMETERS),
         fixed=True,
     )
     goal: float = parameter(
         0.0002,
-        'Standard error at which that parameter is determined, m for e0, px for fx, fy, cx and cy',
+        'Standard error at which the guide stops, m for e0, px for fx, fy, cx, and cy',
         span=(1e-9, 1e3),
         fixed=True,
     )
     lens: str = parameter(
         '',
-        'Initial lens of the guide: a file, or a name in config/lenses; `camera_info`: from '
-        'that topic; empty: one with the parameter `field_of_view`',
+        'Initial lens of the guide: a file, or a name in config/lenses. `camera_info`: from '
+        'that topic. Empty: a lens with the parameter `field_of_view`',
         fixed=True,
         file=True,
     )
     field_of_view: float = parameter(
         3.1,
-        'Field of view over the width of the image, from the data sheet',
+        'Horizontal field of view, from the data sheet',
         'rad',
         (0.3, 6.0),
         fixed=True,
@@ -103,11 +103,11 @@ class DetectorSettings(Settings):
         0.15, 'Nearest distance at which the board is sharp', 'm', (1e-3, 1e3), fixed=True
     )
     far: float = parameter(
-        0.8, 'Furthest distance at which the board can be held', 'm', (1e-3, 1e3), fixed=True
+        0.8, 'Farthest distance at which the board can be held', 'm', (1e-3, 1e3), fixed=True
     )
     guide_output: str = parameter(
         'guided',
-        'Folder for the photographs that the guide takes and observations.csv; it must be empty',
+        'Folder for observations.csv and the photographs that the guide takes. It must be empty',
         fixed=True,
     )
 

@@ -49,9 +49,9 @@ def ros_needed(reason: str) -> str:
     """Return how to get what nodes need; reason: why it cannot be imported."""
     version = '.'.join(map(str, sys.version_info[:2]))
     return (
-        f'nodes need ROS 2, which Python {version} does not have ({reason}); source ROS 2 Jazzy '
-        '(Ubuntu 24.04: apt install ros-jazzy-ros-base) or, on x86-64 Linux with Python 3.11 to '
-        '3.14, install the extra `ros` of this package'
+        f'nodes need ROS 2, which Python {version} does not have ({reason}). Source ROS 2 Jazzy '
+        '(Ubuntu 24.04: apt install ros-jazzy-ros-base). On x86-64 Linux with Python 3.11 to '
+        '3.14, you can instead install the extra `ros` of this package'
     )
 
 

@@ -299,9 +299,9 @@ class LatchedLandmarks:
         self._misses += 1
         if self._is_series:
             raise ObservationError(
-                f'no landmarks of its stamp, the nearest is {1e-6 * (distance or 0):.1f} ms off: '
-                'they were late, lost, or never sent; publish landmarks that hold for all sets '
-                'with stamp 0'
+                f'no landmarks of its stamp, the nearest is {1e-6 * (distance or 0):.1f} ms '
+                'off: they were late, lost, or never sent. Publish landmarks that hold for all '
+                'sets with stamp 0'
             )
         if self._latest is None:
             raise ObservationError('no landmarks; publish them on `landmarks`')

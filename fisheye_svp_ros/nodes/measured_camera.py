@@ -33,11 +33,11 @@ class MeasuredCameraSettings(CameraSettings):
         '', 'Observations: a CSV file, a folder of ORPC files, a recording', file=True
     )
     true_poses: str = parameter(
-        '', 'Poses CSV with the true pose of each frame; empty: unknown', file=True
+        '', 'Poses CSV with the true pose of each frame. Empty: unknown', file=True
     )
     lens: str = parameter(
         '',
-        'Lens for `camera_info` and `scenario`: a file, or a name in config/lenses; empty: '
+        'Lens for `camera_info` and `scenario`: a file, or a name in config/lenses. Empty: '
         'unknown',
         file=True,
     )

@@ -52,13 +52,13 @@ class ModelCriticSettings(RigSettings):
     """Parameters of the model critic."""
 
     sigma_px: float = parameter(
-        0.0, 'Standard deviation of an image point; 0: estimate it', 'px', (0.0, 1e3)
+        0.0, 'Standard deviation of an image point. 0: estimate it', 'px', (0.0, 1e3)
     )
     stereo: bool = parameter(
         False, 'Diagnose the cameras left and right of a rig together', fixed=True
     )
     free_intrinsics: bool = parameter(
-        False, 'Fit the intrinsics too; always done for a lens from `calibrate`'
+        False, 'Fit the intrinsics, too. Those of a lens from `calibrate` are always fitted'
     )
     min_frames: int = parameter(
         20, 'Number of frames before the first diagnosis', span=(5, 100_000)
@@ -67,7 +67,7 @@ class ModelCriticSettings(RigSettings):
         20, 'Number of further frames before the next one', span=(1, 100_000)
     )
     max_frames: int = parameter(
-        100, 'Largest number of frames to diagnose: the latest', span=(5, 100_000)
+        100, 'Largest number of frames to diagnose; the latest are used', span=(5, 100_000)
     )
     output: str = parameter(
         'extended_lens.yaml',

@@ -46,8 +46,8 @@ class RectifierSettings(Settings):
 
     lens: str = parameter(
         CAMERA_INFO,
-        'Lens: a file, or a name in config/lenses; for a rig, a file or folder with '
-        'both; `camera_info`: from that topic beside the images',
+        'Lens: a file, or a name in config/lenses. For a rig: a file or folder with both. '
+        '`camera_info`: from that topic next to the images',
         file=True,
     )
     stereo: bool = parameter(
@@ -55,23 +55,23 @@ class RectifierSettings(Settings):
     )
     rig: str = parameter(
         '',
-        'Rig of the stereo pair: `rig.yaml` or its folder, a file of Kalibr, Basalt, OpenCV, '
-        'or a URDF; empty: that of the lenses',
+        'Rig of the stereo pair: `rig.yaml` or its folder, a file of Kalibr, Basalt, or '
+        'OpenCV, or a URDF. Empty: that of the lenses',
         file=True,
     )
     field_of_view: float = parameter(
-        1.5708, 'Field of view of the rectified images over their width', 'rad', (0.01, 3.05)
+        1.5708, 'Horizontal field of view of the rectified images', 'rad', (0.01, 3.05)
     )
     width: int = parameter(
-        0, 'Width of the rectified images; 0: that of the images', 'px', (0, 8192)
+        0, 'Width of the rectified images. 0: that of the images', 'px', (0, 8192)
     )
     height: int = parameter(
-        0, 'Height of the rectified images; 0: that of the images', 'px', (0, 8192)
+        0, 'Height of the rectified images. 0: that of the images', 'px', (0, 8192)
     )
     range: float = parameter(
         RANGE,
-        'Range at which images of a lens with a moving viewpoint are exact; for a pair, '
-        'from the middle of the baseline',
+        'Range at which images of a lens with a moving viewpoint are exact. For a pair, it is '
+        'measured from the middle of the baseline',
         'm',
         (0.01, 1e6),
     )

@@ -43,8 +43,8 @@ class PhotographingSettings(SyntheticCameraSettings):
 
     photograph: str = parameter(
         '',
-        'Board, chessboard:COLUMNSxROWS:SIZE: publish rendered images of it on `image`, in '
-        'place of landmarks and image points. Its first inner corner is the origin of the '
+        'Board, chessboard:COLUMNSxROWS:SIZE: publish rendered images of it on `image`, '
+        'instead of landmarks and image points. Its first inner corner is the origin of the '
         'world, x right, y down, z away from the camera',
         fixed=True,
     )

@@ -156,7 +156,7 @@ class ImageField:
         where = f'{where}: corrections.image_field'
         if unknown := sorted(set(map(str, entry)) - set(_FIELDS)):
             raise LensError(
-                f'{where}: unknown field {unknown[0]!r}; known are ' + ', '.join(_FIELDS)
+                f'{where}: unknown field {unknown[0]!r}; choose from ' + ', '.join(_FIELDS)
             )
         arrays = {
             name: _number_array(entry, name, where)

@@ -233,7 +233,7 @@ class Design:
         if matches:
             return np.array(matches)
         raise ParameterError(
-            f'{name!r} is not a parameter of this lens and its causes; known are '
+            f'{name!r} is not a parameter of this lens and its causes; choose from '
             + ', '.join(self.names)
         )
 

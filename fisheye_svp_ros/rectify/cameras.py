@@ -174,7 +174,7 @@ def _widest_field(projection: str, along_baseline: bool) -> float:
     if projection not in widest:
         reason = 'has no straight epipolar rows' if projection in _WIDEST else 'is unknown'
         raise ParameterError(
-            f'projection {projection!r} {reason}; take one of ' + ', '.join(widest)
+            f'projection {projection!r} {reason}; choose from ' + ', '.join(widest)
         )
     return widest[projection]
 

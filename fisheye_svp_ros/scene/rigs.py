@@ -18,7 +18,7 @@ def rig(style: str, baseline: float = BASELINE) -> Pose:
     Raises ParameterError for an unknown style or an impossible baseline.
     """
     if style not in STYLES:
-        raise ParameterError(f'style {style!r} is unknown; known are {", ".join(STYLES)}')
+        raise ParameterError(f'style {style!r} is unknown; choose from {", ".join(STYLES)}')
     if not (np.isfinite(baseline) and baseline > 0):
         raise ParameterError(f'baseline is {baseline} m; it must be above 0')
     return rig_from_angle(STYLES[style], baseline)

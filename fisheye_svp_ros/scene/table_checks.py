@@ -112,9 +112,10 @@ def check_rigid(observations: Observations) -> None:
     rigidity = _rigidity(observations)
     if rigidity is not None and rigidity < _MIN_RIGIDITY:
         raise ObservationError(
-            f'{observations.source}: landmarks that are close in one frame are not in others '
-            f'(correlation {rigidity:.2f}; of any rigid target at least {_MIN_RIGIDITY:g}); check '
-            'that image points and landmark numbers belong together, in every frame'
+            f'{observations.source}: landmarks that are close in one frame are not close in '
+            f'others (correlation {rigidity:.2f}; of any rigid target at least '
+            f'{_MIN_RIGIDITY:g}). Check that image points and landmark numbers belong together '
+            'in every frame'
         )
 
 

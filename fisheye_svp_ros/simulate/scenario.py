@@ -53,7 +53,7 @@ class Scenario:
 
     lens: str = parameter('fish214', 'Lens: a file, or a name in config/lenses', file=True)
     shift_scale: float = parameter(
-        1.0, 'Factor on the viewpoint shift of the lens; 0: an SVP lens', span=(0.0, 100.0)
+        1.0, 'Factor on the viewpoint shift of the lens. 0: an SVP lens', span=(0.0, 100.0)
     )
     environment: str = parameter(
         'whole', 'Landmarks: whole, inner or outer, or a CSV with landmark, x, y, z', file=True
@@ -68,7 +68,10 @@ class Scenario:
     )
     baseline: float = parameter(BASELINE, 'Distance between the two cameras', 'm', (1e-6, 1e3))
     vergence: float = parameter(
-        0.0, 'Further inward turn of the left camera, beyond that of the style', 'rad', (-1.6, 1.6)
+        0.0,
+        'Additional inward turn of the left camera, beyond that of the style',
+        'rad',
+        (-1.6, 1.6),
     )
     poses: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
@@ -78,12 +81,12 @@ class Scenario:
     )
     poses_file: str = parameter(
         '',
-        'Poses CSV in place of `poses`, or `calibration`: ten poses to calibrate a rig from',
+        'Poses CSV instead of `poses`. `calibration`: ten poses to calibrate a rig from',
         file=True,
     )
     trajectory_steps: int = parameter(
         0,
-        '0: jump from pose to pose; n: move smoothly from each pose to the next in n steps',
+        '0: jump from pose to pose. n: move smoothly from each pose to the next in n steps',
         span=(0, 1_000_000),
     )
     noise_px: float = parameter(
@@ -92,9 +95,8 @@ class Scenario:
     seed: int = parameter(0, 'Seed of the noise', span=(0, 2**31 - 1))
     rig_file: str = parameter(
         '',
-        'Cameras in place of `lens` and `style`: a folder or file with their lenses and '
-        'relative poses, as `calibrate` writes it; `poses` are those of the first '
-        'camera',
+        'Cameras instead of `lens` and `style`: a folder or file with their lenses and '
+        'relative poses, as `calibrate` writes it. `poses` are those of the first camera',
         file=True,
     )
 

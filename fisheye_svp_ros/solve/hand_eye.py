@@ -281,14 +281,15 @@ def _check_noise(noise: Array, camera: Pose, odds: float) -> None:
     distance = float(np.median(np.linalg.norm(camera.position, axis=1)))
     if noise[0] > _MAX_SHARE * distance or noise[1] > _MAX_TURN:
         raise GeometryError(
-            'no hand-eye transform explains the poses of the robot, with camera or target on the '
-            f'flange: {1000 * noise[0]:.0f} mm and {np.degrees(noise[1]):.1f} degrees are left; '
-            'check that frames, units and the order of the quaternion (x, y, z, w) belong together'
+            'no hand-eye transform explains the poses of the robot, with camera or target on '
+            f'the flange: {1000 * noise[0]:.0f} mm and {np.degrees(noise[1]):.1f} degrees are '
+            'left. Check the frame numbers, the units, and the order of the quaternion (x, y, '
+            'z, w)'
         )
     if odds < _MIN_ODDS:
         raise GeometryError(
-            'the poses of the robot do not show whether camera or target is on the flange (odds '
-            f'{odds:.2g} to 1); turn the flange farther, and take more poses'
+            f'it is unclear whether the camera or the target is on the flange (odds {odds:.2g} '
+            'to 1); turn the flange farther, and take more poses'
         )
 
 

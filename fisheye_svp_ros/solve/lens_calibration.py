@@ -258,7 +258,7 @@ def _incidence_angles(adjusted: AdjustedLens, views: Views) -> Array:
 def start_lens(model: str, image_size: tuple[int, int], free: Sequence[str], name: str) -> Lens:
     """Return the lens that a fit begins with: neutral, its center in the middle of the image."""
     if model not in IMAGE_HEIGHTS:
-        raise LensError(f'model {model!r} is unknown; known are {", ".join(IMAGE_HEIGHTS)}')
+        raise LensError(f'model {model!r} is unknown; choose from {", ".join(IMAGE_HEIGHTS)}')
     width, height = image_size
     if min(width, height) < 1:
         raise LensError(f'image size is {width}x{height}; both must be above 0')
@@ -397,9 +397,10 @@ def _check_focal(adjusted: AdjustedLens, source: str) -> None:
             if not relative < FOCAL_UNCERTAINTY:
                 raise GeometryError(
                     f'{source}: {name} is known only to {100 * relative:.0f} %, rms '
-                    f'{rms_px(adjusted.residual):.3g} px; add views in which the target is tilted '
-                    'and covers the image; check that image points and landmarks belong together '
-                    '(order, units, axes: u to the right, v down, x, y, z right-handed)'
+                    f'{rms_px(adjusted.residual):.3g} px. Add views in which the target is '
+                    'tilted and covers the image. Check that image points and landmarks belong '
+                    'together: order, units, axes (u to the right, v down, x, y, z '
+                    'right-handed)'
                 )
 
 

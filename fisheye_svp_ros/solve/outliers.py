@@ -24,7 +24,8 @@ SWAPPED_POINT = 'at the predicted place of another landmark'
 FAR_POINT = 'far from its prediction'
 VIEW = 'all points of the view are off: check their order'
 FRAME = (
-    'its cameras contradict each other: check the order of points, the moment, and left and right'
+    'its cameras contradict each other: check the order of the points, the time, and left and '
+    'right'
 )
 _VIEW_RATIO, _MIN_VIEW_PX = 15.0, 3.0  # times the median view, px: it belongs elsewhere
 _FRAME_RATIO = 6.0  # times the median frame: cameras that contradict each other

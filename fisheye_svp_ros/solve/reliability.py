@@ -227,9 +227,9 @@ def doubt_of_pairs(
 def misfit_reason(excess: float, freedom: int) -> str:
     """Say in words that the misfit is too large: excess over its expectation, as a variance."""
     return (
-        f'the residuals are {np.sqrt(excess):.3g} times what sigma allows ({freedom} degrees of '
-        'freedom) and no single points explain it: check lens, image size, landmarks and their '
-        'unit'
+        f'the residuals are {np.sqrt(excess):.3g} times what sigma allows ({freedom} '
+        'degrees of freedom), and no single points explain it. Check the lens, the image size, '
+        'and the landmarks with their unit'
     )
 
 
@@ -361,8 +361,8 @@ def _tags_reason(choices: TagChoices, residual: Array) -> str:
     if len(rejected) > 1:
         names = ' or '.join(' and '.join(map(str, tags)) for tags in rejected[:_MAX_NAMES])
         return (
-            f'tags contradict each other: without tag {names} the others agree; the covariance '
-            'covers each choice; check the tag map'
+            f'tags contradict each other: without tag {names}, the others agree. The covariance '
+            'covers each choice. Check the tag map'
         )
     size = np.nan_to_num(np.linalg.norm(residual, axis=-1), nan=np.inf)
     largest = [size[choices.views.board[0] == tag].max() for tag in rejected[0]]

@@ -90,8 +90,8 @@ def place_boards(
     except GeometryError as cause:
         raise ObservationError(
             f'{rows.source}: no relative pose of {" and ".join(rows.cameras)} explains most '
-            'frames; give simultaneous photographs the same frame number, others different ones, '
-            'and number points from the same end; if the cameras see boards of their own, '
+            'frames. Give simultaneous photographs the same frame number and others different '
+            'ones. Number points from the same end. If the cameras see boards of their own, '
             f'{cause}'
         ) from cause
     return PlacedBoards(placed, data, state, boards, poses)

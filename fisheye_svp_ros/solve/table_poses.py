@@ -238,8 +238,8 @@ class _RigChecks:
         if is_unrelated(self._data, self._state):
             raise GeometryError(
                 f'{self._source}: no pose of the rig explains what its cameras see at the same '
-                'time: they see boards of their own, or the rig is of other cameras; localize '
-                'each camera by itself, or calibrate the rig again'
+                'time. They see different boards, or the rig belongs to other cameras. '
+                'Localize each camera separately, or calibrate the rig again'
             )
         self._data, found = find_outliers(self._data, self._state)
         return found._replace(rows=self._rows[found.rows])

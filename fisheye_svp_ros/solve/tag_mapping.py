@@ -82,7 +82,9 @@ def map_tags(
     """
     inside = back_project_corrected(model.lens, uv).valid.all(axis=1)
     if not inside.any():
-        raise GeometryError('no tag lies in the field of view of the lens; is it of this camera?')
+        raise GeometryError(
+            'no tag is in the field of view of the lens; does the lens belong to this camera?'
+        )
     image, ids, uv = image[inside], ids[inside], uv[inside]
     known, slot = np.unique(ids, return_inverse=True)
     numbers, row = np.unique(image, return_inverse=True)

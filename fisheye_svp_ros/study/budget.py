@@ -125,8 +125,8 @@ def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
     lens = setup.lens
     if lens.is_svp:
         raise LensError(
-            f'lens {lens.name!r} has no viewpoint_shift, so nothing is known of the error '
-            'that SVP makes; `fisheye-svp diagnose` measures it: give its extended_lens.yaml'
+            f'lens {lens.name!r} has no viewpoint_shift, so its SVP error is unknown. '
+            '`fisheye-svp diagnose` measures the shift: give its extended_lens.yaml'
         )
     check_noise(setup.noise)
     baseline = float(np.linalg.norm(setup.rig.position))

@@ -15,9 +15,9 @@ from fisheye_svp_ros.errors import ParameterError
 LINES = {
     'calibrate a.csv --board chessboard:3x3:1mm': '--board has no effect on a CSV file',
     'localize a.CSV --lens l.yaml --board chessboard:3x3:1mm': '--board has no effect on a CSV',
-    'calibrate a.csv --every 2': '--every has an effect on photographs alone',
-    'localize a.csv --lens l.yaml --sync 1ms': '--sync has an effect on photographs alone',
-    'diagnose a.csv --lens l.yaml --split 2': '--split has an effect on photographs alone',
+    'calibrate a.csv --every 2': '--every has an effect only on photographs',
+    'localize a.csv --lens l.yaml --sync 1ms': '--sync has an effect only on photographs',
+    'diagnose a.csv --lens l.yaml --split 2': '--split has an effect only on photographs',
     'diagnose bag.mcap --lens l.yaml --detector sb': '--detector has an effect',
     'calibrate a.csv --lens air.yaml': '--lens needs --medium',
     'calibrate a.csv --lens air.yaml --medium water --model equisolid': '--model has no effect',
@@ -27,12 +27,12 @@ LINES = {
     'lens l.yaml --format ros': '--format needs -o FILE',
     'lens l.yaml --range 1': '--range needs --format',
     'localize a.csv --lens l.yaml --rig r.yaml --model-error': '--model-error works for one',
-    'render --lens l --board chessboard:9x6:1mm -o r --poses p.csv --count 3': '--count is of',
-    'render --lens l --board chessboard:9x6:1mm -o r --target room --ranges 1 2': '--ranges is of',
+    'render --lens l --board chessboard:9x6:1mm -o r --poses p.csv --count 3': '--count is for',
+    'render --lens l --board chessboard:9x6:1mm -o r --target room --ranges 1 2': '--ranges is',
     'localize a.csv --lens l.yaml --tag-map t.yaml': '--tag-map belongs to photographs of loose',
     'undistort l.yaml -o u --as cubemap --rig r.yaml': '--rig has no effect on views',
     'undistort l.yaml -o u --as perspective:9,0,60 --fov 60': '--fov has no effect on --as persp',
-    'undistort l.yaml -o u --split 2': '--split has an effect on photographs alone',
+    'undistort l.yaml -o u --split 2': '--split has an effect only on photographs',
 }
 APPLIED = (
     'calibrate photographs --board chessboard:3x3:1mm --every 2 --sync 1ms --split 2',
@@ -78,5 +78,5 @@ def test_each_rule_is_of_options_that_are_there_and_tried() -> None:
 def test_before_anything_is_read(capsys: pytest.CaptureFixture[str]) -> None:
     said = refused(capsys, 'calibrate', 'none.csv', '--image-size', '640x480', '--every', '3')
     assert said == (
-        'fisheye-svp: --every has an effect on photographs alone, with --board; leave it out'
+        'fisheye-svp: --every has an effect only on photographs, with --board; leave it out'
     )

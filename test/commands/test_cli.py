@@ -356,7 +356,7 @@ class TestCalibrate:
         shown, err = capsys.readouterr()
         assert f'{len(table)} points in 6 frames' in shown
         assert err == ''
-        assert '; standard errors allow for local errors of target, frames and image' in shown
+        assert '; standard errors include local errors of target, frames, and image' in shown
         assert 'std. error   unit' in shown  # no column of ranges where all are settled
         lens = load_lens(out)
         assert lens.name == 'mine'
@@ -447,7 +447,7 @@ class TestCalibrate:
             )
             said[path.stem] = capsys.readouterr()
         assert said['observations'].err == ''
-        assert 'photograph the target near the edges' in said['middle'].err
+        assert 'Photograph the target near the edges' in said['middle'].err
         reached = json.loads(out.with_suffix('.calibrate.json').read_text())['reached_deg']
         assert reached == pytest.approx(np.degrees(250 / 700), abs=0.6)
         assert f'the curve is extrapolated beyond {reached:.0f} deg' in said['middle'].err
@@ -489,7 +489,7 @@ class TestCalibrate:
             )
             == 0
         )
-        assert 'the principal point lies -30' in capsys.readouterr().err  # 650 - 959.5
+        assert 'the principal point is -30' in capsys.readouterr().err  # 650 - 959.5
 
     def test_prints_without_writing(self, scene, capsys, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)

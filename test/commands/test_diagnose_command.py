@@ -307,7 +307,7 @@ class TestTerminal:
     def test_nothing_wrong(self, scene, capsys):
         assert run('clean.csv', scene) == 0
         out = ' '.join(capsys.readouterr().out.split())
-        assert out.startswith('Keep the lens. Wrong: No model error shows in these data. ')
+        assert out.startswith('Keep the lens. Wrong: No model error is visible in these data. ')
         assert 'Not excluded: viewpoint_shift up to' in out and 'px' in out
 
     def test_intrinsics_of_another_day_are_told(self, scene, capsys, tmp_path):
@@ -435,8 +435,11 @@ class TestWords:
         gain = found.figures.gain._replace(value=-1.0, low=-1.0)
         refuted = with_changes(found, extended=worse, gain=gain)
         _, gained, _ = verdict_sentences(refuted)
-        assert 'this removes' not in gained and '-100 %' not in gained
-        assert f'do not transfer to it: with them {worse.heldout_rms_px:.3g} px' in gained
+        assert 'correction removes' not in gained and '-100 %' not in gained
+        assert (
+            f'do not transfer to it: with them, the error is {worse.heldout_rms_px:.3g} px'
+            in gained
+        )
 
     def test_a_class_is_named_with_what_would_separate_it(self, found):
         cause = replace(
@@ -458,7 +461,7 @@ class TestWords:
         )
         assert 'depend on the distance of the landmark and the incidence angle' in wrong
         assert 'a few points are outliers' in wrong
-        assert 'no extension improved on it' in gained
+        assert 'no extension improves on that' in gained
         assert 'look for the cause' in following
         *_, following = verdict_sentences(
             with_changes(
@@ -483,7 +486,10 @@ class TestWords:
         wrong, _, _ = verdict_sentences(
             with_changes(found, causes=[], advice=[], remaining=left, trace=[step])
         )
-        assert '; viewpoint_shift is significant (p = 3e-06), but does not improve' in wrong
+        assert (
+            '. viewpoint_shift is significant (p = 3e-06), but it does not significantly improve'
+            in wrong
+        )
 
     def test_what_remains_is_told_in_numbers(self, found):
         gross = [{'frame': 4, 'landmark': 17, 'px': 12.3456, 'why': 'far off'}] * 2
@@ -494,8 +500,8 @@ class TestWords:
                 found, causes=[], advice=[], remaining=left, gross=gross, extended=extended
             )
         )
-        assert '2 points are outliers, the largest frame 4 landmark 17 (12.3 px)' in wrong
-        assert 'the residuals are 3 times as large as sigma states' in wrong
+        assert '2 points are outliers; the largest is frame 4 landmark 17 (12.3 px)' in wrong
+        assert 'the residuals are 3 times as large as sigma' in wrong
 
     def test_the_headline_names_a_cause_in_lens_and_target(self, found):
         """Of several parameters the most significant one, whatever their order."""

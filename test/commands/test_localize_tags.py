@@ -133,7 +133,7 @@ def test_the_size_that_a_layout_does_not_state_is_told(
 @pytest.mark.parametrize(
     ('options', 'said'),
     [
-        (['--board', 'tags:36h11'], 'loose tags hang where a map says; add its file'),
+        (['--board', 'tags:36h11'], 'loose tags need a map; add its file'),
         (['--board', 'chessboard:9x6:24mm', '--tag-map', 'x.yaml'], 'add --board tags:36h11'),
         (['--tag-map', 'x.yaml'], 'belongs to photographs of loose tags'),
         (

@@ -161,7 +161,7 @@ def test_a_rig(folder: Path, tmp_path: Path, way: str, capsys: pytest.CaptureFix
     )
     run(*given, folder / 'photos', '-o', tmp_path, '--range', 0.2)
     out = capsys.readouterr().out
-    assert 'baseline 60.21 mm; difference between the rows of left and right' in out
+    assert 'baseline 60.21 mm; row difference between left and right' in out
     assert f'{tmp_path}: 4 photographs, maps for cv2.remap' in out
     pair = fsvp.rectify_maps(LENS, RIGHT, RIG, range_m=0.2)
     for name, side in (('left', pair.left), ('right', pair.right)):
@@ -196,7 +196,7 @@ def lenses_by_name(folder: Path, *names: str) -> list[str]:
     [
         (
             ('left', 'right'),
-            'note: left and right are not rectified as a pair, since no rig is named; '
+            'note: left and right are not rectified as a pair, because no rig is named; '
             'add --rig FILE\n',
         ),
         (

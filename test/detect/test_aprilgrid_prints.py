@@ -84,7 +84,7 @@ def test_one_tag_takes_the_layout_of_the_other_photographs(tmp_path: Path) -> No
     )
     hidden[low[1] : high[1], low[0] : high[0]] = image[low[1] : high[1], low[0] : high[0]]
     alone = find_points(hidden, pattern_of(Grid(), tmp_path), 'aprilgrid')
-    assert alone == 'no board found: a single tag does not tell how the grid is printed'
+    assert alone == 'no board found: a single tag does not show how the grid is printed'
     for number, one in enumerate([hidden, *images]):
         cv2.imwrite(str(tmp_path / f'{number}.png'), one)
     detection = search(tmp_path, Grid())

@@ -145,7 +145,7 @@ class TestPatterns:
         [
             (
                 'charuco:7x5:30mm:22mm:DICT_9X9_1',
-                'no dictionary DICT_9X9_1; known are DICT_4X4_50, ',
+                'no dictionary DICT_9X9_1; choose from DICT_4X4_50, ',
             ),
             (
                 'charuco:20x20:30mm:22mm:dict_5x5_100',

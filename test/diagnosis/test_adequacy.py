@@ -179,7 +179,7 @@ def test_a_lens_known_in_part_is_told_by_every_command(tmp_path, capsys):
     wide = replace(lens, image_height=type(lens.image_height)(), max_incidence=np.radians(95))
     save_lens(wide, tmp_path / 'lens.yaml')
     load_with_notes(tmp_path / 'lens.yaml')
-    assert 'reach 12 deg of 95 deg; nothing is known beyond' in capsys.readouterr().err
+    assert 'reach 12 deg of 95 deg; beyond, the lens is extrapolated' in capsys.readouterr().err
 
 
 def test_calibrate_does_not_pass_over_what_no_lens_explains(tmp_path, capsys):

@@ -96,7 +96,7 @@ def test_what_photographs_in_air_left_open_of_the_lens_is_found_under_water():
     assert heights[0] == pytest.approx(heights[1], rel=0.01)
     assert found.figures.extended.heldout_rms_px < 0.2
     assert Action.CALIBRATE_AIR in {advice.action for advice in found.advice}
-    assert 'diagnose the photographs in air first' in verdict_sentences(found)[2]
+    assert 'diagnose photographs in air first' in verdict_sentences(found)[2]
 
 
 @pytest.mark.parametrize(

@@ -45,5 +45,5 @@ def test_poses_of_the_camera_are_held() -> None:
 def test_poses_of_no_robot_are_refused() -> None:
     table, _, poses = robot(3)
     shuffled = dict(zip(poses, [poses[(7 * i + 3) % 18] for i in range(18)], strict=True))
-    with pytest.raises(ObservationError, match='nor a flange that carries it'):
+    with pytest.raises(ObservationError, match='nor those of a flange'):
         diagnose(table, LENS, poses=shuffled, options=QUICK)

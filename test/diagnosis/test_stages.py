@@ -180,9 +180,9 @@ def test_one_frame_confirms_nothing_and_is_not_adequate():
         Reason.NO_OTHER_FRAME,
         Reason.REFUTED_BY_FRAMES,
     }
-    assert wrong(found).startswith('Errors show in one frame')
+    assert wrong(found).startswith('There are errors, but one frame')
     screen = first_screen(found, 'table')
-    assert 'points in 1 frame;' in screen.facts
+    assert 'points in 1 frame. ' in screen.facts
     listed = screen.candidates
     assert listed.count('viewpoint_shift (') <= 1
 

@@ -198,14 +198,13 @@ def test_a_calibrated_rig_says_what_it_rests_on(tmp_path, capsys):
     assert calibrated_rig(tmp_path, few_shared(seen, 3)[0]).exists()
     said = capsys.readouterr()
     assert (
-        'rig: only 3 frames are shared, and it is assumed that all cameras saw one target'
-        in said.err
+        'rig: only 3 frames are shared. It is assumed that all cameras saw one target' in said.err
     )
     assert 'mm, from 3 frames, rms 0.' in said.out
     table = seen.table
     turned = replace(table, uv=table.uv + 2 * (np.sin(table.frame) * table.camera)[:, None])
     assert calibrated_rig(tmp_path, turned).exists()
-    assert 'px with a rigid rig, at most ' in capsys.readouterr().err
+    assert 'px with a rigid rig, compared with at most ' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('late', [0.002, 0.0])

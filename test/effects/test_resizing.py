@@ -115,7 +115,9 @@ def test_what_belongs_to_the_pixels_is_lost_and_said(
     assert capsys.readouterr().err == ''
     assert cli.main(['lens', str(tmp_path / 'lens.yaml'), '--scale', '1/2', *out]) == 0
     assert load_lens(tmp_path / 'out.yaml').corrections == {}
-    assert 'left out, since the pixels have another size: detector_bias' in capsys.readouterr().err
+    assert (
+        'left out, because the pixels have another size: detector_bias' in capsys.readouterr().err
+    )
 
 
 def test_errors_of_a_calibration_are_those_of_the_new_pixels() -> None:
@@ -175,9 +177,9 @@ def test_the_command_writes_every_format(
 @pytest.mark.parametrize(
     ('options', 'said'),
     [
-        (['--scale', '1/3'], '848x800 px times 0.333333 is no whole number .*example 283x267'),
-        (['--scale', '0'], "'0' is no factor above 0, such as 1/2"),
-        (['--scale', '1/0'], "'1/0' is no factor above 0"),
+        (['--scale', '1/3'], '848x800 px times 0.333333 is not a whole number .*example 283x267'),
+        (['--scale', '0'], "'0' is not a factor above 0, such as 1/2"),
+        (['--scale', '1/0'], "'1/0' is not a factor above 0"),
         (['--crop', '0,0,900,800'], 'crop 0,0,900,800 is not within the image of 848x800 px'),
         (['--crop', '0,0,0,800'], 'crop 0,0,0,800 is not within'),
         (['--crop', '0,0,800'], "'0,0,800' is not of the form X,Y,WIDTH,HEIGHT"),

@@ -321,7 +321,7 @@ def test_boofcv() -> None:
         (
             '<opencv_storage><K>3</K><D>3</D><width>4</width><height>4.5</height>'
             '</opencv_storage>',
-            'a matrix of 3 x 3',
+            'a 3 x 3 matrix',
         ),
         (CAMCHAIN.replace('[512, 512]', '[512, 512.5]', 1), 'whole numbers are needed'),
         (CAMCHAIN.replace('158.0', '0', 1), 'no valid numbers'),

@@ -85,7 +85,7 @@ def test_the_fisheye_of_rtabmap_has_two_zeros(tmp_path: Path) -> None:
 def test_an_unknown_stated_model_is_refused(tmp_path: Path) -> None:
     path = tmp_path / 'camera.yaml'
     path.write_text(storage('division', FISHEYE))
-    with pytest.raises(LensError, match="distortion model is 'division'; known are equidistant"):
+    with pytest.raises(LensError, match="distortion model is 'division'; choose from equidistant"):
         load_lens(path)
 
 

@@ -503,8 +503,7 @@ def test_the_skew_of_a_camera_matrix_is_kept(
         (OCAM.format(0.0).replace('480 640', ''), 'image size is missing'),
         (
             KALIBR.replace('pinhole', 'omni').replace('[600.1', '[1.0, 600.1'),
-            'omni with equidistant '
-            'is not a form that can be read; those are pinhole with equidistant',
+            'omni with equidistant cannot be read. Readable are pinhole with equidistant',
         ),
         ('{"sfm_data_version": "0.3"}', 'an OpenMVG scene cannot be read; readable are '),
         ('<lensdatabase version="2"></lensdatabase>', 'a lensfun database cannot be read'),

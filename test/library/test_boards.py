@@ -57,7 +57,7 @@ def test_pictures_are_figures_with_units() -> None:
     )
     (axis,) = fsvp.plot_budget(budget).axes
     assert axis.get_ylabel() == 'position error / mm' and len(axis.lines) == 4
-    with pytest.raises(fsvp.FisheyeSvpError, match='known are position'):
+    with pytest.raises(fsvp.FisheyeSvpError, match='choose from position'):
         fsvp.plot_budget(budget, 'depht')
 
 

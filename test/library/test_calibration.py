@@ -148,9 +148,9 @@ def calibrated(table: Observations) -> CalibratedCamera:
 @pytest.mark.parametrize(
     ('frames', 'noise', 'said'),
     [
-        (1, 0.1, ['one frame is too few: noise and errors of the landmarks cannot be told']),
+        (1, 0.1, ['one frame cannot separate noise from errors of the landmarks']),
         (2, 0.1, ['2 frames are too few to judge a lens; take 8 or more']),
-        (14, 2.0, ['noise is 2.1 px in u and v, far more than a detector leaves']),
+        (14, 2.0, ['the noise in u and v is 2.1 px, far more than a detector leaves']),
         (14, 0.1, []),
     ],
 )

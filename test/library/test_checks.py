@@ -45,7 +45,7 @@ SIDE, IMAGE = fsvp.undistort_maps(LENS), np.zeros((400, 424), np.uint8)
             'observations are of type list; a table or a path is needed',
         ),
         (lambda: fsvp.localize(LENS, TABLE), 'observations are of type Lens; a table or a path'),
-        (lambda: fsvp.plan(LENS, BOARD, 0.3), 'room is 0.3; (nearest, furthest) in m is needed'),
+        (lambda: fsvp.plan(LENS, BOARD, 0.3), 'room is 0.3; (nearest, farthest) in m is needed'),
         (
             lambda: fsvp.plan(LENS, BOARD, (0.3, 0.1)),
             'room is (0.3, 0.1); two distances above 0, m',
@@ -100,8 +100,14 @@ SIDE, IMAGE = fsvp.undistort_maps(LENS), np.zeros((400, 424), np.uint8)
             'the image is int64 (400, 424); an array (H, W',
         ),
         (lambda: SIDE.remap(IMAGE > 0), 'the image is bool (400, 424); an array (H, W)'),
-        (lambda: fsvp.project(LENS, 'abc'), 'points is no array of numbers; (..., 3) is needed'),
-        (lambda: fsvp.back_project(LENS, [[1, 2], [3]]), 'uv is no array of numbers; (..., 2) is'),
+        (
+            lambda: fsvp.project(LENS, 'abc'),
+            'points is not an array of numbers; (..., 3) is needed',
+        ),
+        (
+            lambda: fsvp.back_project(LENS, [[1, 2], [3]]),
+            'uv is not an array of numbers; (..., 2) is',
+        ),
         (
             lambda: fsvp.read_observations(None),
             'a NoneType is no path; the name of a file is needed',
@@ -153,9 +159,15 @@ SIDE, IMAGE = fsvp.undistort_maps(LENS), np.zeros((400, 424), np.uint8)
             'landmark must be whole numbers',
         ),
         (lambda: fsvp.observations([1.0], [2.0], [1e30], BOARD), 'landmark must be whole numbers'),
-        (lambda: fsvp.observations('a', [2.0], [0], BOARD), 'u is no array of numbers; (N,) is'),
-        (lambda: fsvp.observations([1.0], ['2'], [0], BOARD), 'v is no array of numbers; (N,) is'),
-        (lambda: fsvp.observations([1.0], [2.0], ['a'], BOARD), 'landmark is no array of num'),
+        (
+            lambda: fsvp.observations('a', [2.0], [0], BOARD),
+            'u is not an array of numbers; (N,) is',
+        ),
+        (
+            lambda: fsvp.observations([1.0], ['2'], [0], BOARD),
+            'v is not an array of numbers; (N,) is',
+        ),
+        (lambda: fsvp.observations([1.0], [2.0], ['a'], BOARD), 'landmark is not an array of num'),
         (lambda: fsvp.observations([[1.0], [2]], [2.0, 3], [0, 1], BOARD), 'must have one length'),
         (
             lambda: fsvp.observations(*np.ones((2, 10)), np.arange(10), BOARD, frame=np.arange(3)),
@@ -167,11 +179,11 @@ SIDE, IMAGE = fsvp.undistort_maps(LENS), np.zeros((400, 424), np.uint8)
         ),
         (
             lambda: fsvp.observations([1.0], [2.0], [0], [[0, 0, 0], [1, 0]]),
-            'board is no array of nu',
+            'board is not an array of nu',
         ),
         (
             lambda: fsvp.observations([1.0], [2.0], [0], [['a', 'b', 'c']]),
-            'board is no array of nu',
+            'board is not an array of nu',
         ),
         (
             lambda: fsvp.observations([1.0], [2.0], [0], [[0, np.nan, 0]]),

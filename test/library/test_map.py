@@ -77,7 +77,7 @@ def test_the_tags_are_where_they_hang(walk: Path, tmp_path: Path) -> None:
     [
         ('chessboard:9x6:25mm', {}, 'loose tags are given as'),
         ('tags:36h11:160mm', {'every': 0}, 'every is 0; 1 or more is needed'),
-        ('tags:36h11:160mm', {'origin': 'five'}, 'origin is no array of numbers'),
+        ('tags:36h11:160mm', {'origin': 'five'}, 'origin is not an array of numbers'),
     ],
 )
 def test_what_cannot_be_is_refused(walk: Path, board: str, options: dict, said: str) -> None:

@@ -115,7 +115,7 @@ def test_mirrored_points_are_told(graph: Callable[..., Graph], tmp_path: Path) -
     told.world(Landmarks(np.arange(20), board))
     assert 'behind' not in told.tell(1, uv, np.arange(20)).message
     status = told.tell(2, uv * [1, -1] + [0, lens.height - 1], np.arange(20))
-    assert 'shows the board from behind: v is counted upwards' in status.message
+    assert 'shows the board from behind: v is counted upward' in status.message
 
 
 def test_a_strict_node_refuses_the_set(graph: Callable[..., Graph]) -> None:

@@ -216,11 +216,11 @@ def test_a_localizer_takes_points_of_rectified_images(graphs: list[Graph]) -> No
 @pytest.mark.parametrize(
     ('model', 'd', 'reason'),
     [
-        ('thin_prism', (0.1,), "'thin_prism'; known are equidistant"),
+        ('thin_prism', (0.1,), "'thin_prism'; choose from equidistant"),
         ('equidistant', (0.1,), 'has 1 coefficients'),
         ('plumb_bob', (0.1,), 'has 1 coefficients'),
         ('rational_polynomial', (0.1,) * 9, 'has 9 coefficients; 4 or 5 or 8 or 12 or 14'),
-        ('', (0.1, 0.0, 0.0, 0.0), "distortion_model is ''; known are"),
+        ('', (0.1, 0.0, 0.0, 0.0), "distortion_model is ''; choose from"),
         ('equidistant', (0.1, 1e300, 0.0, 5e-324), 'no real lens'),
     ],
 )

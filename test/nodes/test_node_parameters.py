@@ -249,7 +249,7 @@ def test_a_node_does_not_start_with_a_wrong_name(
         ('sweep.rate:=[1.0]', 'no such parameter to sweep'),
         ('sweep.poses:=[1.0]', 'no such parameter to sweep'),
         ('sweep.radius:=[1.0, -1.0]', 'radius is -1.0; allowed is 0.001 to 1e+06'),
-        ('sweep.radius:=[near]', "radius is 'near'; float is needed"),
+        ('sweep.radius:=[near]', "radius is 'near'; a number is needed"),
         ('sweep.radius:=2.0', 'a list of at least one value is needed'),
         ('sweep.lens:=[fish180, fish999]', "'fish999' is neither a file"),
         ('sweep.environment:=[whole, cellar]', "environment 'cellar' is unknown"),
@@ -275,7 +275,7 @@ def test_svp_is_one_of_three_words(start: Callable[..., Any]) -> None:
         'false',
         'auto',
     ]
-    with pytest.raises(ParameterError, match='lens is True; str is needed'):
+    with pytest.raises(ParameterError, match='lens is True; text is needed'):
         with_values(table, {'lens': True})
 
 
@@ -312,7 +312,7 @@ def test_a_parameter_that_means_nothing_is_named(
     start('localizer', '-p', 'lenz:=fish180', '-p', 'noise_px:=1.0')
     said = capfd.readouterr().err
     assert "parameter 'lenz' is unknown to this node; did you mean 'lens'?" in said
-    assert "parameter 'noise_px' is unknown to this node; known are " in said
+    assert "parameter 'noise_px' is unknown to this node; choose from " in said
 
 
 def test_what_a_file_says_of_all_nodes_may_be_for_others(
@@ -331,7 +331,7 @@ def test_what_a_file_says_of_all_nodes_may_be_for_others(
     said = capfd.readouterr().err
     assert 'noise_px' not in said and 'exposure' not in said
     assert "'patence' is unknown to this node; did you mean 'patience'?" in said
-    assert "'radius' is unknown to this node; known are" in said
+    assert "'radius' is unknown to this node; choose from" in said
 
 
 @pytest.mark.parametrize(

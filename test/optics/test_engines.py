@@ -437,7 +437,7 @@ def test_small_work_never_loads_numba():
 
 
 def test_a_wrong_or_missing_engine_is_one_line(monkeypatch, capsys):
-    with pytest.raises(ParameterError, match="'fortran'; known are auto, numpy, numba"):
+    with pytest.raises(ParameterError, match="'fortran'; choose from auto, numpy, numba"):
         engines.use('fortran')
     monkeypatch.setitem(sys.modules, 'fisheye_svp_ros.optics.engines.numba_engine', None)
     monkeypatch.delattr(engines, 'numba_engine', raising=False)

@@ -206,7 +206,7 @@ def test_a_lens_file_keeps_it(tmp_path):
         ('v', [[0.0] * 14] * 10, 'image_field.v must be rows of numbers, as many as those of u'),
         ('v', [[float('nan')] * 14] * 11, 'image_field.v holds a number that is not finite'),
         ('stderr', [[-1.0] * 14] * 11, 'image_field.stderr has a number below 0'),
-        ('width', 3, "image_field: unknown field 'width'; known are low, pitch, u, v, stderr"),
+        ('width', 3, "image_field: unknown field 'width'; choose from low, pitch, u, v, stderr"),
         ('u', [[0.0] * 6 + [900.0] + [0.0] * 7] * 11, 'image_field folds the image at ('),
     ],
 )

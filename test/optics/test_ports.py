@@ -181,7 +181,7 @@ def test_a_port_is_read_back(port):
             'tilt_x is -2.0',
         ),
         ({'model': 'dome', 'radius': 0.03, 'medium_index': 1.3, 'z': 0.04}, 'inside the dome'),
-        ({'model': 'oval'}, "corrections.port.model is 'oval'; known are flat, dome"),
+        ({'model': 'oval'}, "corrections.port.model is 'oval'; choose from flat, dome"),
     ],
 )
 def test_an_impossible_port_is_refused(port, reason):

@@ -199,7 +199,7 @@ def test_what_cannot_be_planned_is_refused(linear, board):
         (['--next', '2', '--for', 'fx'], '--for fx: fx is fixed; add --free intrinsics'),
         (
             ['--next', '2', '--for', 'zz', '--free', 'intrinsics'],
-            '--for zz: not a parameter of this lens or of an effect; known are fx, ',
+            '--for zz: not a parameter of this lens or of an effect; choose from fx, ',
         ),
     ],
 )
@@ -367,7 +367,7 @@ def test_views_past_what_a_lens_was_calibrated_for_are_named(tmp_path, capsys):
             )
             == 0
         )
-        noted = 'calibrated up to 50 degrees off the axis; views ' in capsys.readouterr().err
+        noted = 'calibrated up to 50 degrees off the axis. Views ' in capsys.readouterr().err
         assert noted == (reached == 50)
 
 

@@ -145,7 +145,7 @@ def test_views_of_two_cameras_have_a_folder_each(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('options', 'said'),
     [
-        (['--as', 'perspective:30,0'], "'perspective:30,0' is unknown; known are pinhole, "),
+        (['--as', 'perspective:30,0'], "'perspective:30,0' is unknown; choose from pinhole, "),
         (['--as', 'cube'], 'perspective:YAW,PITCH,FOV in degrees'),
         (['--as', 'perspective:0,0,180'], 'field of view is 180 deg; above 0 and at most 175'),
         (['--as', 'perspective:180,0,60'], 'and nothing of yaw180_pitch0'),

@@ -250,7 +250,7 @@ def test_people_read_mm_and_degrees() -> None:
 def test_a_map_says_where_it_cannot_be_relied_on():
     assert not [*map_notes((), 0, 0.2, (0.001, 0.002))]
     missing, outside, corners, focal = map_notes((4, 7), 3, 0.7, (0.02, 0.001))
-    assert '2 tags are not in the map (4, 7)' in missing and 'add such images' in missing
+    assert '2 tags are not in the map (4, 7)' in missing and 'Add such images' in missing
     assert '3 sightings' in outside and 'field of view' in outside
     assert '0.70 px' in corners
     assert 'focal length +2.0 ± 0.1 %: calibrate the lens again' in focal
@@ -261,9 +261,10 @@ def test_wrong_landmarks_are_named_with_what_to_do():
     other = moved._replace(number=7, offset=np.array([0.012, 0.0, 0.0]))
     lost = WrongLandmark(9, 18, 300.2, np.full(3, np.nan))
     assert list(wrong_landmark_notes([moved, other, lost])) == [
-        'landmarks not where x, y, z say: 3 by 50 mm and 7 by 12 mm; rejected; measure them again',
-        'landmark 9: its 18 points are 300 px off and no other place explains them; rejected; '
-        'check its number',
+        'landmarks 3 (50 mm) and 7 (12 mm) are not at their stated positions and are rejected. '
+        'Measure them again',
+        'landmark 9: its 18 points are 300 px off, and no other position explains them. They '
+        'are rejected. Check its number',
     ]
     assert moved.to_dict()['offset'] == [0.0, 0.03, 0.04] and lost.to_dict()['offset'] is None
 

@@ -37,7 +37,7 @@ def test_lookup_by_id_in_any_order_and_shape():
 @pytest.mark.parametrize(
     ('spread', 'radius', 'reason'),
     [
-        ('middle', 2.0, "environment 'middle' is unknown; known are whole, inner, outer"),
+        ('middle', 2.0, "environment 'middle' is unknown; choose from whole, inner, outer"),
         ('whole', 0.0, 'environment radius is 0.0 m; it must be above 0'),
         ('whole', float('nan'), 'environment radius is nan m; it must be above 0'),
         ('whole', float('inf'), 'environment radius is inf m; it must be above 0'),

@@ -28,7 +28,7 @@ def test_styles(style, inward):
 @pytest.mark.parametrize(
     ('style', 'baseline', 'reason'),
     [
-        ('crossed', 0.15, "style 'crossed' is unknown; known are parallel, vergent, divergent"),
+        ('crossed', 0.15, "style 'crossed' is unknown; choose from parallel, vergent, divergent"),
         ('parallel', 0.0, 'baseline is 0.0 m; it must be above 0'),
         ('parallel', float('nan'), 'baseline is nan m; it must be above 0'),
     ],

@@ -72,7 +72,7 @@ def test_random_image_points_are_refused_before_anything_is_fitted():
         lambda: library.calibrate(random, 'equidistant', SIZE),
         lambda: library.diagnose(random, LENS),
     ):
-        with pytest.raises(ObservationError, match='close in one frame are not in others'):
+        with pytest.raises(ObservationError, match='close in one frame are not close in others'):
             refused()
 
 

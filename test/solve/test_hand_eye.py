@@ -189,7 +189,7 @@ def test_a_fixed_camera_is_told_with_its_odds() -> None:
     )
     assert [row[0] for row in hand_eye_rows(found)][::2] == ['camera in base', 'target in flange']
     (warning,) = hand_eye_warnings(found)
-    assert 'if it carries the camera, they are inverted' in warning
+    assert 'If it carries the camera, the poses are inverted' in warning
     assert 'which carries the camera (odds more than' in hand_eye_sentence(fit(3)[1])
 
 
@@ -200,7 +200,7 @@ def test_noise_that_no_robot_has_is_refused(fixed_camera: bool) -> None:
 
 
 def test_poses_that_show_no_arrangement_are_refused() -> None:
-    with pytest.raises(GeometryError, match='whether camera or target is on the flange'):
+    with pytest.raises(GeometryError, match='whether the camera or the target is on the flange'):
         _check_noise(np.array([1e-3, 1e-3]), robot(1)[1], 3.0)
 
 

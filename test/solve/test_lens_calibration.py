@@ -267,7 +267,7 @@ class TestBadInput:
             calibrate(table, 'equidistant', SIZE, free)
 
     def test_unknown_model(self, table):
-        with pytest.raises(LensError, match='known are orthographic'):
+        with pytest.raises(LensError, match='choose from orthographic'):
             calibrate(table, 'pinhole', SIZE)
 
     def test_impossible_image_size(self, table):

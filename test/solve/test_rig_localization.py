@@ -62,5 +62,5 @@ def test_a_camera_that_is_not_in_the_rig_is_refused() -> None:
 
 def test_boards_of_the_cameras_own_are_refused() -> None:
     table, _ = moving_rig(1, frames=6, cameras=2)
-    with pytest.raises(GeometryError, match='they see boards of their own'):
+    with pytest.raises(GeometryError, match='They see different boards'):
         solve_rig_table(table, LENSES, CAMERAS, RIG)

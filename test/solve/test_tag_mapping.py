@@ -124,7 +124,7 @@ def test_a_tag_beyond_the_field_of_view_is_left_out():
     assert 0 < found.outside < len(ids)
     assert map_errors(found, true).max() < 1e-6
     nothing = replace(MODEL.lens, max_incidence=0.01)
-    with pytest.raises(GeometryError, match='no tag lies in the field of view'):
+    with pytest.raises(GeometryError, match='no tag is in the field of view'):
         map_tags(ForwardModel(nothing), image, ids, corners, SIZE)
 
 

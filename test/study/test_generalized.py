@@ -56,7 +56,7 @@ def test_the_command_says_why_its_residual_is_larger_and_plain_keeps_least_squar
         seen = str(tmp_path / 'seen.csv')
         assert not main(['calibrate', seen, '--image-size', size, '-o', str(path), *asked])
         text, page = capsys.readouterr().out, path.with_suffix('.calibrate.html').read_text()
-        told = 'bends the lens to errors of the board'
+        told = 'absorbs board errors into the lens'
         assert (told in text) == (told in page) == (name == 'general')
         lenses.append(load_lens(path))
     least = fsvp.calibrate(table, 'kannala_brandt', SIZE, plain=True).lens

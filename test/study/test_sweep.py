@@ -258,12 +258,12 @@ def test_a_set_that_cannot_be_solved_is_a_row_that_says_why(tmp_path: Path) -> N
 
 BAD = {
     'sweep.radios: [1.0]': 'sweep.radios: no such parameter to sweep',
-    'sweep.rig_file: [rig.yaml]': 'sweep.rig_file: no such parameter to sweep; known are lens, '
+    'sweep.rig_file: [rig.yaml]': 'sweep.rig_file: no such parameter to sweep; choose from lens, '
     'shift_scale, environment, radius, style, baseline, vergence, poses_file, '
     'trajectory_steps, noise_px, seed\n',
     'sweep.radius: []': 'sweep.radius is []; a list of at least one value',
     'sweep.radius: 2.0': 'sweep.radius is 2.0; a list of at least one value',
-    'sweep.radius: [near, far]': "radius is 'near'; float is needed",
+    'sweep.radius: [near, far]': "radius is 'near'; a number is needed",
     'sweep.radius: [1.0, near]': 'sweep.radius: the values in line 1 differ in type\n',
     'sweep.radius: [2.0, -1]': 'line 1 differ in type; write -1 as -1.0',
     'sweep.radius: [-1.0]': 'radius is -1.0; allowed is',
@@ -275,7 +275,7 @@ BAD = {
     'sweep.seed: [1], rate: -3': 'rate is -3.0; allowed is',
     'sweep.seed: [1], poses: [1.0, 2.0]': 'seven a pose are needed',
     'sweep.seed: [1], poses: 3.0': 'poses is 3.0; a list is needed',
-    'sweep.seed: [1], noise_px: much': "noise_px is 'much'; float is needed",
+    'sweep.seed: [1], noise_px: much': "noise_px is 'much'; a number is needed",
     f'sweep.seed: {list(range(1001))}, sweep.radius: {[0.1 * n for n in range(1, 1001)]}': (
         '1001000 scenarios (1001 seed x 1000 radius); add --large to run them all'
     ),

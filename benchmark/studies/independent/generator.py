@@ -72,7 +72,7 @@ def plan(mode: str, seed: int, index: int) -> tuple[tuple[str, float], ...]:
     if mode in ('one', 'outside'):
         return ((first, sizes[(turn + place) % len(sizes)]),)
     if mode != 'two':
-        raise ValueError(f'mode {mode!r}; known are one, two, clean, outside')
+        raise ValueError(f'mode {mode!r}; choose from one, two, clean, outside')
     others = [
         name
         for name in names

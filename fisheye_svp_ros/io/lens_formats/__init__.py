@@ -157,7 +157,7 @@ def write_foreign(lens: Lens, form: str) -> str:
     only form with a shift, is the nearest one.
     """
     if form not in WRITABLE:
-        raise LensError(f'format {form!r} is unknown; known are {", ".join(WRITABLE)}')
+        raise LensError(f'format {form!r} is unknown; choose from {", ".join(WRITABLE)}')
     text: str = import_module(f'{__name__}.{form}').write(lens)
     return text
 

@@ -56,7 +56,9 @@ def read(text: str, where: str) -> Foreign:
 def _kalibr_lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float]:
     model = str(camera.get('camera_model')).lower()
     if model not in _INTRINSICS:
-        raise LensError(f'{where}: camera_model is {model!r}; known are {", ".join(_INTRINSICS)}')
+        raise LensError(
+            f'{where}: camera_model is {model!r}; choose from {", ".join(_INTRINSICS)}'
+        )
     *model_numbers, fx, fy, cx, cy = fields.numbers(
         camera, 'intrinsics', _INTRINSICS[model], where
     )
@@ -88,9 +90,8 @@ def _kalibr_distortion(
             heights = models.double_sphere if model == 'ds' else models.unified_heights
             return models.Distortion(heights(*own))
     raise LensError(
-        f'{where}: {model} with {kind} is not a form that can be read; those are '
-        'pinhole with equidistant, fov, radtan or none, omni with radtan or none, ds '
-        'and eucm'
+        f'{where}: {model} with {kind} cannot be read. Readable are pinhole with equidistant, '
+        'fov, radtan, or none, omni with radtan or none, ds, and eucm'
     )
 
 

@@ -194,7 +194,7 @@ def _distortion(d: Sequence[float], named: Mapping[str, Any], where: str) -> mod
         return models.stated_distortion(model, d, where)
     if _XI not in named and (unknown := next((stated[n] for n in _STATED if n in stated), '')):
         raise LensError(
-            f'{where}: the distortion model is {unknown!r}; known are '
+            f'{where}: the distortion model is {unknown!r}; choose from '
             f'{", ".join(models.STATED_MODELS)} and fisheye'
         )
     if _XI in named:
@@ -227,8 +227,8 @@ def _read_matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> l
         )
     if shape is None or shape not in shapes:
         raise LensError(
-            f'{where}: a matrix of 3 x 3 and the four coefficients of cv2.fisheye are '
-            'needed (of a rig R, 3 x 3, and T, 3 x 1)'
+            f'{where}: a 3 x 3 matrix and the four coefficients of cv2.fisheye are needed; for '
+            'a rig, R (3 x 3) and T (3 x 1)'
         )
     return fields.numbers({'data': data}, 'data', int(shape[0] * shape[1]), where)
 

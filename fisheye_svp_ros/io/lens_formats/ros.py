@@ -109,7 +109,7 @@ def distortion_lens(
     stated = models.stated_model(model) if model or d else 'plumb_bob'
     if stated is None:
         raise LensError(
-            f'{where}: distortion_model is {model!r}; known are '
+            f'{where}: distortion_model is {model!r}; choose from '
             f'{", ".join(models.STATED_MODELS)} and fisheye'
         )
     distortion = models.stated_distortion(stated, d, where)

@@ -137,7 +137,7 @@ def adjust_rigs(
 
 def _load_engine(name: str) -> ModuleType:
     if name not in ENGINES:
-        raise ParameterError(f'{VARIABLE} is {name!r}; known are {", ".join(ENGINES)}')
+        raise ParameterError(f'{VARIABLE} is {name!r}; choose from {", ".join(ENGINES)}')
     if name != 'numba':
         return numpy_engine
     if find_spec('numba') is not None and not cache.is_compiled():

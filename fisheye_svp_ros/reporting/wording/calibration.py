@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.solve.rig_calibration import RigCalibration
 
 STANDARD_ERRORS = (
-    'standard errors allow for local errors of target, frames and image, and for a target as '
-    'wrong in shape and scale as is likely'
+    'standard errors include local errors of target, frames, and image, and likely errors in '
+    'the shape and scale of the target'
 )
 ANY_TARGET = '95 %, any target'  # heads the range of a parameter
 ANY_TARGET_NOTE = (
-    f'{ANY_TARGET}: if it is as wrong in shape and scale as can go unnoticed, not only as is '
-    'likely'
+    f'{ANY_TARGET}: the shape and scale of the target may be wrong by as much as these data '
+    'leave unnoticed'
 )
 _WORTH_SAYING = 1.001  # residuals over those of least squares
 _MODEL_ERROR_RATIO = 2.0  # times the noise, from which residuals show a model error
@@ -51,16 +51,17 @@ def estimate_sentence(figures: Mapping[str, Any]) -> str:
     if least is None or figures['rms_px'] < _WORTH_SAYING * least:
         return ''
     return (
-        f'rms {figures["rms_px"]:.4f} px on the board as stated, {least:.4f} px by least squares, '
-        'which bends the lens to errors of the board (--plain writes that lens)'
+        f'rms {figures["rms_px"]:.4f} px on the board as stated. Plain least squares leaves '
+        f'{least:.4f} px, because it absorbs board errors into the lens (--plain writes that '
+        'lens)'
     )
 
 
 def calibration_warnings(camera: CalibratedCamera) -> tuple[str, ...]:
     """Return what there is to say against a lens, a sentence each."""
     shifts = [
-        f'{name} is undetermined: {1e3 * limits.low:.2f} to {1e3 * limits.high:.2f} mm, since '
-        'the shape of the target is confounded with it; run `fisheye-svp diagnose`'
+        f'{name} is undetermined: {1e3 * limits.low:.2f} to {1e3 * limits.high:.2f} mm, because '
+        'the shape of the target is confounded with it. Run `fisheye-svp diagnose`'
         for name, limits in camera.trust.doubtful_shift.items()
     ]
     mirror = find_mirror(camera.table, camera.lens)
@@ -77,33 +78,34 @@ def _fit_warnings(camera: CalibratedCamera) -> list[str]:
     texts, result = [], camera.result
     if result.left_out:
         texts.append(
-            'left out, their points do not determine a pose (all near one line, or '
-            f'of another lens?): {list_frames(camera.table, result.left_out)}'
+            'left out, because their points do not determine a pose (all near one line, or of '
+            f'another lens?): {list_frames(camera.table, result.left_out)}'
         )
     if not result.adjusted.converged:
         texts.append(
-            'the adjustment has not converged, so the lens is inaccurate; take more '
-            'photographs, or check these'
+            'the fit did not converge, so the lens is inaccurate. Take more photographs, or '
+            'check these'
         )
     texts += _few_frames(len(result.views.frame))
     rms, sigma = (camera.lens.calibration or {})['rms_px'], float(np.median(camera.table.sigma))
     noise = sigma if np.isfinite(sigma) else camera.trust.noise_px
     if is_no_fit(rms, sigma):
         texts.append(
-            f'{camera.model} leaves {rms:.1f} px: the model does not fit this lens, or '
-            'image points and landmarks do not match (order, units, axes, image size), or two '
-            'cameras are mixed; do not use it'
+            f'{camera.model} leaves {rms:.1f} px: the model does not fit this lens, two cameras '
+            'are mixed, or image points and landmarks do not match. Do not use the lens. Check '
+            'order, units, axes, and image size'
         )
     elif len(result.views.frame) > 1 and rms > _MODEL_ERROR_RATIO * 2**0.5 * noise:
         texts.append(
-            f'{rms:.2g} px are {rms / noise / 2**0.5:.1f} times the noise of image '
-            'points: lens, target or data have a model error; do not use this lens before '
-            '`fisheye-svp diagnose` says which'
+            f'the residual of {rms:.2g} px is {rms / noise / 2**0.5:.1f} times the image noise: '
+            'the lens, the target, or the data have a model error. Run `fisheye-svp diagnose` '
+            'before you use this lens'
         )
     if len(result.views.frame) > 1 and camera.trust.noise_px > _MAX_NOISE:
         texts.append(
-            f'noise is {camera.trust.noise_px:.1f} px in u and v, far more than a detector leaves '
-            '(0.02 to 0.3 px): check sharpness, detector, order of corners'
+            f'the noise in u and v is {camera.trust.noise_px:.1f} px, far more than a detector '
+            'leaves (0.02 to 0.3 px). Check the sharpness, the detector, and the order of the '
+            'corners'
         )
     if result.beyond:
         texts.append(
@@ -117,8 +119,8 @@ def _few_frames(frames: int) -> list[str]:
     """Say it where so few frames were taken that their lens cannot be judged."""
     if frames == 1:
         return [
-            'one frame is too few: noise and errors of the landmarks cannot be told apart in it; '
-            f'take {_ENOUGH_FRAMES} frames or more'
+            'one frame cannot separate noise from errors of the landmarks; take '
+            f'{_ENOUGH_FRAMES} frames or more'
         ]
     if frames < _MIN_FRAMES:
         return [f'{frames} frames are too few to judge a lens; take {_ENOUGH_FRAMES} or more']
@@ -131,14 +133,14 @@ def _image_warnings(camera: CalibratedCamera) -> list[str]:
     image = image_coverage(camera.lens, views.uv[views.used])
     if image.is_off_center:
         texts.append(
-            f'the principal point lies {image.offset[0]:.0f}, {image.offset[1]:.0f} px off '
-            'the center of the image; check the image size, and that images are not cropped'
+            f'the principal point is {image.offset[0]:.0f}, {image.offset[1]:.0f} px off the '
+            'center of the image. Check the image size, and whether images are cropped'
         )
     if image.is_extrapolated:
         texts.append(
             f'the curve is extrapolated beyond {np.degrees(camera.result.reached):.0f} deg: '
-            f'image points reach {image.radius:.0f} px from the center, the nearest edge is '
-            f'at {image.edge:.0f} px; photograph the target near the edges too'
+            f'image points reach {image.radius:.0f} px from the center, but the nearest edge is '
+            f'at {image.edge:.0f} px. Photograph the target near the edges, too'
         )
     return texts
 
@@ -150,9 +152,9 @@ def hand_eye_sentence(hand_eye: HandEye) -> str:
     sure = '' if hand_eye.odds < MAX_ODDS else 'more than '
     return (
         f'{len(hand_eye.frame)} poses of the flange, which carries the {carried} (odds '
-        f'{sure}{hand_eye.odds:.3g} to 1); noise of the robot '
-        f'{1e3 * hand_eye.noise_m:.3f} mm and {np.degrees(hand_eye.noise_rad):.4f} deg an axis; '
-        f'lengths of the target are {scale:.5f} ± {error:.5f} times those of the robot'
+        f'{sure}{hand_eye.odds:.3g} to 1). Noise of the robot: {1e3 * hand_eye.noise_m:.3f} mm '
+        f'and {np.degrees(hand_eye.noise_rad):.4f} deg per axis. Lengths of the target are '
+        f'{scale:.5f} ± {error:.5f} times those of the robot'
     )
 
 
@@ -161,8 +163,9 @@ def hand_eye_warnings(hand_eye: HandEye) -> list[str]:
     warnings, factor = [], max(hand_eye.scale, 1 / hand_eye.scale)
     if hand_eye.fixed_camera:
         warnings.append(
-            'the poses are those of a flange that carries the target before a fixed camera; if it '
-            'carries the camera, they are inverted: give the flange in the base'
+            'the poses are those of a flange that carries the target in front of a fixed '
+            'camera. If it carries the camera, the poses are inverted: give those of the '
+            'flange in the base'
         )
     if factor > _MAX_SCALE:
         longer = 'the poses' if hand_eye.scale < 1 else 'the target'
@@ -174,14 +177,14 @@ def hand_eye_warnings(hand_eye: HandEye) -> list[str]:
     elif abs(hand_eye.scale - 1) > max(_MAX_SCALE_ERROR, _MIN_SIGMAS * hand_eye.stderr[-1]):
         warnings.append(
             f'lengths of the target are {100 * (hand_eye.scale - 1):+.1f} % off those of the '
-            f'robot: a square of 25 mm would have to be {25 / hand_eye.scale:.1f} mm; measure the '
-            'squares'
+            f'robot: a square of 25 mm would have to be {25 / hand_eye.scale:.1f} mm. Measure '
+            'the squares'
         )
     if hand_eye.noise_m > _MAX_NOISE_M or hand_eye.noise_rad > _MAX_NOISE_RAD:
         warnings.append(
-            f'noise of the robot is {1e3 * hand_eye.noise_m:.2g} mm and '
-            f'{np.degrees(hand_eye.noise_rad):.2g} deg, far above the repeatability of an arm: '
-            'check stamps, tool frame and lens'
+            f'the noise of the robot is {1e3 * hand_eye.noise_m:.2g} mm and '
+            f'{np.degrees(hand_eye.noise_rad):.2g} deg, far above the repeatability of an arm. '
+            'Check the stamps, the tool frame, and the lens'
         )
     noise = np.repeat((hand_eye.noise_m, hand_eye.noise_rad), 3)
     squares = ((hand_eye.residual / noise) ** 2).sum(axis=1)
@@ -190,7 +193,7 @@ def hand_eye_warnings(hand_eye: HandEye) -> list[str]:
         off, turn = np.linalg.norm(hand_eye.residual[worst].reshape(2, 3), axis=1)
         warnings.append(
             f'the pose of frame {hand_eye.frame[worst]} is {1e3 * off:.1f} mm and '
-            f'{np.degrees(turn):.2f} deg off the others: correct it, or remove it from the poses'
+            f'{np.degrees(turn):.2f} deg off the others. Correct it, or remove it'
         )
     return warnings
 
@@ -199,8 +202,8 @@ def unrelated_cameras(group: Sequence[str], others: Sequence[str]) -> str:
     """Return why cameras are not in a rig with others."""
     return (
         f'{" and ".join(group)} cannot be related to {", ".join(others)}: no frame shows the '
-        'target in both; photograph it where two cameras see it, or turn the rig while each sees '
-        'a board of its own, and give simultaneous photographs the same frame number'
+        'target in both. Photograph it where two cameras see it, or turn the rig while each '
+        'camera sees a board of its own. Give simultaneous photographs the same frame number'
     )
 
 
@@ -217,9 +220,9 @@ def rig_warnings(
     own = max((lenses[name].calibration or {}).get('rms_px', np.inf) for name in rig.cameras)
     if rig.total_rms_px > MAX_RIG_RATIO * own:
         yield (
-            f'rms {rig.total_rms_px:.2f} px with a rigid rig, at most {own:.2f} px for each '
-            'camera alone: the cameras moved, their photographs were not simultaneous, or a '
-            'lens is wrong'
+            f'rms {rig.total_rms_px:.2f} px with a rigid rig, compared with at most {own:.2f} '
+            'px for each camera alone. The cameras moved, their photographs were not '
+            'simultaneous, or a lens is wrong'
         )
     for name, shared in zip(rig.cameras, rig.shared.tolist(), strict=True):
         if shared < MIN_SHARED_FRAMES:
@@ -235,6 +238,6 @@ def _few_shared_frames(name: str, shared: int, cameras: int) -> str:
     else:
         what = 'is shared' if one else 'are shared'
     return (
-        f'only {shared} frame{"" if one else "s"} {what}, and it is assumed that all '
-        'cameras saw one target; take more photographs of it with two cameras at once'
+        f'only {shared} frame{"" if one else "s"} {what}. It is assumed that all cameras saw '
+        'one target. Take more photographs of it with two cameras at once'
     )

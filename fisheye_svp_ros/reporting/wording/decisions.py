@@ -35,8 +35,8 @@ _ACTIONS = {
     Action.USE_EXTENDED: 'solve with the extended lens file',
     Action.DIAGNOSE_AIR: 'the lens already has errors in air: diagnose photographs in air '
     'first, then these with the extended lens of that run',
-    Action.CALIBRATE_AIR: 'the lens was adjusted within the errors of its calibration in air: '
-    'take photographs in air that fill the image, or measure the target more precisely',
+    Action.CALIBRATE_AIR: 'the lens was adjusted within the errors of its calibration in air. '
+    'Take photographs in air that fill the image, or measure the target more precisely',
     Action.MEASURE_BOARD: 'measure the board, or flatten or replace it',
     Action.MEASURE_LANDMARKS: 'measure the landmarks of the target, starting with the largest '
     'errors',

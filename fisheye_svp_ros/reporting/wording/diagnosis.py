@@ -33,9 +33,9 @@ from fisheye_svp_ros.scene.observations import frame_name
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
 
 CAPTIONS = {
-    'field': 'Residual vectors over the image. The scale is in the upper right corner. Dotted lines: '
-    'equal incidence angle. Above: single points. Below: means over cells of the image, which '
-    'show errors common to all frames.',
+    'field': 'Residual vectors over the image. The scale is in the upper right corner. Dotted '
+    'lines: equal incidence angle. Above: single points. Below: means over cells of the image, '
+    'which show errors common to all frames.',
     'theta': 'Residuals against the incidence angle, along the radius from the principal point '
     '(above) and across it (below).',
     'range': 'Residuals against the distance of the landmark. If the viewpoint of the lens moves, '

@@ -76,8 +76,8 @@ def landmarks_left_out(count: int, of: int) -> str:
 def frames_differ(topic: str, frame: str, other_topic: str, other: str) -> str:
     """Tell of two inputs that cannot belong together."""
     return (
-        f'{topic}: left out: in frame {frame!r}, but {other_topic} in {other!r}; '
-        'publish both in one frame, or on /tf where one stands in the other'
+        f'{topic}: left out: in frame {frame!r}, but {other_topic} in {other!r}; publish both '
+        'in one frame, or publish the transform between them on /tf'
     )
 
 
@@ -158,9 +158,9 @@ def compilation_text(state: str) -> str:
 
 
 MIRROR_WORDS = {
-    Mirror.V_UPWARDS: 'v is counted upwards',
+    Mirror.V_UPWARDS: 'v is counted upward',
     Mirror.UV_EXCHANGED: 'u and v are exchanged',
-    Mirror.IMAGE: 'v is counted upwards, or u and v are exchanged',
+    Mirror.IMAGE: 'v is counted upward, or u and v are exchanged',
     Mirror.Y_REVERSED: 'y of the board is reversed',
 }
 MIRROR_REMEDY = 'write u to the right, v down, x, y, z right-handed with z into the board'
@@ -181,9 +181,9 @@ def points_mirrored(what: str, mirror: Mirror) -> str:
 def points_extrapolated(what: str, beyond: ExtrapolatedPoints) -> str:
     """Tell of points, or pixels, where nothing is known of the lens."""
     return (
-        f'{what}: {100 * beyond.share:.2g} % lie up to '
-        f'{np.degrees(beyond.farthest):.0f} deg from the axis, but image points of the '
-        f'calibration reach {np.degrees(beyond.known):.0f} deg: nothing is known beyond'
+        f'{what}: {100 * beyond.share:.2g} % lie up to {np.degrees(beyond.farthest):.0f} deg '
+        'from the axis, but image points of the calibration reach '
+        f'{np.degrees(beyond.known):.0f} deg: beyond, the lens is extrapolated'
     )
 
 
@@ -201,6 +201,6 @@ def reader_limit(lens: Lens, form: str) -> str:
 def exchanged_cameras(left: str, right: str) -> str:
     """Tell of a rig whose left camera stands right of the right one."""
     return (
-        f'{right} stands to the left of {left}: the baseline is negative, which stereo_image_proc '
+        f'{right} is to the left of {left}: the baseline is negative, which stereo_image_proc '
         'refuses; exchange the names, or turn the images upright'
     )

@@ -18,8 +18,8 @@ def second_pose_note(frames: str, count: int) -> str:
     """Say which frames a second pose explains about as well; frames: as they are enumerated."""
     poses = 'pose is' if count == 1 else 'poses are'
     return (
-        f'{count} {poses} ambiguous ({frames}): the target may be tilted the other way, odds in '
-        'localize.json; go nearer, or add landmarks'
+        f'{count} {poses} ambiguous ({frames}): the target may be tilted the other way (odds in '
+        'localize.json). Go nearer, or add landmarks'
     )
 
 
@@ -42,22 +42,25 @@ def map_notes(
         names = ', '.join(map(str, missing))
         tags = 'tag is' if len(missing) == 1 else 'tags are'
         yield (
-            f'{len(missing)} {tags} not in the map ({names}): no image shows them together with a '
-            'mapped tag; add such images'
+            f'{len(missing)} {tags} not in the map ({names}): no image shows them together with '
+            'a mapped tag. Add such images'
         )
     if outside:
-        yield f'{outside} sightings of a tag reach beyond the field of view of the lens: left out'
+        yield (
+            f'{outside} sightings of a tag reach beyond the field of view of the lens and are '
+            'left out'
+        )
     if rms_px > _POOR_CORNERS:
         yield (
             f'corners are off by {rms_px:.2f} px, more than those of flat tags (under '
-            f'{_POOR_CORNERS:g} px): standard errors do not cover that; is the lens of this '
-            'camera, are the tags flat and of one size, do they hang still?'
+            f'{_POOR_CORNERS:g} px). Standard errors do not cover that. Does the lens belong to '
+            'this camera? Are the tags flat, of one size, and at rest?'
         )
     change, error = focal
     if abs(change) > max(_SURE * error, _LARGE_CHANGE):
         yield (
             f'the tags would have the focal length {100 * change:+.1f} ± {100 * error:.1f} %: '
-            'calibrate the lens again; standard errors of the map do not cover that'
+            'calibrate the lens again. Standard errors of the map do not cover that'
         )
 
 
@@ -68,7 +71,7 @@ def wrong_landmark_notes(
 
     of_tags: they are corners of tags, which are named in their place.
     """
-    kind, place = ('tag', 'the map says') if of_tags else ('landmark', 'x, y, z say')
+    kind = 'tag' if of_tags else 'landmark'
     numbers = tags_of(np.array([one.number for one in landmarks], dtype=np.int64))
     groups: dict[int, list[WrongLandmark]] = {}
     for landmark, tag in zip(landmarks, numbers.tolist(), strict=True):
@@ -79,18 +82,24 @@ def wrong_landmark_notes(
         if any(one.is_displaced for one in group)
     }
     if moved:
-        many = len(moved) > 1
-        names = [f'{number} by {1e3 * size:.3g} mm' for number, size in moved.items()]
-        yield (
-            f'{kind}{"s" if many else ""} not where {place}: {_enumerate_names(names)}; '
-            f'rejected; measure {"them" if many else "it"} again'
-        )
+        names = [f'{number} ({1e3 * size:.3g} mm)' for number, size in moved.items()]
+        if len(moved) > 1:
+            yield (
+                f'{kind}s {_enumerate_names(names)} are not at their stated positions and are '
+                'rejected. Measure them again'
+            )
+        else:
+            ((number, size),) = moved.items()
+            yield (
+                f'{kind} {number} is {1e3 * size:.3g} mm from its stated position and is '
+                'rejected. Measure it again'
+            )
     for number, group in groups.items():
         if number not in moved:
             points, px = sum(one.points for one in group), max(one.px for one in group)
             yield (
-                f'{kind} {number}: its {points} points are {px:.3g} px off and no other place '
-                'explains them; rejected; check its number'
+                f'{kind} {number}: its {points} points are {px:.3g} px off, and no other position '
+                'explains them. They are rejected. Check its number'
             )
 
 
