@@ -46,7 +46,7 @@ from fisheye_svp_ros.reporting.undistort_report import (
 )
 from fisheye_svp_ros.scene.observations import RADII
 
-_MARK, _RECORDING = '.demo', 'recording'
+_MARK, _RECORDING, _ANSWER = '.demo', 'recording', 'errors.png'
 _PATIENCE = 900.0  # s; only a hang takes this long
 
 
@@ -108,7 +108,11 @@ def run(args: argparse.Namespace) -> None:
                 'rectified': remaining_document(apart),
             },
         )
-    _draw(args.output, rows, fields)
+    if _draw(args.output, rows, fields):
+        print(
+            f'{args.output / _ANSWER}: the errors of this package next to those that Kita '
+            'published. The same as tables:\n'
+        )
     draw_pair(args.output / 'rectified.png', *images)
     note_formats()
     _print(rows)
@@ -117,7 +121,7 @@ def run(args: argparse.Namespace) -> None:
         'between left and right',
         apart,
     )
-    print(f'  {"" if reason else "recording, "}table, pictures: {args.output}')
+    print(f'  {"" if reason else "recording, "}table, and more pictures: {args.output}')
 
 
 def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float]) -> None:
@@ -150,18 +154,18 @@ def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float])
 def _print(rows: Sequence[DemoRow]) -> None:
     for task in TASKS:
         mine = [row for row in rows if row.task == task.name]
-        axis = () if task.name == 'depth' else ('axis deg', 'published')
+        axis = () if task.name == 'depth' else ('axis, deg', 'Kita, deg')
         print_table(
             task.title,
             (
                 'lens',
-                'radius m',
+                'radius, m',
                 task.swept,
-                'error mm',
-                'published',
+                'error, mm',
+                'Kita, mm',
                 *axis,
-                'image px',
-                'published',
+                'image, px',
+                'Kita, px',
             ),
             map(_cells, mine),
         )
@@ -188,9 +192,11 @@ def _cells(row: DemoRow) -> tuple[str, ...]:
     )
 
 
-def _draw(folder: Path, rows: Sequence[DemoRow], fields: Sequence[ResidualSet]) -> None:
+def _draw(folder: Path, rows: Sequence[DemoRow], fields: Sequence[ResidualSet]) -> bool:
+    """Draw the pictures; return whether that of the errors was drawn."""
     from fisheye_svp_ros.paper.demonstration_plots import draw_comparison, draw_residual_fields
     from fisheye_svp_ros.reporting.terminal import draw_or_note
 
-    draw_or_note(folder / 'errors.png', draw_comparison, rows)
+    drawn = draw_or_note(folder / _ANSWER, draw_comparison, rows)
     draw_or_note(folder / 'residuals.png', draw_residual_fields, fields)
+    return drawn

@@ -183,9 +183,9 @@ def _read_poses(path: str, cameras: Cameras, boards: tuple[BoardPose, ...]) -> P
                 return poses
     nearest = np.linalg.norm(poses.position, axis=-1).min()
     raise GeometryError(
-        f'{path}: from none of its poses the target is seen larger than '
-        f'{_MIN_SIZE:g} px, the nearest is {nearest:.3g} m from its origin; poses '
-        'of the camera in the frame of the target, in m, are needed'
+        f'{path}: from each of its poses, the target is smaller than {_MIN_SIZE:g} px. The '
+        f'nearest pose is {nearest:.3g} m from the origin. Give poses of the camera in the frame '
+        'of the target, in m'
     )
 
 

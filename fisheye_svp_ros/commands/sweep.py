@@ -30,7 +30,8 @@ from fisheye_svp_ros.io.files import (
 )
 from fisheye_svp_ros.io.share import sweep_path
 from fisheye_svp_ros.optics import engines
-from fisheye_svp_ros.reporting.terminal import print_table, progress
+from fisheye_svp_ros.reporting.terminal import print_table, progress, short_number
+from fisheye_svp_ros.reporting.wording.metrics import metric_text
 from fisheye_svp_ros.study.summary import Summary, summarize
 from fisheye_svp_ros.study.sweep import (
     Plan,
@@ -229,14 +230,7 @@ def _report(
 ) -> None:
     """Print and write what came out, metric by metric."""
     count = len(plan.sweep)
-    print_table(
-        f'{path}: {count_text(count, "scenario")}',
-        ('metric', 'sets', 'not solved', 'median', 'mean', 'largest'),
-        [
-            (name, str(s.solved), str(s.missing), *(f'{v:.6g}' for v in s[2:]))
-            for name, s in summaries.items()
-        ],
-    )
+    print_table(f'{path}: {count_text(count, "scenario")}', *_summary_table(summaries))
     write_json(
         folder / _SUMMARY,
         {
@@ -247,6 +241,22 @@ def _report(
             'metrics': {name: s._asdict() for name, s in summaries.items()},
         },
     )
+
+
+def _summary_table(
+    summaries: Mapping[str, Summary],
+) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return header and rows, in mm and degrees; without what is zero in every set."""
+    lost = any(summary.missing for summary in summaries.values())
+    header = ('metric', 'sets', *(('not solved',) if lost else ()), 'median', 'mean', 'largest')
+    rows = []
+    for name, summary in summaries.items():
+        text = metric_text(name)
+        numbers = [short_number(text.factor * value) for value in summary[2:]]
+        if set(numbers) != {'0'}:
+            missing = (str(summary.missing),) if lost else ()
+            rows.append((text.title(), str(summary.solved), *missing, *numbers))
+    return header, rows
 
 
 def _count(text: str) -> int:

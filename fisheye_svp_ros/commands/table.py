@@ -13,7 +13,7 @@ from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import plain_columns, write_table
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.recording import STAMP, is_tabulated, tabulate
-from fisheye_svp_ros.reporting.terminal import console, print_table, progress
+from fisheye_svp_ros.reporting.terminal import console, print_table, progress, short_number
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -104,4 +104,4 @@ def _blocks(tags: Cells, metrics: Cells) -> Iterator[Cells]:
 def _cell(value: Any) -> str:
     if value is None:
         return ''
-    return f'{value:.6g}' if isinstance(value, float) else str(value)
+    return short_number(value) if isinstance(value, float) else str(value)

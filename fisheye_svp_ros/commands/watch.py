@@ -47,6 +47,8 @@ def _result_table(watcher: Watcher, width: int) -> RenderableType:
     from rich import box
     from rich.table import Table
 
+    from fisheye_svp_ros.reporting.terminal import short_number
+
     if width < _MIN_COLUMNS:
         return f'the terminal must be {_MIN_COLUMNS} columns wide; this one has {width}'
     table = Table(box=box.SIMPLE_HEAD)
@@ -62,5 +64,5 @@ def _result_table(watcher: Watcher, width: int) -> RenderableType:
             text = metric_text(name)
             values = metric.latest, metric.total / metric.count, metric.largest
             shown = '_'.join(filter(None, text[:2]))
-            table.add_row('', shown, *(f'{text.factor * value:.6g}' for value in values))
+            table.add_row('', shown, *(short_number(text.factor * value) for value in values))
     return table

@@ -307,8 +307,8 @@ def find_hand_eye(linear: Linearization, poses: dict[int, Pose]) -> HandEye:
     except GeometryError as cause:
         raise ObservationError(
             f'{data.observations.source}: the given poses are neither those of the camera nor '
-            f'those of a flange that carries the camera or the target: {cause}; or leave the '
-            'poses out'
+            f'those of a flange that carries the camera or the target ({cause}). Correct the '
+            'poses, or leave them out'
         ) from cause
 
 

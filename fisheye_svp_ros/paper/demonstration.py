@@ -61,7 +61,8 @@ class Task(NamedTuple):
 TASKS = (
     Task(
         'localization',
-        'Self-localization as SVP. error: of the position along the axis; image: mean residual',
+        'Self-localization with the SVP model: position error along the axis, axis error, mean '
+        'image residual',
         'environment',
         SPREADS,
         'localizer',
@@ -70,8 +71,8 @@ TASKS = (
     ),
     Task(
         'calibration',
-        'Stereo calibration as SVP. error: of the place of the left camera, which depends on ten '
-        'poses that are not published; image: mean residual',
+        'Stereo calibration with the SVP model: position and axis error of the left camera, and '
+        'mean image residual. The errors depend on ten poses that Kita did not publish',
         'style',
         STYLE_NAMES,
         'stereo_calibrator',
@@ -80,8 +81,8 @@ TASKS = (
     ),
     Task(
         'depth',
-        'Stereo depth as SVP. error: Error3, mean distance from the true points; image: '
-        'Error2, mean distance from the epipolar curves; published: over all panels',
+        'Stereo depth with the SVP model: mean distance from the true points (Error3) and from '
+        'the epipolar curves (Error2). Kita published only ranges',
         'style',
         STYLE_NAMES,
         'stereo_depth',

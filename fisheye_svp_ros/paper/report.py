@@ -124,11 +124,11 @@ def _recovery(results: Results) -> Iterator[Block]:
     fits, count = results.family.matching, len(results.family.members)
     yield Heading('What the tables determine')
     yield Text(
-        'The lens curves, focal lengths and landmarks are not printed. They were solved for from '
-        f'tables 1 and 2 with the exact solver, from {count} starts, {len(fits)} of which '
-        'reproduce at least 35 of the 36 z and residual cells within 10 %. The best one is used '
-        'here; figures 9 and 10 and tables 3 and 4 were not used. To repeat the search: '
-        f'{COMMAND}.'
+        'The paper does not print the lens curves, the focal lengths, and the landmarks. They '
+        f'were recovered from tables 1 and 2 with the exact solver, from {count} starts. Of '
+        f'these, {len(fits)} reproduce at least 35 of the 36 values of z and residual within 10 '
+        '%. The best one is used here. Figures 9 and 10 and tables 3 and 4 were not used. To '
+        f'repeat the search: {COMMAND}.'
     )
     yield Picture(
         'figure4.png',
@@ -148,11 +148,11 @@ def _recovery(results: Results) -> Iterator[Block]:
         ]
     yield TableBlock(['lens', 'quantity', 'used', 'all fits'], rows, 2)
     yield Text(
-        'Determined: the shift of Fish180 to some tenths of a millimeter over the whole field, '
-        'that of Fish214 up to where the landmarks end (88 degree); beyond, it is undetermined. '
-        'Open: how f and the size of the shift share the residuals, the single coefficients of '
-        'the curve, and the position of every single landmark. Fish180 fits best with the largest '
-        'f that its image allows.'
+        'The tables determine the shift of Fish180 to a few tenths of a millimeter over the '
+        'whole field. They determine that of Fish214 up to where the landmarks end (88 '
+        'degrees). They do not determine how f and the size of the shift share the residuals. '
+        'Nor do they determine single coefficients of the curve and the positions of single '
+        'landmarks. Fish180 fits best with the largest f that its image allows.'
     )
 
 
@@ -175,13 +175,14 @@ def _stopping(results: Results) -> Iterator[Block]:
     off = 100 * study.off
     yield Heading('The inconsistent cell')
     yield Text(
-        'z of Fish180, Whole, 2.0 m is -0.1148 mm in the paper, -0.1614 and -0.1631 mm in the '
-        'rows below it; x, y and the row of Outer at 2.0 m are inconsistent too. At the published '
-        f'position the sum of squares is only {100 * study.relative_cost:.1f} % above the least '
-        'one: a solver that stops early may end there. Two ways of damping were tried, from 40 '
-        'starts within some 20 mm and 2 degree: in proportion to the data (Marquardt), and the '
-        'same for every mm and rad (Levenberg). Each stops when the sum of squares falls by less '
-        'than a limit in a step; the table has the median distance of z from the optimum, in %.'
+        'In the paper, z of Fish180, Whole, 2.0 m is -0.1148 mm, but -0.1614 and -0.1631 mm in '
+        'the rows below it. x, y, and the row of Outer at 2.0 m are inconsistent, too. At the '
+        f'published position, the sum of squares is only {100 * study.relative_cost:.1f} % '
+        'above the minimum, so a solver that stops early may end there. Two kinds of damping '
+        'were tried, from 40 starts within about 20 mm and 2 degrees. Marquardt damping is in '
+        'proportion to the data. Levenberg damping is the same for every mm and rad. Each '
+        'solver stops when a step reduces the sum of squares by less than a limit. The table '
+        'has the median distance of z from the optimum, in %.'
     )
     header = [
         'damping',
@@ -201,11 +202,11 @@ def _stopping(results: Results) -> Iterator[Block]:
     yield TableBlock(header, rows, 1)
     levenberg = off[0, 1, study.gains.index(1e-3)]
     yield Text(
-        'Stopping early with Levenberg damping explains the cell: at 0.001 px² z of Fish180, '
-        f'Whole, 2.0 m is off by {levenberg[0, 0]:.0f} % (published: 29 %) and Outer by '
-        f'{levenberg[0, 2]:.0f} %, while every cell nearer than 2.0 m is off by less than 1 %, '
-        'since a millimeter moves the image more there. Stopping early with Marquardt damping '
-        'would spoil Inner first, and does not explain it.'
+        'Stopping early with Levenberg damping explains the cell. At 0.001 px², z of Fish180, '
+        f'Whole, 2.0 m is off by {levenberg[0, 0]:.0f} % (published: 29 %), and Outer by '
+        f'{levenberg[0, 2]:.0f} %. Every cell nearer than 2.0 m is off by less than 1 %, '
+        'because a millimeter moves the image more there. Stopping early with Marquardt '
+        'damping does not explain the cell. It would spoil Inner first.'
     )
 
 
@@ -220,11 +221,11 @@ def _calibration_blocks(results: Results) -> Iterator[Block]:
         yield Heading(f'Table {table}: {NAMES[LENSES[table - 3]]}', 3)
         yield _comparison_table(results, table)
     yield Text(
-        'new: cells that the paper leaves empty. The ten poses are not printed either. The last '
-        f'columns of the list of differences below are results of {POSE_SETS} random sets of ten '
-        'poses: position errors depend at least as much on the poses as on the lens. The row '
-        'divergent, 0.2 m of table 3 repeats y, z and residual of divergent, 2.0 m digit by '
-        'digit, probably by mistake.'
+        'new: cells that the paper leaves empty. The paper does not print the ten poses, '
+        f'either. The last columns of the list of differences below come from {POSE_SETS} '
+        'random sets of ten poses. Position errors depend at least as much on the poses as on '
+        'the lens. In table 3, the row divergent, 0.2 m repeats y, z, and residual of '
+        'divergent, 2.0 m digit by digit, probably by mistake.'
     )
 
 
@@ -261,13 +262,13 @@ def _stereo_blocks(results: Results) -> Iterator[Block]:
         3,
     )
     yield Text(
-        'Points that one of the two cameras does not see are left out: the rig of Fish214 stands '
-        '0.1 m ahead, so that half of the landmarks at 0.2 m are behind it. Error2 is the mean '
-        'distance to the epipolar curve; measured within the column, as the drawn lines are, it '
-        'is up to a few times as large, since curves run steeply near the rim. The text contains '
-        'five of nine captions per lens; each was assigned to the panel that it fits best, in '
-        'printed order. Error3 is the mean distance of the points halfway between the two rays; '
-        'points near the line through both cameras dominate it.'
+        'Points that one of the two cameras does not see are left out. The rig of Fish214 is '
+        '0.1 m ahead, so half of the landmarks at 0.2 m are behind it. Error2 is the mean '
+        'distance to the epipolar curve. Measured within the column, like the drawn lines, it '
+        'is up to a few times as large, because curves are steep near the rim. The text '
+        'contains five of nine captions per lens. Each was assigned to the panel that it fits '
+        'best, in printed order. Error3 is the mean distance of the points halfway between the '
+        'two rays. Points near the line through both cameras dominate it.'
     )
     for name, figure in zip(LENSES, (9, 10), strict=True):
         yield Picture(
@@ -297,11 +298,11 @@ def _claims(results: Results) -> Iterator[Block]:
 def _solvers(results: Results) -> Iterator[Block]:
     yield Heading('Other solvers')
     yield Text(
-        'The same image points, solved with the ShiftVP lens, with a shift that is 10 % or 30 % '
-        'off, and with a shift that was calibrated (with f and the principal point) from 30 views '
-        f'of Whole with {CALIBRATION_NOISE} px of noise, one draw. A shift that is wrong by a '
-        'share leaves the same share of the SVP errors. The z error after a calibration grows '
-        'with the range: it comes from f. All cells are in paper.json.'
+        'The same image points are solved with the ShiftVP lens, with a shift 10 % or 30 % '
+        'off, and with a calibrated shift. The calibration (with f and the principal point) '
+        f'used 30 views of Whole with {CALIBRATION_NOISE} px of noise, in one draw. If the '
+        'shift is off by 10 %, 10 % of the SVP error remains. The z error after a calibration '
+        'grows with the range, because it comes from f. All cells are in paper.json.'
     )
     rows = []
     for variant, evaluations in results.found.items():
@@ -347,8 +348,9 @@ def _solvers(results: Results) -> Iterator[Block]:
 def _noise_blocks(results: Results) -> Iterator[Block]:
     yield Heading('Where noise hides the SVP error')
     yield Text(
-        'The range beyond which an SVP error is smaller than the noise: z against its standard '
-        'deviation, mean residual and Error2 against the noise of an image point. m.'
+        'The range, in m, beyond which an SVP error is smaller than the noise. z is compared '
+        'with its standard deviation, mean residual and Error2 with the noise of an image '
+        'point.'
     )
     rows = [
         [NAMES[c.lens], c.quantity, c.where, *(_range(value) for value in c.ranges)]

@@ -33,6 +33,7 @@ UNITS = {  # of the parameters of a lens; 1 where there is none
 _DEFAULT_WIDTH = 200  # columns where no terminal says how many it has
 _MIN_WIDTH = 10  # columns that text is broken into at the narrowest
 _MAX_REASON = 200  # characters of an error
+_ROUNDING, _ALL_DIGITS = 1e-9, 1e4  # what rounding leaves; from where all digits are shown
 _INTERVAL = 5.0  # seconds between lines where there is no terminal
 
 
@@ -108,11 +109,20 @@ def with_error(value: float, standard_error: float) -> tuple[str, str]:
     """Return a value and its standard error as text, to two digits of the error."""
     if not (math.isfinite(standard_error) and standard_error > 0):
         return f'{value:.6g}', '-'
-    decimals = max(0, 1 - math.floor(math.log10(standard_error)))
+    digits = 1 - math.floor(math.log10(standard_error))
+    decimals = max(0, digits)
     if decimals > 9:
         return f'{value:.6g}', f'{standard_error:.1e}'
-    text = f'{value:.{decimals}f}'
-    return without_minus_zero(text), f'{standard_error:.{decimals}f}'
+    text = f'{round(value, digits):.{decimals}f}'
+    return without_minus_zero(text), f'{round(standard_error, digits):.{decimals}f}'
+
+
+def short_number(value: float) -> str:
+    """Return a number for people: to four digits, what rounding leaves as 0."""
+    if abs(value) < _ROUNDING:
+        return '0'
+    whole = abs(value) >= _ALL_DIGITS or float(value).is_integer()
+    return f'{value:.0f}' if math.isfinite(value) and whole else f'{value:.4g}'
 
 
 def without_minus_zero(text: str) -> str:

@@ -87,7 +87,8 @@ def test_every_scenario_is_there_once_beside_the_published_numbers(demo: Any) ->
 
 def test_a_rectified_pair_is_shown(demo: Any) -> None:
     folder, out = demo
-    assert 'A pair of fish180, rectified at 0.5 m: difference between the rows' in out
+    assert 'A pair of fish180, rectified at 0.5 m: row difference between left' in out
+    assert out.startswith(f'{folder / "errors.png"}: the errors of this package')
     rows = json.loads((folder / 'demo.json').read_text())['rectified']
     worst = dict(zip(rows['ranges_m'], rows['worst_px'], strict=True))
     assert worst[0.5] < 1e-6 < 0.05 < worst[0.3]

@@ -227,8 +227,8 @@ def _read_matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> l
         )
     if shape is None or shape not in shapes:
         raise LensError(
-            f'{where}: a 3 x 3 matrix and the four coefficients of cv2.fisheye are needed; for '
-            'a rig, R (3 x 3) and T (3 x 1)'
+            f'{where}: a 3 x 3 matrix and four coefficients of cv2.fisheye are needed; for a '
+            'rig, R (3 x 3) and T (3 x 1)'
         )
     return fields.numbers({'data': data}, 'data', int(shape[0] * shape[1]), where)
 
