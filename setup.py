@@ -1,5 +1,6 @@
 """The package for pip and for colcon (ament_python)."""
 
+import sys
 from pathlib import Path
 
 from setuptools import find_packages, setup
@@ -18,6 +19,10 @@ nodes = (
     'model_critic',
 )
 
+# colcon installs by these commands, into lib/ of a workspace, where `ros2 run` looks; pip makes
+# wheels.  There, names such as `detector` would be on the path of everybody, and `fisheye-svp`
+# would be there twice.
+for_colcon = not {'install', 'develop'}.isdisjoint(sys.argv)
 wheels = "sys_platform == 'linux' and platform_machine == 'x86_64' and python_version < '3.15'"
 
 
@@ -38,7 +43,8 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (share, ['package.xml']),
-        ('bin', ['resource/fisheye-svp']),  # setup.cfg sends the scripts to lib/, off the path
+        # setup.cfg sends the scripts to lib/, off the path.
+        *([('bin', ['resource/fisheye-svp'])] if for_colcon else []),
         *tree('config'),
         *tree('launch'),
     ],
@@ -97,14 +103,13 @@ setup(
     },
     zip_safe=True,
     maintainer='fisheye_svp_ros maintainers',
-    maintainer_email='maintainers@fisheye-svp-ros.example',
     description='What the single-viewpoint approximation of a fisheye lens costs, and what a '
     'simulation gets wrong about measured image points.',
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
             f'fisheye-svp = {package_name}.cli:main',
-            *(f'{node} = {package_name}.nodes.executables:{node}' for node in nodes),
+            *(f'{node} = {package_name}.nodes.executables:{node}' for node in nodes if for_colcon),
         ],
     },
 )

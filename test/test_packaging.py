@@ -18,6 +18,7 @@ import pytest
 from helpers.nodes import ROOT
 
 from fisheye_svp_ros import __version__
+from fisheye_svp_ros.nodes import NODES
 
 # By package on PyPI, its key in rosdistro's rosdep/python.yaml; None: there is no key.
 ROSDEP = {
@@ -223,3 +224,19 @@ def test_editable_installations_are_paths_that_type_checkers_follow() -> None:
     text = (ROOT / 'Makefile').read_text()
     assert 'EDITABLE := --config-settings editable_mode=compat -e\n' in text
     assert " -e '." not in text and text.count('$(EDITABLE)') >= 1
+
+
+@pytest.mark.parametrize(
+    ('commands', 'for_colcon'),
+    [(['install'], True), (['develop'], True), (['bdist_wheel'], False)],
+)
+def test_scripts_of_nodes_are_only_where_ros2_run_looks(
+    commands: list[str], for_colcon: bool
+) -> None:
+    """A pip installation put nine of them on the path, and fisheye-svp twice."""
+    pytest.importorskip('setuptools')
+    with contextlib.chdir(ROOT):
+        setup = import_module('distutils.core').run_setup('setup.py', commands, 'init')
+    scripts = {line.partition(' ')[0] for line in setup.entry_points['console_scripts']}
+    assert scripts - {'fisheye-svp'} == (set(NODES) if for_colcon else set())
+    assert ('bin' in dict(setup.data_files)) == for_colcon
