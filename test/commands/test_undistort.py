@@ -450,7 +450,7 @@ def test_what_cannot_be_rendered_is_said_in_a_line(
     write_poses(tmp_path / 'mm.csv', np.arange(2), away)
     end = '--board', 'chessboard:6x5:30mm', '-o', tmp_path / 'out'
     said = refused(capsys, 'render', '--lens', 'fish180', '--poses', tmp_path / 'mm.csv', *end)
-    assert 'mm.csv: from none of its poses the target' in said and 'in m, are needed' in said
+    assert 'mm.csv: from each of its poses, the target is smaller' in said and 'in m' in said
     for name in ('left', 'right'):
         shutil.copy(folder / 'lenses' / f'{name}.yaml', tmp_path)
     said = refused(capsys, 'render', '--lens', f'{tmp_path}/', '--count', 1, *end)

@@ -188,7 +188,7 @@ def test_calibrate_does_not_pass_over_what_no_lens_explains(tmp_path, capsys):
     write_observations(tmp_path / 'points.csv', replace(table, sigma=np.full(len(table), np.nan)))
     points, lens = (str(tmp_path / name) for name in ('points.csv', 'lens.yaml'))
     main(['calibrate', points, '--image-size', f'{width}x{height}', '-o', lens])
-    assert re.search(r'px are \d+\.\d times the noise of image points', capsys.readouterr().err)
+    assert re.search(r'px is \d+\.\d times the image noise', capsys.readouterr().err)
 
 
 @once('sound')

@@ -263,7 +263,7 @@ def test_cameras_without_a_common_frame():
     (said,) = found.cameras
     assert said.verdict == 'agree' and said.maps.correlation > 0.95 and not said.rig
     assert not said.posed_alone
-    assert 'too few frames are shared' in sections(found)[0].sentence
+    assert 'Too few frames are shared' in sections(found)[0].sentence
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         assert known_errors(found.evaluation.simulation, found.evaluation.fixed_model, ()) == {}

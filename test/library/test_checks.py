@@ -28,7 +28,7 @@ SIDE, IMAGE = fsvp.undistort_maps(LENS), np.zeros((400, 424), np.uint8)
             lambda: fsvp.detect('.', BOARD, detector='zzz'),
             "detector 'zzz' does not find chessboard",
         ),
-        (lambda: fsvp.detect('.', BOARD, detector='circles'), 'take one of saddle, quick, sb, cl'),
+        (lambda: fsvp.detect('.', BOARD, detector='circles'), 'choose from saddle, quick, sb, cl'),
         (lambda: fsvp.detect('.', 3), "board '3': known kinds are chessboard"),
         (lambda: fsvp.detect([], BOARD), 'no photographs; give at least one'),
         (lambda: fsvp.detect('.', BOARD, every=0), 'every is 0; 1 or more is needed'),

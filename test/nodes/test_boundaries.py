@@ -327,7 +327,7 @@ def test_files_are_named_below_the_folder_alone(
     for name, reason in (
         (outside, 'is not below'),
         (inside.parent / 'link.yaml', 'is not below'),
-        (inside.parent / 'fifo.yaml', 'is no file'),
+        (inside.parent / 'fifo.yaml', 'is not a file'),
         ('/dev/zero', 'not below'),
         (inside.parent / 'huge.yaml', 'above 64 MB'),
         ('plain', 'not below'),

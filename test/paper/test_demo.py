@@ -128,7 +128,7 @@ def test_as_observations_it_says_how_to_record_one_of_its_namespaces(demo: Any) 
 
 def test_the_table_and_the_pictures_are_there(demo: Any) -> None:
     folder, printed = demo
-    assert printed.count(' as SVP. error: ') == 3
+    assert printed.count(' with the SVP model: ') == 3
     lines = printed.splitlines()
     assert sum(line.startswith('  fish180 ') for line in lines) == 9 and '-0.1614' in printed
     assert 'Error2' in printed and 'Error3' in printed

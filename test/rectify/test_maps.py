@@ -200,7 +200,7 @@ def test_impossible_cameras_and_ranges_are_refused() -> None:
             rectified_camera(projection, (640, 480), np.radians(degrees))
     with pytest.raises(ParameterError, match='size is 0x480'):
         rectified_camera('pinhole', (0, 480), 1.0)
-    with pytest.raises(ParameterError, match='has no straight epipolar rows; take one of pinhole'):
+    with pytest.raises(ParameterError, match='has no straight epipolar rows; choose from pinhole'):
         rectified_camera('fisheye', (640, 480), 1.0, along_baseline=True)
     for range_m in (0.0, -1.0, np.nan, 0.003):
         with pytest.raises(ParameterError, match=r"range is .*lens 'small' needs more than"):
