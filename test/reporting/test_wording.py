@@ -278,9 +278,9 @@ def test_wrong_corners_of_tags_are_named_by_the_tag():
         WrongLandmark(36 + corner, 18, 300.2 - corner, np.full(3, np.nan)) for corner in (0, 1)
     ]
     assert list(wrong_landmark_notes([*moved, *lost], of_tags=True)) == [
-        'tag not where the map says: 6 by 30.1 mm; rejected; measure it again',
-        'tag 9: its 36 points are 300 px off and no other place explains them; rejected; check '
-        'its number',
+        'tag 6 is 30.1 mm from its stated position and is rejected. Measure it again',
+        'tag 9: its 36 points are 300 px off, and no other position explains them. They are '
+        'rejected. Check its number',
     ]
 
 
