@@ -104,7 +104,7 @@ def test_of_mirror_images_only_a_board_whose_y_points_up_leaves_a_diagnosis_soun
     note_upwards(replace(table, xyz=upwards(table.xyz)), {'': LENS})
     note_upwards(table, {'': LENS})
     (line,) = capsys.readouterr().err.splitlines()
-    assert 'its y points up' in line and 'count y downwards' in line
+    assert 'its y points up' in line and 'count y downward' in line
 
 
 def test_a_view_alone_or_seen_edge_on_has_no_side() -> None:

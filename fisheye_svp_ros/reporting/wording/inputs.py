@@ -171,7 +171,7 @@ def points_mirrored(what: str, mirror: Mirror) -> str:
     if mirror == Mirror.Y_UPWARDS:
         return (
             f'{what}: every frame shows the board from behind: its y points up and its z out of '
-            'it; poses refer to that frame; for z into the board, count y downwards'
+            'it. Poses refer to that frame. For z into the board, count y downward'
         )
     return (
         f'{what}: every frame shows the board from behind: {MIRROR_WORDS[mirror]}; {MIRROR_REMEDY}'
