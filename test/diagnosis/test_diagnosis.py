@@ -5,7 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.scenes import lens, observe, scene
+from helpers import scenes
+from helpers.scenes import lens, observe
 
 from fisheye_svp_ros.diagnosis import Action, DiagnosisOptions, diagnose
 from fisheye_svp_ros.diagnosis.problem import Inputs, Problem
@@ -28,6 +29,11 @@ from fisheye_svp_ros.solve.outliers import FRAME, VIEW, find_outliers
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 SIGMA = 0.2
+
+
+def scene(rng, cameras=1, frames=16):
+    """Return views and poses of few frames, by which the cost of a diagnosis goes."""
+    return scenes.scene(rng, cameras, frames)
 
 
 def fitted(seed, terms=(), cameras=1, free=(), simulated=None):
@@ -241,7 +247,7 @@ def test_near_points_that_a_cause_explains_are_no_gross_errors():
 
 def test_points_that_say_themselves_how_unsure_they_are_are_no_gross_errors():
     rng = np.random.default_rng(22)
-    pose, views = scene(rng)
+    pose, views = scene(rng, frames=24)
     clean = observe(lens(), (), pose, views, 0.0, rng)
     sigma = np.full(len(clean), SIGMA)
     sigma[::40] = 6 * SIGMA
@@ -469,7 +475,7 @@ def test_rigs_and_frames_that_see_little(kept):
 
 def test_the_last_fit_is_the_best_under_the_last_variances():
     rng = np.random.default_rng(25)
-    pose, views = scene(rng)
+    pose, views = scene(rng, frames=24)
     moves = rng.normal(size=views.points[0].shape) * 1e-3
     terms = [
         ModelTerm(
