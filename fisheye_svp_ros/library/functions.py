@@ -446,7 +446,7 @@ def diagnose(
     held_out: other frames of the same camera and target to measure the gain on; against: of the
     same camera with another target or of another day, where causes of the lens must hold, too;
     poses: of the camera, or of the flange of a robot that carries it, which the data tell apart;
-    with_, without: names of effects that are known to be there, or not to be;
+    `with_`, without: names of effects that are known to be there, or not to be;
     next: how many photographs to take next are listed in `document['next']`, those that separate
     the causes best; number, room: as in `plan`, by default what is unclear, and the distances of
     the observations;
