@@ -38,6 +38,7 @@ _RECENT = 1e9  # s since 1970, in 2001
 _PER_SECOND = {'nanoseconds': 1e9, 'microseconds': 1e6, 'milliseconds': 1e3}
 _MAX_VALUE = 1e12  # m, px or s; squares and products of anything larger are soon no numbers
 _MAX_PIXEL = 1e6  # px; no image reaches so far
+_MAX_PLACE = 1e8  # m; the farthest places on Earth are 2e7 apart
 _MIN_UNSEEN_ROWS = 5
 
 REQUIRED_COLUMNS = ('frame', 'landmark', 'u', 'v', 'x', 'y', 'z')
@@ -243,6 +244,11 @@ def read(path: str | Path) -> Observations:
         table.refuse(
             np.abs(column) > _MAX_PIXEL, name, f'a place in an image, up to {_MAX_PIXEL:g} px,'
         )
+    xyz = table.numbers('x', 'y', 'z')
+    for name, column in zip('xyz', xyz.T, strict=True):
+        table.refuse(
+            np.abs(column) > _MAX_PLACE, name, f'a place in meters, up to {_MAX_PLACE:g},'
+        )
     _refuse_unseen(table, np.stack([frame, camera], axis=-1), uv)
     sigma = table.known_numbers('sigma') if 'sigma' in table else None
     if sigma is not None:
@@ -252,7 +258,7 @@ def read(path: str | Path) -> Observations:
         frame,
         landmark,
         uv,
-        table.numbers('x', 'y', 'z'),
+        xyz,
         camera=camera,
         board=table.integers('board') if 'board' in table else None,
         t=table.numbers('t')[:, 0] if 't' in table else None,

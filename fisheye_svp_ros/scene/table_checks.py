@@ -14,6 +14,7 @@ from fisheye_svp_ros.scene.observations import Observations, rig_cameras, select
 ROUNDING = 1e-7  # px: what is simulated without noise scatters by less, nothing measured does
 MAX_TARGET_SIZE = 20.0  # m; a target larger than this was measured in other units
 MAX_NOISE = 1e3  # px, of an image point: beyond it nothing is measured
+_MIN_NOISE = 1e-6  # px: of less, errors over noise, or their squares, overflow
 _MIN_SIGMA, _MIN_SIGMA_SHARE = 1e-6, 1e-3  # px, and of the median
 SIGMA_BOUND = f'{_MIN_SIGMA:g} px or more, and {_MIN_SIGMA_SHARE:g} of the median or more'
 _COPIED_SHARE = 0.5  # of the image points: no two photographs have so many alike
@@ -37,6 +38,8 @@ def check_noise(noise: float) -> None:
     """Raise ParameterError for a standard deviation of u and of v, px, that nobody means."""
     if not 0 < noise <= MAX_NOISE:
         raise ParameterError(f'noise is {noise:g} px; above 0 and up to {MAX_NOISE:g} is needed')
+    if noise < _MIN_NOISE:
+        raise ParameterError(f'noise is {noise:g} px; at least {_MIN_NOISE:g} px is needed')
 
 
 def implausible_sigma(sigma: Array) -> Mask:

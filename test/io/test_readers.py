@@ -174,9 +174,9 @@ class TestObservationsCsv:
         fails(csv(text + f'2{row}\n'), 'line 5', says)  # the first of several
 
     def test_the_largest_numbers(self, csv):
-        table = read_observations(csv(f'{HEADER}\n{2**53},{2**32 - 1},1,2,-1e12,4,1e12\n'))
+        table = read_observations(csv(f'{HEADER}\n{2**53},{2**32 - 1},1,2,-1e8,4,1e8\n'))
         assert (table.frame[0], table.landmark[0]) == (2**53, 2**32 - 1)
-        assert table.xyz[0].tolist() == [-1e12, 4.0, 1e12]
+        assert table.xyz[0].tolist() == [-1e8, 4.0, 1e8]
 
     @pytest.mark.parametrize(
         ('name', 'cell', 'says'),
@@ -209,6 +209,13 @@ class TestObservationsCsv:
     def test_bad_optional_cell(self, csv, name, cell, says):
         text = f'{HEADER},{name}\n0,4,1,2,3,4,5,1\n0,5,1,2,3,4,5,{cell}\n'
         fails(csv(text), 'line 3', says)
+
+    @pytest.mark.parametrize('name', ['x', 'y', 'z'])
+    def test_a_place_that_is_not_on_earth(self, csv, name):
+        """Its frame was left out, as one whose points are near one line."""
+        cells = {'x': '3', 'y': '4', 'z': '5'} | {name: '-1e9'}
+        text = f'{HEADER}\n0,4,1,2,3,4,5\n0,5,1,2,{",".join(cells.values())}\n'
+        fails(csv(text), 'line 3', f"{name} is '-1e9'; a place in meters, up to 1e+08, is needed")
 
     @pytest.mark.parametrize('unseen', ['-1,-1', '0,0', '-9999,-9999'])
     def test_rows_of_points_that_were_not_seen(self, csv, unseen):

@@ -160,6 +160,12 @@ def test_impossible_noise(noise):
         make_budget(Setup(LENS, rig('parallel'), noise))
 
 
+def test_a_noise_that_overflows_is_refused():
+    """The answer divided by limits of 0."""
+    with pytest.raises(ParameterError, match='noise is 1e-300 px; at least 1e-06 px'):
+        make_budget(Setup(LENS, rig('parallel'), 1e-300))
+
+
 def test_the_command_says_yes_and_no(tmp_path, capsys):
     assert main(['budget', '--lens', 'fish214', '--max-residual', '100']) == 0
     said = ' '.join(capsys.readouterr().out.split())

@@ -128,14 +128,17 @@ def read(text: str, where: str) -> Foreign:
 def _failures(named: Mapping[str, Any], lenses: Mapping[str, tuple[Lens, float]]) -> Iterator[str]:
     """Yield why the calibration that a file is of has failed, by its own figures."""
     stated = next((named[name] for name in _ERRORS if name in named), None)
-    poor = isinstance(stated, int | float) and stated > _MAX_ERROR
+    poor = [f'the file states {stated:.3g} px'] if _is_poor(stated) else []
     for camera, (lens, _) in lenses.items():
         begun = abs(lens.fx - lens.width / np.pi) < 1e-6 * lens.width and lens.fx == lens.fy
         begun = begun and not any(lens.image_height.coefficients)
         if begun or poor:
-            reasons = [f'the file states {stated:.3g} px'] * poor
-            reasons += ["f = width / pi without distortion is OpenCV's start value"] * begun
-            yield f'{camera}: {", ".join(reasons)}: this fit failed; calibrate again'
+            start = ["f = width / pi without distortion is OpenCV's start value"] * begun
+            yield f'{camera}: {", ".join(poor + start)}: this fit failed; calibrate again'
+
+
+def _is_poor(stated: Any) -> bool:
+    return isinstance(stated, int | float) and stated > _MAX_ERROR
 
 
 def _names_of_side(names: Sequence[str], side: str) -> list[str]:
