@@ -164,6 +164,8 @@ def _run(arguments: Sequence[str]) -> None:
             'use on a machine. auto: numba for long work, numpy otherwise. Default: '
             'FISHEYE_SVP_ENGINE, or auto',
         )
+    if '' in arguments and named != 'run':  # as a path it would be the folder that one is in
+        parser.error('an argument is empty; a variable of the shell may be unset')
     parsed, unknown = parser.parse_known_args(arguments)
     if unknown:
         chosen = commands.choices[named]

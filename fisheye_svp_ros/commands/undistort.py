@@ -142,7 +142,7 @@ def _projection(text: str) -> str:
     except ValueError:
         raise argparse.ArgumentTypeError(
             f'{text!r} is unknown; choose from {", ".join((*PROJECTIONS, CUBEMAP))} and '
-            'perspective:YAW,PITCH,FOV in degrees, for example perspective:45,0,90'
+            'perspective:YAW,PITCH,FOV in degrees, up to 360, for example perspective:45,0,90'
         ) from None
     return text
 
@@ -150,7 +150,8 @@ def _projection(text: str) -> str:
 def _view(text: str) -> View:
     kind, _, angles = text.partition(':')
     yaw, pitch, field = (float(np.radians(float(word))) for word in angles.split(','))
-    if kind != _PERSPECTIVE or not np.isfinite([yaw, pitch, field]).all():
+    turns = np.abs([yaw, pitch]) <= 2 * np.pi  # NaN is none
+    if kind != _PERSPECTIVE or not (turns.all() and np.isfinite(field)):
         raise ValueError(text)
     return perspective_view(yaw, pitch, field)
 

@@ -680,6 +680,21 @@ def test_measured_data(tmp_path):
             ['calibrte', 'x'],
             'unknown command calibrte; did you mean calibrate? (see fisheye-svp --help)',
         ),
+        *(
+            (words, 'an argument is empty; a variable of the shell may be unset')
+            for words in (
+                ['example', '-o', ''],
+                ['localize', '', '--lens', 'fish214'],
+                ['localize', 'o.csv', '--lens', ''],
+            )
+        ),
+        *(
+            (
+                ['undistort', 'fish214', '--as', f'perspective:{angles}', '-o', 'u'],
+                f"argument --as: 'perspective:{angles}' is unknown",
+            )
+            for angles in ('1e300,0,90', '0,361,90', 'nan,0,90')
+        ),
     ],
 )
 def test_a_slip_is_answered_with_what_there_is(words, said, capsys):
