@@ -199,9 +199,9 @@ def _convert(lenses: Sequence[Lens], steps: Sequence[Pose], args: argparse.Names
 def _at_range(lens: Lens, args: argparse.Namespace) -> tuple[Lens, tuple[float, ...]]:
     """Return the lens, or the SVP lens nearest at the range that is asked for, and ranges, m."""
     given, ranges = lens, _RANGES
-    if args.range_m is not None and not args.range_m > 0:
-        raise ParameterError(f'--range {args.range_m:g}: a distance in m, above 0, is needed')
     if args.range_m is not None and lens.is_svp:
+        if not args.range_m > 0:
+            raise ParameterError(f'--range {args.range_m:g}: a distance in m, above 0, is needed')
         say(f'--range {args.range_m:g} changes nothing: lens {lens.name!r} has a single viewpoint')
     elif args.range_m is not None:
         given, worst = nearest_svp_lens(lens, args.range_m)
