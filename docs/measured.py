@@ -16,6 +16,26 @@ RESULTS = ROOT / 'docs' / 'results'
 README = ROOT / 'README.md'
 INDEX = RESULTS / 'index.md'
 _MARKS = '<!-- evidence -->', '<!-- end of evidence -->'
+_NUMBER = re.compile(r'(?<![\w/])\d+\.\d+|\b\d+ %')
+_DATED = re.compile(r'^\*Measured on [^*]*\*\n\n', re.MULTILINE)
+_VERSION = '1.1.0'
+_DIAGNOSIS = ('diagnosis', 'mixed_model', 'effects')
+# Rooms that a page measures, where it is not the diagnosis.
+ROOMS = {
+    'benchmarks': (),
+    'detectors': ('detect',),
+    'hand_eye': ('solve',),
+    'mutation': (),
+    'paper': ('paper', 'solve', 'optics'),
+    'pose_covariance': ('solve',),
+    'rectification': ('rectify',),
+    'rectifier': ('rectify',),
+    'reliability': ('solve',),
+    'rig_transforms': ('solve',),
+    'rigs': ('solve',),
+    'rules': (),
+    'tag_drive': ('solve',),
+}
 _HEAD = """# Measured results
 
 Each figure stands on its page with how it was measured; this table is made from the pages
@@ -188,6 +208,40 @@ def date(claim: Claim) -> str:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout.strip()
 
 
+def numbers_date(page: Path) -> str:
+    """Return the date of the last commit that changed a number of a page; '' where there is none.
+
+    Its own first line is left out.
+    """
+    name = page.relative_to(ROOT).as_posix()
+    commits = _git('log', '--format=%h %cs', '--', name).split('\n')
+    for commit, day in (line.split() for line in commits if line):
+        texts = (_git('show', f'{version}:{name}') for version in (f'{commit}^', commit))
+        before, after = (_NUMBER.findall(_DATED.sub('', text)) for text in texts)
+        if before != after:
+            return day
+    return ''
+
+
+def dated(page: Path) -> str:
+    """Return a page with the date of its numbers, and whether their code was edited since."""
+    day, text = numbers_date(page), page.read_text(encoding='utf-8')
+    title, _, rest = _DATED.sub('', text).partition('\n\n')
+    rooms = [f'fisheye_svp_ros/{room}' for room in ROOMS.get(page.stem, _DIAGNOSIS)]
+    edited = _git('log', '-1', '--format=%cs', '--', *rooms).strip() if rooms else ''
+    note = f'*Measured on {day} with version {_VERSION}.'
+    if edited > day:
+        note += (
+            f' The code that it measures was last edited on {edited}. Run the command again before'
+            ' you rely on a figure.'
+        )
+    return f'{title}\n\n{note}*\n\n{rest}'
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(['git', *words], cwd=ROOT, capture_output=True, text=True).stdout
+
+
 def index() -> str:
     """Return the page of all claims."""
     rows = [
@@ -215,7 +269,10 @@ def readme(text: str) -> str:
 
 
 def main() -> None:
-    """Write both files."""
+    """Write both files, and the dates of the pages of results."""
+    for page in sorted(RESULTS.glob('*.md')):
+        if page != INDEX:
+            page.write_text(dated(page), encoding='utf-8')
     INDEX.write_text(index(), encoding='utf-8')
     README.write_text(readme(README.read_text(encoding='utf-8')), encoding='utf-8')
 

@@ -163,3 +163,11 @@ def test_the_figures_of_the_first_pages_are_those_of_the_results() -> None:
     assert measured.readme(text) == text and len(text.splitlines()) <= 150
     pages = {path.stem for path in measured.RESULTS.glob('*.md')}
     assert {claim.page for claim in measured.CLAIMS} <= pages
+
+
+def test_every_page_of_results_says_when_it_was_measured() -> None:
+    """A reader took figures of older code for those of the present one."""
+    for page in (ROOT / 'docs' / 'results').glob('*.md'):
+        if page.stem != 'index':
+            note = page.read_text(encoding='utf-8').split('\n\n')[1]
+            assert re.match(r'\*Measured on 20\d\d-\d\d-\d\d with version \d', note), page.name

@@ -87,9 +87,9 @@ class Readout:
             return covariance, ''
         turn, off = (float(np.linalg.norm(part)) for part in (velocity[3:], bias[0, :3]))
         return covariance + bias[:, :, None] * bias[:, None, :], (
-            f'a rolling shutter of {1e3 * self._seconds:.0f} ms moves the pose by {1e3 * off:.2g} '
-            f'mm at {turn:.2g} rad/s, which the covariance now covers; set readout_time (0: '
-            'global shutter)'
+            f'a rolling shutter of {1e3 * self._seconds:.0f} ms moves the pose by '
+            f'{1e3 * off:.2g} mm at {turn:.2g} rad/s. The covariance covers that. Set '
+            'readout_time (0: global shutter)'
         )
 
 
