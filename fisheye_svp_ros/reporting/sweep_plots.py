@@ -188,13 +188,13 @@ def _draw_grids(
 ) -> None:
     with _axes(path, len(metrics), 4.4, 3.6) as (figure, axes):
         for axis, metric in zip(axes, metrics, strict=True):
-            medians = grid(table, metric.column, x, y)
-            values = np.ma.masked_invalid(metric.factor * medians.median)
+            columns, lines, median = grid(table, metric.column, x, y)
+            values = np.ma.masked_invalid(metric.factor * median)
             positive = values.compressed()[values.compressed() > 1e-6]
             wide = positive.size and positive.max() > 30 * positive.min()
             norm = LogNorm(positive.min(), positive.max()) if wide else None
             mesh = axis.imshow(values, origin='lower', aspect='auto', cmap=_COLORS, norm=norm)
-            for set_ticks, cells in ((axis.set_xticks, medians.x), (axis.set_yticks, medians.y)):
+            for set_ticks, cells in ((axis.set_xticks, columns), (axis.set_yticks, lines)):
                 step = -(-len(cells) // _TICKS)
                 set_ticks(range(0, len(cells), step), [f'{cell:g}' for cell in cells[::step]])
             axis.tick_params(axis='x', rotation=45)

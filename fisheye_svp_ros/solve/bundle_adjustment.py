@@ -175,13 +175,13 @@ def adjust_lens(lens: Lens, views: Views, pose: Pose, names: Sequence[str]) -> A
     linear = Linearization(data, fitted, names)
     _, arrow = _arrow_equations(linear, linear.shared_columns)
     _check_determined(arrow, names)
-    covariance = arrow_covariance(arrow)
+    of_poses, of_lens = arrow_covariance(arrow)
     return AdjustedLens(
         fitted.lens,
         tuple(names),
-        covariance.shared[0],
+        of_lens[0],
         fitted.pose,
-        covariance.blocks[0],
+        of_poses[0],
         linear.residual_px,
         (linear.residual**2).sum(axis=1),
         bool(solved.converged[0]),

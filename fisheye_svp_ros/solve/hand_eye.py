@@ -426,7 +426,7 @@ class _HandEyeAdjustment(Adjustment):
         inverse = np.linalg.inv(blocks)
         coupled = -frame @ inverse @ equations.cross[0]
         coupled[..., -PARAMETERS:] += shared
-        whole = arrow_covariance(tuple(equations)).shared[0]
+        whole = arrow_covariance(tuple(equations))[1][0]
         variance = frame @ inverse @ np.swapaxes(frame, -1, -2)
         variance = variance + coupled @ whole @ np.swapaxes(coupled, -1, -2)
         leverage = np.diagonal(variance, axis1=-2, axis2=-1) * self._weight**2
@@ -449,7 +449,7 @@ class _HandEyeAdjustment(Adjustment):
                 'the poses of the robot do not determine the hand-eye transform; '
                 'turn the flange about two axes or more, and move it'
             )
-        whole = arrow_covariance(normal).shared[0]
+        whole = arrow_covariance(normal)[1][0]
         return np.asarray(self._robot.sigma**2 * whole[-PARAMETERS:, -PARAMETERS:])
 
     def _equations(self, packed: Arrays, system: int) -> tuple[Array, Arrays]:

@@ -199,13 +199,6 @@ class ArrowEquations(NamedTuple):
     shared_gradient: Array
 
 
-class ArrowCovariance(NamedTuple):
-    """Covariance of the blocks (S, V, B, B) and of the shared parameters (S, K, K)."""
-
-    blocks: Array
-    shared: Array
-
-
 def arrow_of_views(
     cost: Array, hessian: Array, gradient: Array, block: int
 ) -> tuple[Array, Arrays]:
@@ -253,8 +246,8 @@ def arrow_information(normal: Arrays) -> Array:
     return np.asarray(reduced * shared_scale[:, :, None] * shared_scale[:, None, :])
 
 
-def arrow_covariance(normal: Arrays) -> ArrowCovariance:
-    """Return the covariance of every block and of the shared parameters, whitened rows assumed.
+def arrow_covariance(normal: Arrays) -> tuple[Array, Array]:
+    """Return the covariances of blocks (S, V, B, B) and of shared parameters (S, K, K), whitened.
 
     A direction that the rows do not determine is left out of it: check `arrow_information` first.
     """
@@ -264,7 +257,7 @@ def arrow_covariance(normal: Arrays) -> ArrowCovariance:
     shared = _inverse(reduced)
     leverage = eliminated[..., :-1]
     blocks = _inverse(scaled.blocks) + leverage @ shared[:, None] @ np.swapaxes(leverage, -1, -2)
-    return ArrowCovariance(
+    return (
         blocks / (block_scale[..., :, None] * block_scale[..., None, :]),
         shared / (shared_scale[:, :, None] * shared_scale[:, None, :]),
     )

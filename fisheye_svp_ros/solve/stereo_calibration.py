@@ -72,15 +72,15 @@ def calibrate_stereo(
     pose, rig = start or _starts(left, right, left_views, right_views, systems)
     solved = _solve_rigs((left, right), (left_views, right_views), (*pose, *rig))
     pose, rig = Pose(*solved.state[:2]), Pose(*solved.state[2:])
-    covariance = arrow_covariance(solved.normal)
+    of_poses, of_rig = arrow_covariance(solved.normal)
     lost = ~solved.converged
     shape = (*pose.shape, -1, 2)
-    covariance.shared[lost] = covariance.blocks[lost] = np.nan
+    of_rig[lost] = of_poses[lost] = np.nan
     return StereoCalibration(
         rig,
-        covariance.shared,
+        of_rig,
         pose,
-        covariance.blocks,
+        of_poses,
         residuals(left, _left_pose(pose, rig).reshape(-1), left_views).reshape(shape),
         residuals(right, pose.reshape(-1), right_views).reshape(shape),
         solved.cost,

@@ -31,14 +31,6 @@ class ErrorCurve(NamedTuple):
     high: Array
 
 
-class Grid(NamedTuple):
-    """The median (Y, X) of an error over values of two parameters, NaN where there is none."""
-
-    x: list[Any]
-    y: list[Any]
-    median: Array
-
-
 class ResidualRatio(NamedTuple):
     """Residuals beside their noise: ratio (K,) of rms to sigma, and the density noise predicts.
 
@@ -88,8 +80,11 @@ def curves(table: DataFrame, metric: str, x: str, by: Sequence[str]) -> list[Err
     return drawn
 
 
-def grid(table: DataFrame, metric: str, x: str, y: str) -> Grid:
-    """Return the median of the magnitude of an error over two parameters."""
+def grid(table: DataFrame, metric: str, x: str, y: str) -> tuple[list[Any], list[Any], Array]:
+    """Return values (X,), (Y,) of two parameters, and the median magnitude (Y, X) of an error.
+
+    NaN where there is none.
+    """
     values, columns, lines = (
         np.abs(_metric_column(table, metric)),
         _slots(table, x),
@@ -101,7 +96,7 @@ def grid(table: DataFrame, metric: str, x: str, y: str) -> Grid:
             cell = values[np.intersect1d(line, column)]
             if np.isfinite(cell).any():
                 median[i, j] = np.nanmedian(cell)
-    return Grid(list(columns), list(lines), median)
+    return list(columns), list(lines), median
 
 
 def noise_spreads(table: DataFrame, by: str | None) -> list[ResidualRatio]:

@@ -82,9 +82,9 @@ def test_a_picture_shows_no_more_curves_than_can_be_told_apart(
 
 
 def test_a_grid_holds_magnitudes() -> None:
-    found = grid(TABLE, 'localizer.rms_px', 'environment', 'radius')
-    assert (found.x, found.y) == (['a', 'b'], [1.0, 2.0])
-    assert found.median.tolist() == [[2.0, 7.0], [5.0, 8.0]]
+    x, y, median = grid(TABLE, 'localizer.rms_px', 'environment', 'radius')
+    assert (x, y) == (['a', 'b'], [1.0, 2.0])
+    assert median.tolist() == [[2.0, 7.0], [5.0, 8.0]]
 
 
 def test_of_calibrations_only_those_of_all_sets_count() -> None:
