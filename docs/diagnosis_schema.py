@@ -38,7 +38,6 @@ from fisheye_svp_ros.diagnosis import (  # noqa: E402
 from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame  # noqa: E402
 from fisheye_svp_ros.diagnosis.evaluation import FitQuality, Intrinsic  # noqa: E402
 from fisheye_svp_ros.diagnosis.variance_budget import Component, Structure  # noqa: E402
-from fisheye_svp_ros.diagnosis.written_lens import AveragedShift  # noqa: E402
 from fisheye_svp_ros.reporting.diagnosis_document import (  # noqa: E402
     ADVICE,
     CANDIDATE,
@@ -73,6 +72,11 @@ def _entry(kind: type, keys: Keys) -> Fields:
 
 
 PARAMETER: Fields = {'value': float, 'stderr': float, 'unit': str}
+AVERAGED: Fields = {
+    'effect': str,
+    'probability': float,
+    'parameters': dict[str, PARAMETER],  # type: ignore[valid-type]
+}
 DECISION: Fields = {
     'say': str,
     'why': str,
@@ -93,7 +97,7 @@ FIELDS: Fields = {
         'rms_px': float,
         'heldout_rms_px': float,
         'ray_error_mrad': dict,
-        'averaged_shift': NotRequired[list[AveragedShift]],
+        'averaged_effects': NotRequired[list[AVERAGED]],  # type: ignore[valid-type]
         'image_field': NotRequired[dict],
     },
     'extended': FitQuality,

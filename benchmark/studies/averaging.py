@@ -1,4 +1,4 @@
-"""What averaging over a viewpoint shift is worth: `make study NAME=averaging`.
+"""What averaging over all likely models is worth: `make study NAME=averaging`.
 
 Few photographs of a board that may be bent, through a Kannala-Brandt lens whose viewpoint may
 move; the image points are formed by a few lines of their own. Each set is calibrated and
@@ -42,12 +42,17 @@ def trial(seed: int) -> Outcome:
     seen, truth = draw_set(seed)
     given, found = study.calibrated_and_diagnosed(seen, (WIDTH, HEIGHT), free_intrinsics=True)
     named = found.evaluation.extended_lenses(found.evaluation.null.linear.state)['']
-    shift, names = found.evaluation.averaged_model.shifts, [cause.effect for cause in found.causes]
+    names = [cause.effect for cause in found.causes]
+    shift = [
+        one
+        for one in found.evaluation.averaged_model.effects
+        if one.effect.name == 'viewpoint_shift'
+    ]
     written = getattr(found.lens.viewpoint_shift, 'e0', 0.0)
     return Outcome(
         truth.viewpoint_shift.e0,
         written,  # type: ignore[union-attr]
-        shift[0].stderr if shift else 0.0,
+        float(shift[0].stderr[0]) if shift else 0.0,
         shift[0].weight if shift else 0.0,
         'viewpoint_shift' in names,
         tuple(study.ray_error(lens, truth, seen.uv) for lens in (given, named, found.lens)),
@@ -78,7 +83,7 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
                 ]
             )
     return study.page(
-        'Averaging over a viewpoint shift',
+        'Averaging over all likely models',
         __doc__,
         command,
         [

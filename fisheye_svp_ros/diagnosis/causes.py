@@ -19,6 +19,7 @@ from fisheye_svp_ros.diagnosis.effect_tests import (
     EffectTests,
 )
 from fisheye_svp_ros.diagnosis.findings import Status, probability_of, status_of
+from fisheye_svp_ros.diagnosis.posterior import EffectPosterior
 from fisheye_svp_ros.diagnosis.random_effects import SAG
 from fisheye_svp_ros.diagnosis.sagging import SagOdds, bend_over_sag
 from fisheye_svp_ros.diagnosis.variance_budget import NoiseGrowth
@@ -31,7 +32,6 @@ from fisheye_svp_ros.scene.observations import Observations, photograph_entry
 from fisheye_svp_ros.solve.outliers import Outliers
 from fisheye_svp_ros.solve.port_fit import MEDIUM_INDEX, THICKNESS
 
-_CONFOUNDED_SHARE = 0.3  # of the statistic, that the other explains by itself
 _PORT_UNITS = {
     MEDIUM_INDEX: '',
     'port_distance': 'm',
@@ -59,7 +59,8 @@ class Cause:
     that are not tested and that it may stand for; refuted_by_frames: first and last frame of
     contiguous thirds that are predicted worse with it; odds: of each of the confounded set, of
     which this is the first, where one of them is there; of a bend also against a sag of the board,
-    where it sags; {} of a cause alone.
+    where it sags; {} of a cause alone; posterior: how probable it is, or one of the set, by all
+    likely models, None where these do not ask for it.
     """
 
     form: str
@@ -73,6 +74,7 @@ class Cause:
     imitations: tuple[Imitation, ...] = ()
     refuted_by_frames: tuple[tuple[int, int], ...] = ()
     odds: Mapping[str, float] = field(default_factory=dict)
+    posterior: float | None = None
 
     @property
     def effect(self) -> str:
@@ -82,7 +84,7 @@ class Cause:
     @property
     def probability(self) -> float:
         """How probable the cause is, or one of its confounded set."""
-        return probability_of(self.p_value)
+        return probability_of(self.p_value) if self.posterior is None else self.posterior
 
     @property
     def status(self) -> Status:
@@ -118,16 +120,20 @@ class Cause:
 
 def selected_causes(
     tests: EffectTests,
+    posterior: EffectPosterior,
     found: Sequence[ModelTerm],
     errors: Array,
     shares: dict[str, float],
     held_out: Sequence[tuple[float, float]],
 ) -> list[Cause]:
-    """Return the causes that move predictions; held_out: rms and gain once each is in."""
+    """Return the causes that move predictions; held_out: rms and gain once each is in.
+
+    A cause is as probable as that it, or one of its confounded set, is there.
+    """
     causes = []
     for term, (rms, gain) in zip(found, held_out, strict=True):
         effect, columns, name = term.effect, term.columns, term.name
-        odds = confounded_odds(tests, name, columns)
+        odds = confounded_odds(tests, posterior, term)
         alike = [rival for rival in odds if rival != name]
         sag = bend_over_sag(tests, columns) if name == TargetShapeEffect.name else None
         if sag is not None:
@@ -145,6 +151,7 @@ def selected_causes(
                 gain=gain,
                 indistinguishable_from=alike,
                 odds=odds,
+                posterior=posterior.probability_beside(name, odds),
                 imitations=_imitations(tests, alike, columns),
             )
         )
@@ -233,43 +240,39 @@ def _survives(tests: EffectTests, effect: Effect, columns: Index) -> bool:
     return True
 
 
-def confounded_effects(tests: EffectTests, name: str, columns: Index) -> list[str]:
-    """Return the effects with which in the model this one would no longer be needed."""
-    return [rival for rival in confounded_odds(tests, name, columns) if rival != name]
+def confounded_effects(
+    tests: EffectTests, posterior: EffectPosterior, term: ModelTerm
+) -> list[str]:
+    """Return the effects that may be there in the place of one."""
+    return [rival for rival in confounded_odds(tests, posterior, term) if rival != term.name]
 
 
-def confounded_odds(tests: EffectTests, name: str, columns: Index) -> dict[str, float]:
+def confounded_odds(
+    tests: EffectTests, posterior: EffectPosterior, term: ModelTerm
+) -> dict[str, float]:
     """Return how probable each of a confounded set is, one of them being there; {} for one alone.
 
-    The effect is the first; the others are those with which in the model it would no longer be
-    needed.  By the score of each in its place (`EffectTests.log_odds`); what is rarer, or only
-    tested where the user states it, is less likely before the data.
+    The effect is the first; the others are those that likely models have in its place, and those
+    that are tested only where the user states them and do what it does.
     """
-    if CATALOGUE[name].asked_last:
+    name, columns = term.name, term.columns
+    if term.effect.per_frame or term.effect.asked_last:
         return {}
-    null = tests.null
-    rest = np.setdiff1d(null.included_columns, columns)
-    score = tests.score_beside(rest, columns)
-    others = [
-        (candidate.effect, null.form_columns(candidate.form), candidate.score)
-        for candidate in tests.candidates(rest)
-    ]
+    if name not in posterior.probabilities:
+        posterior = EffectPosterior.of_null_model(tests.null)  # as if it need not be there
+    chance = posterior.probabilities.get(name, 0.0)
+    odds = {name: chance, **posterior.in_place_of(name)}
     if CATALOGUE[name].budget_stage() == 'lens':
-        others += [(effect, at, tests.score_beside(rest, at)) for effect, at in null.look_alikes]
-    odds = {name: tests.log_odds(score) - RARITY_ODDS * bool(CATALOGUE[name].rarer_than)}
-    for effect, at, theirs in others:
-        if null.effect_kinds & set(effect.kinds) or effect.name in odds:
-            continue
-        if theirs.statistic < _CONFOUNDED_SHARE * score.statistic:
-            continue
-        own = tests.score_beside(np.concatenate([rest, at]), columns)
-        if own.p_value > CONFOUNDED_P:
-            rare = bool(effect.rarer_than) or any(effect is one for one, _ in null.look_alikes)
-            odds[effect.name] = tests.log_odds(theirs) - RARITY_ODDS * rare
-    if len(odds) == 1:
-        return {}
-    shares = special.softmax(np.array([*odds.values()]) / 2)
-    return dict(zip(odds, shares.tolist(), strict=True))
+        rest = np.setdiff1d(tests.null.included_columns, columns)
+        score = tests.score_beside(rest, columns)
+        for effect, at in tests.null.look_alikes:
+            theirs = tests.score_beside(rest, at)
+            beside = tests.score_beside(np.concatenate([rest, at]), columns)
+            if beside.p_value > CONFOUNDED_P and not tests.null.effect_kinds & {*effect.kinds}:
+                log_odds = tests.log_odds(theirs) - tests.log_odds(score) - RARITY_ODDS
+                odds[effect.name] = chance * float(np.exp(min(log_odds, 0.0) / 2))
+    total = sum(odds.values())
+    return {rival: share / total for rival, share in odds.items()} if len(odds) > 1 else {}
 
 
 def _with_sag(odds: Mapping[str, float], name: str, sag: SagOdds) -> dict[str, float]:

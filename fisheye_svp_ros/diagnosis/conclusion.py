@@ -35,7 +35,6 @@ from fisheye_svp_ros.diagnosis.lens_evidence import compare_lens_files, find_bou
 from fisheye_svp_ros.diagnosis.random_effects import BEND, MILLIMETRE, SAG
 from fisheye_svp_ros.diagnosis.variance_budget import Component, significant_components
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.effects.target_map import board_maps
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations, frame_names
@@ -454,11 +453,9 @@ def _worst_rays(errors: Mapping[str, Mapping[str, Sequence[RayError]]]) -> tuple
 def _unexplained_corrections(evaluation: Evaluation) -> list[str]:
     """Return what the written lens has that no confirmed cause stands for."""
     field = evaluation.written_field
-    parts = {
-        'viewpoint_shift': bool(evaluation.averaged_model.shifts),
-        'image_field': field is not None and bool(field.fields),
-    }
-    return [name for name, there in parts.items() if there]
+    effects = [one.effect.name for one in evaluation.averaged_model.effects]
+    written = ['image_field'] if field is not None and field.fields else []
+    return list(dict.fromkeys((*effects, *written)))
 
 
 def _open_effects(evaluation: Evaluation, candidates: Sequence[Finding]) -> dict[str, float]:
@@ -469,10 +466,8 @@ def _open_effects(evaluation: Evaluation, candidates: Sequence[Finding]) -> dict
         if candidate.status is not Status.REFUTED
         and CATALOGUE[candidate.effect].budget_stage() == 'lens'
     }
-    shifts = evaluation.averaged_model.shifts
-    if shifts:
-        found[ViewpointShiftEffect.name] = max(shift.weight for shift in shifts)
-    return found
+    averaged = {one.effect.name: one.weight for one in evaluation.averaged_model.effects}
+    return found | averaged
 
 
 def _target_facts(

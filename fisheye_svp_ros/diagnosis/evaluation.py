@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.diagnosis.averaging import AveragedModel
 from fisheye_svp_ros.diagnosis.causes import Cause, medium_cause, selected_causes
 from fisheye_svp_ros.diagnosis.checks.medium import Medium, stated_parameters
 from fisheye_svp_ros.diagnosis.cross_validation import (
@@ -32,15 +33,11 @@ from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
 from fisheye_svp_ros.diagnosis.model_errors import ModelErrors, shared_names
 from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.diagnosis.posterior import EffectPosterior
 from fisheye_svp_ros.diagnosis.problem import Problem, extended_lenses
-from fisheye_svp_ros.diagnosis.selection import Selection
+from fisheye_svp_ros.diagnosis.selection import Selection, known_effects
 from fisheye_svp_ros.diagnosis.similar_views import similar_views
-from fisheye_svp_ros.diagnosis.uncertainty import (
-    OtherModel,
-    likely_models,
-    standard_errors,
-    total_errors,
-)
+from fisheye_svp_ros.diagnosis.uncertainty import standard_errors, total_errors
 from fisheye_svp_ros.diagnosis.variance_budget import (
     Component,
     cause_squares,
@@ -49,7 +46,7 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
     scatter_px,
     variance_budget,
 )
-from fisheye_svp_ros.diagnosis.written_lens import AveragedModel, WrittenField
+from fisheye_svp_ros.diagnosis.written_lens import WrittenField
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.mixed_model import run_in_threads
 from fisheye_svp_ros.optics.lens import Lens
@@ -156,13 +153,21 @@ class Evaluation:
 
     @cached_property
     def averaged_model(self) -> AveragedModel:
-        """The model whose lens is written: with the shifts that may be there."""
-        return AveragedModel.from_selection(self.selection)
+        """The model whose lens is written: with the effects that may be there."""
+        return AveragedModel.of_posterior(self.posterior)
+
+    @cached_property
+    def posterior(self) -> EffectPosterior:
+        """The likely models, with all that the user knows of."""
+        selection = self.selection
+        return EffectPosterior.of_null_model(
+            selection.null, known_effects(selection.problem), selection.refuted
+        )
 
     @cached_property
     def written_field(self) -> WrittenField | None:
         """The image field that is written, or why it is not; None where none is predicted."""
-        return WrittenField.from_selection(self.selection, self.fitted)
+        return WrittenField.from_model(self.averaged_model, self.fitted)
 
     @cached_property
     def model_errors(self) -> ModelErrors:
@@ -185,23 +190,21 @@ class Evaluation:
         return self.model_errors.summary(self.written_model)
 
     @cached_property
-    def other_models(self) -> list[OtherModel]:
-        """Other likely models; none of them with a shift that is averaged over."""
-        if self.problem.options.quick:
-            return []
-        return likely_models(self.null, self.averaged_model.kinds)
-
-    @cached_property
     def errors(self) -> Array:
         """Standard errors of all that is shared."""
-        return self._errors_of(self.null, None if self.averaged_model.kinds else self.other_models)
+        return self._errors_of(self.null, self.averaged_model)
 
-    def _errors_of(self, null: NullModel, models: list[OtherModel] | None = None) -> Array:
+    def _errors_of(self, null: NullModel, averaged: AveragedModel | None = None) -> Array:
         return (
             standard_errors(null, jackknife=False)
             if self.problem.options.quick
-            else total_errors(null, models)
+            else total_errors(null, averaged)
         )
+
+    @cached_property
+    def _own_errors(self) -> Array:
+        """Standard errors of all that is shared, by the fitted model alone."""
+        return standard_errors(self.null, jackknife=not self.problem.options.quick)
 
     def predict(
         self, without: Sequence[str] = (), offsets: PredictedOffsets | None = None
@@ -423,7 +426,12 @@ class Evaluation:
             for name, after in zip(self.names, predictions[1:], strict=True)
         ]
         causes = selected_causes(
-            EffectTests(self.null), self.selection.causes, self.errors, shares, held_out
+            EffectTests(self.null),
+            self.posterior,
+            self.selection.causes,
+            self.errors,
+            shares,
+            held_out,
         )
         causes = [
             replace(cause, refuted_by_frames=self._refuting_frames.get(cause.effect, ()))
@@ -466,11 +474,11 @@ class Evaluation:
         """Free intrinsics before and after, with errors under the null model."""
         if self.medium is not None:
             return {}
-        selection = self.selection
-        written = self.averaged_model
-        alone = self._errors_of(self.null, self.other_models) if written.kinds else self.errors
-        errors = np.sqrt(np.diag(written.widen(np.diag(alone**2))))
-        after = dict(zip(shared_names(written.linear), errors, strict=True))
+        selection, written = self.selection, self.averaged_model
+        names, own = shared_names(written.linear), np.diag(np.nan_to_num(self._own_errors) ** 2)
+        errors = written.added_covariance()
+        errors[np.ix_(written.place, written.place)] += own
+        after = dict(zip(names, np.sqrt(np.diag(errors)), strict=True))
         given = stated_parameters(selection.problem.inputs.lenses)
         before = dict(
             zip(

@@ -95,7 +95,7 @@ class Finding:
     held_out, held_out_stderr: what it adds to the log predictive density of frames left out, NaN
     where that was not asked; z: by how many of its errors over the frames the held-out sum of
     squares falls with it; parameters: value, stderr, unit by name, as far as it was fitted;
-    averaged: its probability in the average of models that is written, None where it is not in it.
+    posterior: how probable it is by all likely models, None where these do not ask for it.
     """
 
     form: str
@@ -109,7 +109,7 @@ class Finding:
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     rival: Rival | None = None
     z: float = 0.0
-    averaged: float | None = None
+    posterior: float | None = None
 
     @property
     def effect(self) -> str:
@@ -130,7 +130,7 @@ class Finding:
             return 0.0
         if self.reason.refutes:
             return 1 / (1 + exp(min(self.z**2, _MAX_SQUARE) / 2))
-        return probability_of(self.p_corrected) if self.averaged is None else self.averaged
+        return probability_of(self.p_corrected) if self.posterior is None else self.posterior
 
     @property
     def is_accepted(self) -> bool:

@@ -27,7 +27,6 @@ from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.model_errors import mask_shared
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.uncertainty import LensCovariance
-from fisheye_svp_ros.diagnosis.written_lens import OpenShifts
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.mixed_model import project_out, pseudo_inverse, solve_lower
 from fisheye_svp_ros.optics.lens import Lens
@@ -84,11 +83,15 @@ def compare_lens_files(evaluation: Evaluation) -> FileFigure:
 
 
 def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
-    null, shifts = evaluation.null, OpenShifts.from_selection(evaluation.selection)
-    linear, ratio = null.linear, noise_ratio(null.linear)
+    null, averaged = evaluation.null, evaluation.averaged_model
+    linear, ratio, at = null.linear, noise_ratio(null.linear), averaged.border
     now, given = _shared_values(evaluation)
-    of_lens = np.append(lens_columns(linear), np.ones(len(shifts.columns), dtype=bool))
-    at = null.columns_and_residual(shifts.columns)
+    whole = averaged.refit(null.information[np.ix_(at, at)])
+    of_lens = averaged.columns_of_lens.copy()
+    of_lens[: len(now)] = lens_columns(linear)
+    always = np.isin(np.arange(len(now)), averaged.posterior.fixed)
+    before = np.zeros(len(at) - 1)
+    before[: len(now)] = (np.where(always, now, 0.0) - given) * null.scale[: len(now)]
     refit_rig = _rig_response(null, at[:-1])
     residual = np.zeros((*linear.residual.shape, 2))
     _, rows, fields = null.leave_one_out(at)
@@ -96,19 +99,20 @@ def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
     lenses = evaluation.problem.inputs.lenses.values()
     both_change = all(_is_of_these_data(evaluation, lens) for lens in lenses)
     for frame, information in enumerate(null.information_without_frames(at)):
-        change, added, combination = shifts.refit(null, information)
+        left = averaged.refit(information)
         # Without the frame, a lens that was fitted to it changes as the extended one does.
-        between = now - given if both_change else now + change - given
-        new = np.append(between, np.zeros(len(shifts.columns)))
-        off = np.where(of_lens, new * null.scale[at[:-1]] + added, 0.0)
+        off = before + left.values
+        if both_change:
+            off[left.always] -= left.with_effects_of(whole) - whole.values[left.always]
+        off = np.where(of_lens, off, 0.0)
         off[: len(refit_rig)] -= refit_rig @ off
-        residual[frame] = (rows[frame] @ combination)[:, None]
+        residual[frame] = (rows[frame] @ left.combination)[:, None]
         residual[frame, :, 0] += null.fixed.border[frame][:, at[:-1]] @ off
         if has_field:
-            residual[frame, :, 0] += fields[frame] @ combination
+            residual[frame, :, 0] += fields[frame] @ left.combination
     even = ratio[..., None]
-    left = project_out(residual * even, linear.frame_columns * even) / even
-    return sum_squares(linear, left[..., 0]), sum_squares(linear, left[..., 1])
+    left_over = project_out(residual * even, linear.frame_columns * even) / even
+    return sum_squares(linear, left_over[..., 0]), sum_squares(linear, left_over[..., 1])
 
 
 def _rig_response(null: NullModel, at: Index) -> Array:
@@ -216,9 +220,7 @@ def find_lens_rays(
     if evaluation.medium is not None:
         return {}, None
     quick = evaluation.problem.options.quick
-    known = LensCovariance.from_model(
-        evaluation.null, evaluation.averaged_model, None if quick else evaluation.other_models
-    )
+    known = LensCovariance.from_model(evaluation.null, evaluation.averaged_model, quick)
     fresh = evaluation.extended_lenses(_generalized_state(evaluation.selection.first))
     views = known.linear.data.views
     errors, offsets, asked = {}, [], evaluation.problem.options.range_m
@@ -251,9 +253,7 @@ def map_lens_rays(evaluation: Evaluation) -> dict[str, RayMap]:
     if evaluation.medium is not None:
         return {}
     quick = evaluation.problem.options.quick
-    known = LensCovariance.from_model(
-        evaluation.null, evaluation.averaged_model, None if quick else evaluation.other_models
-    )
+    known = LensCovariance.from_model(evaluation.null, evaluation.averaged_model, quick)
     if not lens_columns(known.linear).any():
         return {}
     views, lenses = known.linear.data.views, evaluation.problem.inputs.lenses

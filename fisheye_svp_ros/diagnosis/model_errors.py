@@ -208,11 +208,14 @@ def pose_maps(columns: Array) -> Array:
     return np.asarray(np.linalg.solve(turned @ columns, turned))
 
 
-def shared_names(linear: Linearization) -> tuple[str, ...]:
-    """Return the names of what is shared in a linearization: rig, intrinsics, effects."""
+def shared_names(linear: Linearization, state: RigState | None = None) -> tuple[str, ...]:
+    """Return the names of what is shared in a linearization: rig, intrinsics, effects.
+
+    state: whose effects, None for its own.
+    """
     terms = [
         name
-        for term in linear.state.terms
+        for term in (state or linear.state).terms
         if is_shared(term.effect)
         for name in parameter_names(term.effect)
     ]

@@ -172,7 +172,7 @@ def _most_causes(null: NullModel) -> int:
 def _change_effects(problem: Problem, search: _Search, null: NullModel, most: int) -> _Search:
     """Remove effects and add others; where none changes, single landmarks that stand out."""
     tests, options = EffectTests(null), problem.options
-    included, steps = eliminate_effects(tests, _known_effects(problem), options.quick)
+    included, steps = eliminate_effects(tests, known_effects(problem), options.quick)
     gone = [step.effect for step in steps]
     # What was given up is not asked for again.
     refused = {step.effect for step in (*search.trace, *steps) if step.reason.is_removal}
@@ -272,7 +272,7 @@ def _finish(problem: Problem, search: _Search, changed: bool) -> tuple[_Search, 
         if not changed:
             return search, null  # all that is in the model was asked for beside these variances
         included, steps = eliminate_effects(
-            EffectTests(null), _known_effects(problem), options.quick
+            EffectTests(null), known_effects(problem), options.quick
         )
         if not steps:
             return search, null
@@ -299,7 +299,7 @@ def without_cause(selection: Selection, name: str) -> Selection:
     return replace(selection, null=null)
 
 
-def _known_effects(problem: Problem) -> tuple[str, ...]:
+def known_effects(problem: Problem) -> tuple[str, ...]:
     """Return what is not asked for: what the lens came with and what the user includes."""
     return (*problem.options.included, *(effect.name for effect in problem.given_effects))
 

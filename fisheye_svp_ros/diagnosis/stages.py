@@ -304,14 +304,8 @@ def _conclude(
         evaluation.uncertainty['image_px']['misfit'],
         evaluation.extended_lenses,
     )
-    if averaged.shifts:
-        likeliest = max(shift.weight for shift in averaged.shifts)
-        candidates = [
-            replace(candidate, averaged=likeliest)
-            if candidate.effect == 'viewpoint_shift'
-            else candidate
-            for candidate in candidates
-        ]
+    known = evaluation.posterior.probabilities
+    candidates = [replace(one, posterior=known.get(one.effect)) for one in candidates]
     advice = advise(evaluation, causes, significant, _holds_back(candidates))
     conclusion = conclude(
         evaluation,
@@ -323,7 +317,7 @@ def _conclude(
     )
     field = evaluation.written_field
     for camera, (name, lens) in enumerate(lenses.items()):
-        lens = conclusion.with_ray_error(averaged.with_shift_entry(lens, name), name)
+        lens = conclusion.with_ray_error(averaged.with_entry(lens, name), name)
         lenses[name] = lens if field is None else field.add_to(lens, camera)
     return Diagnosis(
         **vars(conclusion),
@@ -395,7 +389,7 @@ def _evidence(evaluation: Evaluation) -> Iterator[Evidence]:
     tests, full = EffectTests(null), cross_validate(null)
     kept = full.is_predictable
     confounded = [
-        (term.name, term.columns, confounded_effects(tests, term.name, term.columns))
+        (term.name, term.columns, confounded_effects(tests, evaluation.posterior, term))
         for term in null.terms
         if not term.effect.per_frame
     ]

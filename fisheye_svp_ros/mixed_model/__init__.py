@@ -8,6 +8,7 @@ covariance, leave-one-group-out predictions.  It knows no camera, board, lens or
     equations      Henderson's mixed-model equations, factored block by block
     solution       estimates and predictions, their covariance, groups left out one by one
     reml           variances by restricted maximum likelihood, which the data call for, p-values
+    model_averaging  which added columns are there: all likely subsets, their coefficients
     score_tests    Rao's score tests of added fixed columns and of variances at zero
     threads        work on all cores
 """
@@ -21,6 +22,17 @@ from fisheye_svp_ros.mixed_model.equations import (
     make_equations,
     no_variances,
     solve_lower,
+)
+from fisheye_svp_ros.mixed_model.model_averaging import (
+    Coefficients,
+    Estimates,
+    Models,
+    Options,
+    Products,
+    estimate_models,
+    find_coefficients,
+    find_models,
+    log_evidence,
 )
 from fisheye_svp_ros.mixed_model.model_columns import (
     Components,
@@ -69,11 +81,16 @@ from fisheye_svp_ros.mixed_model.threads import map_in_threads, run_in_threads
 __all__ = [
     'IDENTIFIABLE',
     'LAMBDA_ABSENT',
+    'Coefficients',
     'Components',
     'Equations',
+    'Estimates',
     'FactoredEquations',
     'LeaveOneOut',
+    'Models',
+    'Options',
     'Posterior',
+    'Products',
     'RandomColumns',
     'Score',
     'Solution',
@@ -82,8 +99,11 @@ __all__ = [
     'component_p_values',
     'component_squares',
     'eliminate',
+    'estimate_models',
     'estimate_variances',
     'factor_equations',
+    'find_coefficients',
+    'find_models',
     'find_variances',
     'group_basis',
     'identifiable_basis',
@@ -91,6 +111,7 @@ __all__ = [
     'integrate_columns',
     'is_called_for',
     'leave_groups_out',
+    'log_evidence',
     'make_equations',
     'map_in_threads',
     'multiply_rows',

@@ -9,20 +9,17 @@ from helpers.scenes import lens, observe, scene
 
 from benchmark.study import ray_error
 from fisheye_svp_ros.diagnosis import NullModel, lens_evidence
+from fisheye_svp_ros.diagnosis.averaging import AveragedModel
 from fisheye_svp_ros.diagnosis.lens_evidence import _distances
 from fisheye_svp_ros.diagnosis.null_model import cluster_frames
+from fisheye_svp_ros.diagnosis.posterior import EffectPosterior
 from fisheye_svp_ros.diagnosis.problem import extended_lenses
-from fisheye_svp_ros.diagnosis.uncertainty import (
-    LensCovariance,
-    likely_models,
-    standard_errors,
-    total_errors,
-)
+from fisheye_svp_ros.diagnosis.uncertainty import LensCovariance, standard_errors, total_errors
 from fisheye_svp_ros.effects.base import ModelTerm
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.ray_errors import SAMPLES, ray_model, typical_points
+from fisheye_svp_ros.solve.ray_errors import ray_model, typical_points
 from fisheye_svp_ros.solve.rig_state import group_by_frame
 
 SIGMA = 0.01
@@ -53,24 +50,17 @@ def test_effects_that_hide_each_other_move_rays_less_than_parameters():
     data = group_by_frame(table)
     begin = replace(initial_state(data, lens()), terms=(ModelTerm(terms[0].effect, np.zeros(2)),))
     null = NullModel.estimate(data, adjust(data, begin, CENTER), CENTER)
-    columns = null.column_count
     uv = typical_points(data.views.uv[data.views.used])
-    fitted = extended_lenses({'': lens()}, null.linear.state, table)['']
     truth = reduce(lambda one, term: term.effect.extend(one, term.values), terms, lens())
+    averaged = AveragedModel.of_posterior(EffectPosterior.of_null_model(null))
+    fitted = extended_lenses({'': lens()}, averaged.linear.state, table)['']
     off = ray_error(fitted, truth, uv, (1.0,))
-
-    errors = total_errors(null)
-    parameters_alone = LensCovariance(
-        null.linear,
-        np.diag(errors**2),
-        np.zeros((columns, SAMPLES)),
-        np.ones(columns),
-        np.arange(columns),
-    )
-    known = replace(parameters_alone, covariance=np.zeros((columns, columns)))
-    known = known.with_other_models(null, likely_models(null), rng)
+    known = LensCovariance.from_model(null, averaged, quick=False)
     stated = stated_mrad(known, lens(), table, uv)
     assert off / 3 < stated < 3 * off
+    alone = np.zeros(len(known.others))
+    alone[averaged.place] = total_errors(null, averaged) ** 2
+    parameters_alone = replace(known, covariance=np.diag(alone), others=0 * known.others)
     assert stated_mrad(parameters_alone, lens(), table, uv) > 3 * stated
 
 
@@ -80,11 +70,8 @@ def test_what_few_frames_left_out_say_is_a_sample_too():
     pose, views = scene(rng, frames=6)
     data = group_by_frame(observe(lens(), [], pose, views, SIGMA, rng))
     null = NullModel.estimate(data, adjust(data, initial_state(data, lens()), CENTER), CENTER)
-    own = np.arange(null.column_count)
-    averaged = SimpleNamespace(
-        linear=null.linear, place=own, draw_shifts=lambda rng, count: np.zeros((len(own), count))
-    )
-    known = LensCovariance.from_model(null, averaged, likely_models(null))
+    averaged = AveragedModel.of_posterior(EffectPosterior.of_null_model(null))
+    known = LensCovariance.from_model(null, averaged, quick=False)
     said = standard_errors(null) / standard_errors(null, jackknife=False)
     assert known.freedom == cluster_frames(null.linear).max() + 16
     assert said.max() > 1.05 and (known.ratios < said)[said > 1.05].all()

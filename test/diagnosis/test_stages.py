@@ -12,6 +12,7 @@ from fisheye_svp_ros.diagnosis import EffectTests, NullModel, Reason, Rival, dia
 from fisheye_svp_ros.diagnosis.causes import selected_causes
 from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain
 from fisheye_svp_ros.diagnosis.findings import Doubt, find_doubt
+from fisheye_svp_ros.diagnosis.posterior import EffectPosterior
 from fisheye_svp_ros.diagnosis.stages import find_rival
 from fisheye_svp_ros.diagnosis.stepwise import eliminate_effects
 from fisheye_svp_ros.effects.base import ModelTerm
@@ -196,7 +197,9 @@ def test_p_values_are_corrected_once(false_tilt):
     corrected = min(1.0, alone * false_tilt.effect_count * forms)
     shares = {term.name: 0.1 for term in null.terms}
     errors = np.ones(null.column_count)
-    *_, cause = selected_causes(false_tilt, null.terms, errors, shares, [(0.1, 0.0)] * 2)
+    posterior = EffectPosterior.of_null_model(null)
+    held_out = [(0.1, 0.0)] * 2
+    *_, cause = selected_causes(false_tilt, posterior, null.terms, errors, shares, held_out)
     assert cause.p_value == corrected > alone
     _, steps = eliminate_effects(false_tilt, ('focal_drift',), quick=True)
     assert all(one.p_corrected == corrected for one in steps)

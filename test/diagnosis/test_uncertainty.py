@@ -1,7 +1,6 @@
 """Uncertainty: noise, parameters, and the misfit that remains."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from scipy import linalg
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, NullModel, diagnose
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
 from fisheye_svp_ros.diagnosis.model_errors import ModelErrors
-from fisheye_svp_ros.diagnosis.uncertainty import likely_models, model_weights
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
@@ -175,17 +173,3 @@ def dense_square(null, sigma):
     way[:, len(inverse) - random.fields.shape[1] :] = random.fields.toarray()
     mean = way @ mean
     return 1e-6 * (sigma**2 * way @ inverse @ way.T + np.outer(mean, mean))
-
-
-def test_the_chosen_model_is_there_however_many_are_likelier(monkeypatch):
-    """Four cameras and a board had forty likelier models, all with effects no lens file takes."""
-    monkeypatch.setattr('fisheye_svp_ros.diagnosis.uncertainty._MAX_MODELS', 0)
-    data = group_by_frame(photographs(AIR, None, 4))
-    null = NullModel.estimate(data, adjust(data, initial_state(data, AIR), ()), ())
-    (chosen,) = likely_models(null)
-    np.testing.assert_array_equal(chosen.included, null.included_columns)
-
-
-def test_a_model_three_times_as_likely_has_three_quarters():
-    models = [SimpleNamespace(criterion=value) for value in (7.0, 7.0 + 2 * np.log(3.0))]
-    np.testing.assert_allclose(model_weights(models), [0.25, 0.75])

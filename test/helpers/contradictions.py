@@ -76,10 +76,9 @@ def _beliefs(document: Document) -> Iterator[str]:
             yield f'{cause["effect"]} is confirmed and gains {cause["gain"]:.3f}'
         if all(abs(one['value']) < one['stderr'] for one in cause['parameters'].values()):
             yield f'{cause["effect"]} is confirmed, and within its error'
-    for shift in document['lens'].get('averaged_shift', []):
-        for entry in candidates:
-            if entry['effect'] == 'viewpoint_shift' and entry['probability'] < shift['weight']:
-                yield f'a shift of weight {shift["weight"]:.2f} at {entry["probability"]:.2f}'
+    for written in document['lens'].get('averaged_effects', []):
+        if written['effect'] in names:
+            yield f'{written["effect"]} is a cause, and written without being one'
 
 
 def _moves_predictions(cause: Mapping[str, Any]) -> bool:
@@ -114,9 +113,8 @@ def _lens(document: Document) -> Iterator[str]:
         if any(CATALOGUE[one['effect']].budget_stage() == 'lens' for one in causes):
             yield 'the lens is kept beside a cause in it'
         costs = {one['effect']: one['edge_mrad'] for one in lens['bound']}
-        for entry in (*document['candidates'], *document['lens'].get('averaged_shift', [])):
-            effect = entry.get('effect', 'viewpoint_shift')
-            likely = entry.get('weight', entry.get('probability')) > 0.5
+        for entry in (*document['candidates'], *document['lens'].get('averaged_effects', [])):
+            effect, likely = entry['effect'], entry['probability'] > 0.5
             of_lens = CATALOGUE[effect].budget_stage() == 'lens'
             if likely and of_lens and costs[effect] > 1.0:
                 yield f'the lens is kept beside a likely {effect} that costs over 1 mrad'
@@ -180,9 +178,10 @@ def _bounds(document: Document) -> Iterator[str]:
         if bound['effect'] in causes:
             yield f'{bound["effect"]} is a cause, and bounded'
         if bound['effect'] == 'viewpoint_shift':
-            for shift in document['lens'].get('averaged_shift', []):
-                if abs(shift['e0']) > bound['value']:
-                    yield f'a shift of {shift["e0"]:.2g}, at most {bound["value"]:.2g} m'
+            for written in document['lens'].get('averaged_effects', []):
+                e0 = written['parameters'].get('e0', {'value': 0.0})['value']
+                if abs(e0) > bound['value']:
+                    yield f'a shift of {e0:.2g}, at most {bound["value"]:.2g} m'
 
 
 def _line(screen: str, head: str) -> str:
@@ -217,8 +216,7 @@ def _screen(document: Document, screen: str) -> Iterator[str]:
                 yield f'{entry["effect"]} is refuted and {word}'
             if word.lower() == 'likely' and entry['probability'] < 0.5:
                 yield f'{entry["effect"]} is {word} at {entry["probability"]:.2f}'
-    for shift in document['lens'].get('averaged_shift', []):
-        if shift['weight'] < 0.5 and re.search(
-            'ikely[^;]* not confirmed[^:]*: viewpoint_shift', screen
-        ):
-            yield f'a shift of weight {shift["weight"]:.2f} is likely'
+    for written in document['lens'].get('averaged_effects', []):
+        name, chance = written['effect'], written['probability']
+        if chance < 0.5 and re.search(f'ikely[^;]* not confirmed[^:]*: {name}', screen):
+            yield f'{name} of probability {chance:.2f} is likely'

@@ -220,9 +220,8 @@ def lens_contents(d: Diagnosis) -> str:
     field = d.evaluation.written_field
     parts = ['intrinsics fitted to these data'] if d.evaluation.intrinsics else []
     parts += [c.effect for c in d.causes if c.stage == 'lens']
-    parts += (
-        ['a viewpoint shift that is not confirmed'] if d.evaluation.averaged_model.shifts else []
-    )
+    averaged = dict.fromkeys(one.effect.name for one in d.evaluation.averaged_model.effects)
+    parts += [f'{name}, which is not confirmed' for name in averaged]
     parts += ['an image field'] if field is not None and field.fields else []
     return f'with {join_names(parts)}' if parts else 'as it was fitted'
 

@@ -31,7 +31,6 @@ from fisheye_svp_ros.diagnosis import (
 )
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.blocks import image_uri
-from fisheye_svp_ros.reporting.terminal import with_error
 from fisheye_svp_ros.reporting.wording.accuracy import accuracy, used_rays
 from fisheye_svp_ros.reporting.wording.adequacy import flaw_headline, flaw_statement
 from fisheye_svp_ros.reporting.wording.causes import (
@@ -45,6 +44,7 @@ from fisheye_svp_ros.reporting.wording.causes import (
     finding_reason,
     most_significant,
     pixels,
+    quantity,
     size,
     with_odds,
 )
@@ -305,19 +305,17 @@ def _candidates(d: Diagnosis) -> str:
     if d.adequacy.is_misfit:
         return ''
     included = f'{LENS_FILE} includes ' if d.offers_extended else ''
-    shifts = d.evaluation.averaged_model.shifts
-    others = [
-        candidate
-        for candidate in d.candidates
-        if not shifts or candidate.effect != 'viewpoint_shift'
-    ]
+    averaged = d.evaluation.averaged_model.effects
+    names = {one.effect.name for one in averaged}
+    others = [candidate for candidate in d.candidates if candidate.effect not in names]
     words = []
-    for shift in shifts:
-        status = status_of(shift.weight, False)
-        size_of = f'e0 = {" ± ".join(with_error(1e3 * shift.e0, 1e3 * shift.stderr))} mm'
-        told = f': {included}{size_of}' if included or status is not Status.NOT_NEEDED else ''
-        camera = f'{shift.camera} ' if shift.camera else ''
-        words.append(f'{camera}viewpoint_shift ({belief(status, shift.weight)}{told})')
+    for one in averaged[:_MAX_NAMES]:
+        status = status_of(one.weight, False)
+        name, first = next(iter(one.parameters.items()))
+        told = f': {included}{name} = {quantity(first)}'
+        told = told if included or status is not Status.NOT_NEEDED else ''
+        name = ' '.join((*one.effect.cameras, one.effect.name))
+        words.append(f'{name} ({belief(status, one.weight)}{told})')
     words += [
         f'{finding.effect} ({belief(finding.status, finding.probability)}: '
         f'{finding_reason(finding)})'
