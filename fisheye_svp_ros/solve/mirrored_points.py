@@ -16,7 +16,6 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.boards import MAX_THICKNESS, is_flat
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
-from fisheye_svp_ros.solve.lens_calibration import localize_views, select_points
 from fisheye_svp_ros.solve.measured_poses import rms_px
 
 _MIN_POINTS = 6  # of a view: fewer hardly have a side
@@ -53,6 +52,9 @@ def mirror_by_lens(views: Views, lens: Lens) -> Mirror | None:
     """Return which mirror image of views of flat boards a lens fits far better, if one does."""
     if not _are_all_from_behind(views):
         return None
+    # Brings SciPy: nodes are to start without it.
+    from fisheye_svp_ros.solve.lens_calibration import select_points
+
     few = select_points(views, _VIEWS)
     flipped = few.uv * [1.0, -1.0] + [0.0, lens.height - 1.0]
     images = {Mirror.V_UPWARDS: flipped, Mirror.UV_EXCHANGED: few.uv[..., ::-1]}
@@ -63,6 +65,8 @@ def mirror_by_lens(views: Views, lens: Lens) -> Mirror | None:
 
 
 def _median_rms(lens: Lens, views: Views) -> float:
+    from fisheye_svp_ros.solve.lens_calibration import localize_views
+
     residual = np.where(views.used[..., None], localize_views(lens, views).residual, np.nan)
     rms_by_view = [rms_px(one) if np.isfinite(one).any() else np.inf for one in residual]
     return float(np.median(rms_by_view))

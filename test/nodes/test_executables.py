@@ -201,6 +201,15 @@ def test_a_node_that_diagnoses_starts_without_what_only_a_diagnosis_needs() -> N
     assert not printed_by(code).split()
 
 
+@pytest.mark.parametrize('node', ['localizer', 'stereo_depth', 'rectifier', 'synthetic_camera'])
+def test_a_node_that_only_solves_starts_without_what_adjusts(node: str) -> None:
+    code = (
+        f'import sys; import fisheye_svp_ros.nodes.{node}; '
+        "print(*{'scipy', 'fisheye_svp_ros.solve.bundle_adjustment'} & {*sys.modules})"
+    )
+    assert not printed_by(code).split()
+
+
 @pytest.mark.parametrize(('given', 'taken'), [({}, '1'), ({'OMP_NUM_THREADS': '3'}, '3')])
 def test_a_node_computes_on_one_core_unless_told_otherwise(
     given: dict[str, str], taken: str

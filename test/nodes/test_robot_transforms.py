@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.graph import LATCHED, FedLocalizer, Graph
+from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.time import Time
 
 from geometry_msgs.msg import PoseWithCovarianceStamped  # isort: skip
 
@@ -130,6 +132,28 @@ def test_map_to_odom_is_dated_ahead_and_sent_again_while_nothing_is_seen(
     ahead = np.diff([stamp_of(one) for one in r.sent()])
     assert (ahead > 0).all(), 'tf2 takes no older stamp without a word'
     assert read_transform(r.sent()[-1]).position == pytest.approx(there.position, abs=1e-9)
+
+
+def test_tf2_answers_for_now_while_nothing_is_seen(robot: Callable[..., Robot]) -> None:
+    """As Nav2 asks: where the base was 20 ms before the latest odometry."""
+    tf2 = pytest.importorskip('tf2_py', reason='tf2 is not installed (ros-jazzy-tf2-py)')
+    r, answered = robot('odom_frame:=odom'), 0
+    buffer = tf2.BufferCore(Duration(seconds=30))
+    r.drive(0.3)
+    r.see(0.1)
+    for t in np.arange(0.3, 5.0, 0.25):
+        r.drive(0.25, float(t))
+        now = START + round(NS * (t + 0.24))
+        r.graph.until(lambda now=now: (sent := r.sent()) and stamp_of(sent[-1]) >= now)
+        for stamp in (START, now):
+            one = messages.transform_message(identity(), stamp, 'odom', 'base_link')
+            buffer.set_transform(one, 'odometry')
+        for one in r.sent():
+            buffer.set_transform(one, 'localizer')
+        world = r.sent()[0].header.frame_id
+        buffer.lookup_transform_core(world, 'base_link', Time(nanoseconds=now - NS // 50))
+        answered += 1
+    assert answered == 19
 
 
 def test_the_tolerance_is_a_parameter(robot: Callable[..., Robot]) -> None:

@@ -55,8 +55,9 @@ def pose_of(
     return GatedPose(moved, scale**2 * SMALL, suspects=suspects)
 
 
-def judge(gate: OdometryGate, step: int, *pose: Any) -> tuple:
-    return tuple(gate.judge(pose_of(step, *pose), START.compose(drive(step))))
+def judge(gate: OdometryGate, step: int, *pose: Any) -> tuple[str, str]:
+    verdict = gate.judge(pose_of(step, *pose), START.compose(drive(step)))
+    return verdict.refused, verdict.unconfirmed
 
 
 def test_a_pose_that_odometry_contradicts_is_refused() -> None:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fisheye_svp_ros.io.tag_maps import tags_of
-from fisheye_svp_ros.solve.outliers import WrongLandmark
+
+if TYPE_CHECKING:
+    # A node starts with these words, but without what adjusts.
+    from fisheye_svp_ros.solve.outliers import WrongLandmark
 
 _MAX_NAMES = 10
 _POOR_CORNERS = 0.5  # px rms; sharp images leave 0.1 to 0.3
