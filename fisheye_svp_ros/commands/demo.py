@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,6 +28,7 @@ from fisheye_svp_ros.io.recording import (
 )
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes.executables import missing_rclpy
+from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.paper.demonstration import (
     TASKS,
     DemoRow,
@@ -129,6 +131,9 @@ def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float])
     mark = logs.parent / _MARK
     if bag.exists() and not mark.exists():
         raise OutputError(f'{bag}: it exists and is not from an earlier demo; choose another -o')
+    # All is solved before Numba is loaded, let alone compiled.
+    if os.environ.get(engines.VARIABLE, 'auto') == 'auto':
+        engines.use('numpy')
     write_text(mark, 'fisheye-svp demo made `recording`, and replaces it.\n')
     shutil.rmtree(bag, ignore_errors=True)
     cameras = []
