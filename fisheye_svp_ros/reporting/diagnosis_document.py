@@ -21,33 +21,35 @@ from fisheye_svp_ros.scene.observations import photograph_names
 Keys = Mapping[str, str | Callable[[Any], Any]]  # JSON key to attribute, or to what computes it
 
 
-def _same(names: str) -> Keys:
+def _attributes(names: str) -> Keys:
     return {name: name for name in names.split()}
 
 
 CAUSE: Keys = {
-    **_same('effect form parameters p_value probability status share survives heldout_rms_px'),
-    **_same('gain indistinguishable_from odds'),
+    **_attributes(
+        'effect form parameters p_value probability status share survives heldout_rms_px'
+    ),
+    **_attributes('gain indistinguishable_from odds'),
     'to_separate': separation,
     'refuted_by_frames': 'refuted_by_frames',
 }
 CANDIDATE: Keys = {
-    **_same('effect parameters'),
+    **_attributes('effect parameters'),
     'p_value': 'p_corrected',
-    **_same('probability status'),
+    **_attributes('probability status'),
     'why': finding_reason,
 }
 STEP: Keys = {
     'effect': 'form',
-    **_same('statistic rank p_value'),
+    **_attributes('statistic rank p_value'),
     'corrected': 'p_corrected',
-    **_same('held_out held_out_stderr'),
+    **_attributes('held_out held_out_stderr'),
     'accepted': 'is_accepted',
     'why': finding_reason,
 }
 ADVICE: Keys = {
     'what': advised_action,
-    **_same('frames photographs landmarks boards gain kind'),
+    **_attributes('frames photographs landmarks boards gain kind'),
 }
 
 
