@@ -413,7 +413,7 @@ def refused_map(hour: Hour, pattern: str) -> None:
     hour.says(pattern, lambda: points.publish(image_points()))
 
 
-@tries('Doubtful poses: lens, unit or image size are others')
+@tries('Doubtful poses: wrong lens, unit, or image size')
 def another_lens(hour: Hour, pattern: str) -> None:
     _, points = framed_sets(hour, *ZOOMED)
     hour.says(pattern, lambda: points.publish(image_points(zoom=1.02)))
