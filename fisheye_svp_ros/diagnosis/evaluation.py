@@ -161,7 +161,10 @@ class Evaluation:
         """The likely models, with all that the user knows of."""
         selection = self.selection
         return EffectPosterior.of_null_model(
-            selection.null, known_effects(selection.problem), selection.refuted
+            selection.null,
+            known_effects(selection.problem),
+            selection.refuted,
+            self.problem.options.quick,
         )
 
     @cached_property

@@ -68,12 +68,17 @@ class EffectPosterior:
 
     @classmethod
     def of_null_model(
-        cls, null: NullModel, known: Collection[str] = (), refuted: Collection[str] = ()
+        cls,
+        null: NullModel,
+        known: Collection[str] = (),
+        refuted: Collection[str] = (),
+        quick: bool = False,
     ) -> EffectPosterior:
         """Find the likely models.
 
-        known: effects that are there whatever the data say; refuted: those that are not.  Behind
-        a port no viewpoint shifts: what it does is the port's.
+        known: effects that are there whatever the data say; refuted: those that are not; quick:
+        nothing without a name stands beside them.  Behind a port no viewpoint shifts: what it does
+        is the port's.
         """
         if any(lens.port is not None for lens in null.linear.state.lenses):
             refuted = (*refuted, ViewpointShiftEffect.name)
@@ -83,7 +88,7 @@ class EffectPosterior:
         options, form_of = _make_options(null, forms, columns)
         bases = tuple(
             _reduce(null, information, fixed, columns, odds - logs / 2)
-            for (logs, information), odds in _alternatives(null, forms)
+            for (logs, information), odds in _alternatives(null, forms, quick)
         )
         models = find_models(bases, options, _models_of_state(null, forms))
         return cls(null, fixed, forms, form_of, columns, options, bases, models)
@@ -246,10 +251,14 @@ def _log_odds(null: NullModel, forms: Sequence[Form]) -> Array:
     return np.log(odds) - RARITY_ODDS / 2 * np.array(rare, dtype=bool)
 
 
-def _alternatives(null: NullModel, forms: Sequence[Form]) -> Iterator[tuple[Alternative, float]]:
+def _alternatives(
+    null: NullModel, forms: Sequence[Form], quick: bool
+) -> Iterator[tuple[Alternative, float]]:
     """Yield what else there may be, with its log odds before the data: fields, walks."""
-    first, *fields = null.field_alternatives
-    yield first, 0.0
+    yield (null.factorization.log_determinant, null.factorization.information), 0.0
+    if quick:
+        return
+    fields = null.field_alternatives[1:]
     for one in fields:
         yield one, -float(np.log(len(fields)))
     if any(form.effect.of_recording for form in forms):
