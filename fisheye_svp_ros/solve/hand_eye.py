@@ -20,7 +20,6 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.mixed_model import pseudo_inverse
 from fisheye_svp_ros.pose import (
     Pose,
     cross_matrix,
@@ -364,9 +363,11 @@ class _LensKnowledge(NamedTuple):
         state = adjust_poses(data, state)
         images = Adjustment(data, state, free)
         normal = images.linearize(images.pack([state]), np.zeros(1, dtype=int))[1]
+        size = np.sqrt(np.diag(covariance))
+        known = np.linalg.pinv(covariance / np.outer(size, size), hermitian=True)
         return cls(
             state.shared_values(free),
-            pseudo_inverse(covariance, 1e-13) - arrow_information(normal)[0],
+            known / np.outer(size, size) - arrow_information(normal)[0],
             -ArrowEquations(*normal).shared_gradient[0],  # of the poses there is none left
         )
 

@@ -44,7 +44,8 @@ def test_water_is_named_and_measured(lens, others):
     assert cause.parameters['medium_index']['value'] == pytest.approx(1.34, rel=0.01)
     assert found.figures.extended.heldout_rms_px < 0.2 < found.figures.base.heldout_rms_px
     assert sum(c.share for c in found.components) == pytest.approx(1.0)
-    assert found.lens.port.medium_index == cause.parameters['medium_index']['value']
+    index = cause.parameters['medium_index']  # the lens is averaged over other likely effects
+    assert abs(found.lens.port.medium_index - index['value']) < 0.1 * index['stderr']
     assert found.lens.fx == AIR.fx and found.figures.gain.value > 0.9
     assert 'air or another medium behind it' in verdict_sentences(found)[0]
     assert 'in air first' not in verdict_sentences(found)[2]

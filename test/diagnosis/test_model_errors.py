@@ -121,7 +121,7 @@ def test_a_diagnosis_and_its_lens_file_say_the_same(tmp_path):
     found = diagnose(table, lens, free_intrinsics=True, options=DiagnosisOptions(quick=True))
     save_lens(found.lens, tmp_path / 'lens.yaml')
     errors = LensErrors.from_lens(load_lens(tmp_path / 'lens.yaml'))
-    fit = found.evaluation.fixed_model
+    fit = found.evaluation.written_model
     views, pose = fit.data.views, fit.state.pose
     said, carried = found.evaluation.model_errors.of_poses(fit), errors.of_poses(views, pose)
     np.testing.assert_allclose(carried.parameters, said.parameters, rtol=1e-6, atol=1e-15)

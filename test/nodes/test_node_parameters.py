@@ -205,7 +205,7 @@ def test_a_node_says_which_lens_it_solves_with(
     assert node.settings.solves_svp is solves_svp
     if node.settings.lens:
         points = SimpleNamespace(
-            points=np.zeros((1, 3)), uv=np.full((1, 2), 500.0), landmark=np.zeros(1, int), tag=None
+            xyz=np.zeros((1, 3)), uv=np.full((1, 2), 500.0), landmark=np.zeros(1, int), tag=None
         )
         shift = node.model(0, {'image_points': points}).lens.viewpoint_shift
         assert (shift is None) is solves_svp

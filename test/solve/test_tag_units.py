@@ -51,7 +51,7 @@ def test_where_two_choices_fit_the_covariance_covers_both():
         if 'contradict' in solved.reasons[0]:
             off.append(squared)
             first, second = seen.tolist()
-            both = f'without tag {first} or {second} ', f'without tag {second} or {first} '
+            both = f'without tag {first} or {second},', f'without tag {second} or {first},'
             assert any(text in solved.reasons[0] for text in both)
             assert is_ambiguous(solved.result).all()
     assert len(off) > 12 and np.mean(np.array(off) > CHI2_999) < 0.1

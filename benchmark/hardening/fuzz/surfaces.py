@@ -42,7 +42,7 @@ from fisheye_svp_ros.io.readers import (
 )
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.io.recording import read as read_observations_bag
-from fisheye_svp_ros.io.share import config_path, lens_path
+from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.library import functions as library
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import KannalaBrandt
@@ -385,15 +385,6 @@ def surfaces() -> list[Surface]:
                 _quietly(load_landmarks),
             ),
             30,
-        ),
-        Surface(
-            'environment YAML',
-            _file(
-                'a.yaml',
-                lambda p: p.write_bytes(config_path('environments/kita.yaml').read_bytes()),
-                _quietly(lambda path: environment('whole', 2.0, path)),
-            ),
-            20,
         ),
         Surface('ORPC, target', _orpc, 70),
         Surface('sweep file', _sweeps, 40),
