@@ -63,7 +63,7 @@ def flaw_statement(flaw: Flaw) -> str:
 
 def flaw_summary(flaw: Flaw) -> str:
     """Return what is wrong as a clause of few words."""
-    of = f' of {flaw.camera}' if flaw.camera else ''
+    of, whose = (f' of {flaw.camera}', 'its') if flaw.camera else ('', "the lens's")
     count = _COUNTS.get(len(flaw.groups), str(len(flaw.groups)))
     px, mrad, angle = f'{flaw.size:.2g} px', f'{1e3 * flaw.size:.2g} mrad', degrees(flaw.size)
     if flaw.mirror:
@@ -87,8 +87,8 @@ def flaw_summary(flaw: Flaw) -> str:
         FlawKind.NOISE_TOO_LARGE: f'the noise of the image points is {flaw.size:.1f} px, far more '
         'than a detector leaves (0.02 to 0.3 px)',
         FlawKind.LENS_UNKNOWN: f'these views leave rays{of} uncertain by up to {mrad} at 1 m',
-        FlawKind.ANGLE_SHORT: f'image points{of} reach only {angle:.0f} of the '
-        f'{degrees(flaw.beside):.0f} deg that the lens claims',
+        FlawKind.ANGLE_SHORT: f'points{of} reach {angle:.0f} of {whose} '
+        f'{degrees(flaw.beside):.0f} deg',
         FlawKind.OFF_CENTER: f'the principal point{of} is {flaw.size:.0f}, {flaw.beside:.0f} px '
         'off the center of the image',
     }

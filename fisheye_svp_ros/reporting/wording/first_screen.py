@@ -372,7 +372,7 @@ def headline(d: Diagnosis) -> str:
     """Return whether the lens may be used, how good it is and where, or what is wrong instead."""
     lens, rays = lens_words(d), used_rays(d)
     if d.adequacy.flaws:
-        known = f'. Within, rays are {rays.bound}' if rays and is_short_of_angle(d) else ''
+        known = f'. Rays within are {rays.bound}' if rays and is_short_of_angle(d) else ''
         return f'{flaw_headline(d.adequacy.flaws[0])}. {lens}{known}.'
     if d.decision['lens'].say != 'recalibrate' and rays:
         undecided = d.decision['lens'].say == 'undecided'
