@@ -201,8 +201,8 @@ def _effects_with(number: str, after: Linearization) -> list[Effect]:
     if number in intrinsic_names(after.state.lens):
         raise ParameterError(f'--for {number}: {number} is fixed; add --free intrinsics')
     raise ParameterError(
-        f'--for {number}: not a parameter of this lens or of an effect; known '
-        f'are {", ".join(names)}'
+        f'--for {number}: not a parameter of this lens or of an effect; choose '
+        f'from {", ".join(names)}'
     )
 
 

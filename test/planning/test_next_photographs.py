@@ -181,7 +181,9 @@ def test_the_question_is_the_doubt_then_the_cause_then_the_lens(linear, board):
 
 
 def test_what_cannot_be_planned_is_refused(linear, board):
-    known = r'are fx, fy, .*viewpoint_shift\.e0, .*landmark_survey, landmark_scale\.relative'
+    known = (
+        r'choose from fx, fy, .*viewpoint_shift\.e0, .*landmark_survey, landmark_scale\.relative'
+    )
     with pytest.raises(ParameterError, match=known):
         next_photographs(linear, [], NOISE, 1, 'colour', ROOM)
     with pytest.raises(GeometryError, match='does not see the whole board from 50 to 60 m'):
