@@ -512,7 +512,7 @@ def test_render_refuses_what_has_no_effect(
         == 2
     )
     err = capsys.readouterr().err
-    assert f'{said[0]} is of ' in err and err.count('\n') == 1
+    assert f'{said[0]} is for ' in err and 'leave ' in err and err.count('\n') == 1
     assert not (tmp_path / 'a').exists()
 
 

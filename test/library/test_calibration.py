@@ -175,7 +175,7 @@ def test_a_warning_names_the_curve_of_the_lens() -> None:
 def test_exchanged_cameras_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = photographs(6)
     folder = run_command(replace(table, cameras=STEREO[::-1]), tmp_path, 'rig')
-    assert 'right stands to the left of left: the baseline is negative' in capsys.readouterr().err
+    assert 'right is to the left of left: the baseline is negative' in capsys.readouterr().err
     assert cli.main(['undistort', str(folder), '-o', str(tmp_path / 'maps')]) == 0
-    assert 'right stands to the left of left: the baseline is negative' in capsys.readouterr().err
+    assert 'right is to the left of left: the baseline is negative' in capsys.readouterr().err
     assert not fsvp.calibrate_cameras(table, SIZE).notes

@@ -54,18 +54,18 @@ def test_a_lens_is_a_key() -> None:
 
 
 @pytest.mark.parametrize(
-    ('rotation', 'position'),
+    ('rotation', 'position', 'said'),
     [
-        (np.ones((3, 3)), np.zeros(3)),
-        (np.eye(3), 0),
-        (np.eye(3), np.zeros(4)),
-        (np.diag([1.0, 1.0, -1.0]), np.zeros(3)),
-        (2 * np.eye(3), np.zeros(3)),
-        (np.eye(4)[:3], np.zeros(3)),
+        (np.ones((3, 3)), np.zeros(3), 'det R = 1 are needed'),
+        (np.eye(3), 0, r'not \(3, 3\) and \(\)'),
+        (np.eye(3), np.zeros(4), r'not \(3, 3\) and \(4,\)'),
+        (np.diag([1.0, 1.0, -1.0]), np.zeros(3), 'det R = 1 are needed'),
+        (2 * np.eye(3), np.zeros(3), 'R RT = 1'),
+        (np.eye(4)[:3], np.zeros(3), r'not \(3, 4\) and \(3,\)'),
     ],
 )
-def test_a_pose_is_a_rotation_and_a_position(rotation: Any, position: Any) -> None:
-    with pytest.raises(fsvp.FisheyeSvpError, match='a pose has'):
+def test_a_pose_is_a_rotation_and_a_position(rotation: Any, position: Any, said: str) -> None:
+    with pytest.raises(fsvp.FisheyeSvpError, match=f'a pose (has|is not) .*{said}'):
         fsvp.Pose(rotation, position)
 
 

@@ -23,7 +23,7 @@ from fisheye_svp_ros.commands import watch
     ('width', 'shown'),
     [
         (24, 'the terminal must be 64 columns wide; this one has 24'),
-        (64, '-0.0123457 -0.0123457 0.0123457'),
+        (64, '-0.0001235 -0.0001235 0.0001235'),
     ],
 )
 def test_a_terminal_that_is_too_narrow_is_told_so(width: int, shown: str) -> None:
@@ -32,7 +32,7 @@ def test_a_terminal_that_is_too_narrow_is_told_so(width: int, shown: str) -> Non
     results = SolverResults(
         sets=3, lost=1, note='few', metrics={'position_error_x_m': MetricHistory()}
     )
-    results.metrics['position_error_x_m'].add(-1.23456789e-5)
+    results.metrics['position_error_x_m'].add(-1.23456789e-7)
     watcher = SimpleNamespace(results={'/here/localizer': results})
     out = Console(width=width, file=io.StringIO(), record=True)
     out.print(watch._result_table(cast('Any', watcher), width))

@@ -299,7 +299,7 @@ class TestBadInput:
     def test_focal_length_that_one_view_does_not_give(self):
         lens = make_lens('equidistant', 25)
         table = make_table(lens, plane, 1, 13, tilt=0.0, widest=0.0)
-        with pytest.raises(GeometryError, match=r'fx is known only to \d+ %.*add views'):
+        with pytest.raises(GeometryError, match=r'fx is known only to \d+ %.*Add views'):
             calibrate(table, 'kannala_brandt', SIZE)
 
     def test_the_error_of_the_focal_length_is_said_in_percent(self):

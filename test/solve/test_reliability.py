@@ -241,7 +241,8 @@ class TestStereoDepth:
             uv[0] = np.roll(uv[0], 1, axis=0)
         else:
             sigma /= 3
-        assert 'check ' in self.doubt(models, left, uv, sigma)
+        remedy = 'check left and right' if spoil in ('swap', 'ids') else '. Check the lens, the im'
+        assert remedy in self.doubt(models, left, uv, sigma)
 
 
 def test_a_misfit_is_too_large_even_where_no_freedom_is_left():
