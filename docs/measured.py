@@ -77,7 +77,7 @@ CLAIMS = (
         'travel',
         r'extended\s+lens\s+of\s+`diagnose`\s+is\s+off\s+by\s+([\d.]+)\s+and\s+([\d.]+)\s+px,'
         r'.*?OpenCV\s+by\s+([\d.]+)\s+and\s+([\d.]+)\s+px',
-        'extended lens off by {0} and {1} px, not {2} and {3} px',
+        '{0} px instead of {2} px; with the boards exchanged, {1} px instead of {3} px',
         '`cv2.fisheye`',
         'make peers NAME=travel',
         'On a board that it was not calibrated on, the extended lens predicts points to '
