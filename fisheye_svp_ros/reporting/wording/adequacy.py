@@ -74,7 +74,7 @@ def flaw_summary(flaw: Flaw) -> str:
         FlawKind.SHIFT_TOO_LARGE: f'the viewpoint would shift by {1e3 * flaw.size:.0f} mm, more '
         'than in any real lens; x, y, z are probably not in m',
         FlawKind.CAMERAS_MIXED: f'{count} groups of frames come from {count} cameras',
-        FlawKind.FOCAL_VARIES: f'the focal length{of} differs from frame to frame by '
+        FlawKind.FOCAL_VARIES: f'the focal length{of} differs from frame to frame by up to '
         f'{100 * flaw.size:.2g} %',
         FlawKind.CENTER_VARIES: f'the image{of} is shifted by {px} rms from frame to frame',
         FlawKind.FRAMES_DIFFER: f'frames contradict each other: residuals are {px} '
