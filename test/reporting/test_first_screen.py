@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 from unittest.mock import Mock
 
 import numpy as np
@@ -22,6 +23,7 @@ from fisheye_svp_ros.diagnosis import (
     Finding,
     Flaw,
     FlawKind,
+    LensReason,
     Reason,
     diagnose,
 )
@@ -31,7 +33,7 @@ from fisheye_svp_ros.diagnosis.findings import MAX_SHIFT
 from fisheye_svp_ros.diagnosis.variance_budget import Structure
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.reporting.diagnosis_report import write_report
-from fisheye_svp_ros.reporting.wording.adequacy import frame_list
+from fisheye_svp_ros.reporting.wording.adequacy import flaw_headline, frame_list
 from fisheye_svp_ros.reporting.wording.causes import percent, size
 from fisheye_svp_ros.reporting.wording.diagnosis import (
     known_reference,
@@ -52,6 +54,7 @@ from fisheye_svp_ros.reporting.wording.first_screen import (
 )
 from fisheye_svp_ros.reporting.wording.next_steps import ReportInputs, command_to_go_on
 from fisheye_svp_ros.scene.table_checks import MAX_TARGET_SIZE
+from fisheye_svp_ros.solve.mirrored_points import Mirror
 
 
 @pytest.fixture(scope='module')
@@ -144,8 +147,8 @@ def test_an_impossible_shift_asks_for_the_unit_first(found: Diagnosis) -> None:
     adequacy = judge_data(found.evaluation, [], found.components, {}, [shift])
     assert adequacy.flaws[0] == Flaw(FlawKind.SHIFT_TOO_LARGE, 0.049, MAX_SHIFT)
     assert _flawed(found, adequacy)[0] == (
-        'The viewpoint would shift by 49 mm, more than in any real lens; x, y, z are probably not '
-        'in m. The lens cannot be judged until lengths are in m.'
+        'The viewpoint would shift by 49 mm, more than in any real lens. '
+        'The lens cannot be judged until lengths are in m.'
     )
 
 
@@ -153,7 +156,7 @@ def test_a_board_in_mm_is_no_reason_for_another_lens(found: Diagnosis) -> None:
     """Once "Use extended_lens.yaml" for a board of 200 m, its bend 1.3 m."""
     large = Flaw(FlawKind.TARGET_TOO_LARGE, 200.0, MAX_TARGET_SIZE)
     said = _flawed(replace(found, causes=[_tilt(0.005, 0.002)]), Adequacy((large,), 1.0))
-    assert said[0].startswith('The target is 200 m across: x, y, z must be in m, not in mm. ')
+    assert said[0].startswith('The target is 200 m across: x, y, z must be in m, not mm. ')
     assert not any(line.startswith('Causes') for line in said)
     assert 'Next: fisheye-svp diagnose IN_METERS.csv --lens l.yaml -o diagnosis' in said
 
@@ -163,6 +166,28 @@ def _flawed(found: Diagnosis, adequacy: Adequacy) -> list[str]:
     flawed = replace(found, adequacy=adequacy, decision=adequacy.revise(found.decision))
     inputs = ReportInputs('a.csv', ('l.yaml',), None, None, Path('out'), True)
     return terminal_lines(first_screen(flawed, 'table'), command_to_go_on(flawed, inputs))
+
+
+@pytest.mark.parametrize('cameras', [('',), ('left', 'right')])
+@pytest.mark.parametrize('say', ['use_extended', 'recalibrate', 'undecided'])
+@pytest.mark.parametrize('kind', FlawKind)
+def test_no_headline_of_flawed_data_is_long(
+    kind: FlawKind, say: str, cameras: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rays = SimpleNamespace(bound='known only to 4.6 mrad at 0.1 m')
+    monkeypatch.setattr('fisheye_svp_ros.reporting.wording.first_screen.used_rays', lambda _: rays)
+    mirror = Mirror.IMAGE if kind is FlawKind.MIRRORED else None
+    flaw = Flaw(kind, 1.2, 1.5, groups=((0,), (1,)), camera=cameras[0], mirror=mirror)
+    reason = LensReason.NO_CAUSE_CONFIRMED if say == 'undecided' else LensReason.RAYS_BETTER
+    flawed = SimpleNamespace(
+        adequacy=Adequacy((flaw,), 1.0),
+        decision={'lens': SimpleNamespace(say=say, reason=reason)},
+        lenses=dict.fromkeys(cameras),
+        offers_extended=True,
+    )
+    said = headline(cast('Diagnosis', flawed))
+    assert len(said.split()) <= MAX_WORDS
+    assert said.startswith(flaw_headline(flaw).partition(':')[0])
 
 
 def test_data_that_no_lens_fits_have_a_next_step(found: Diagnosis) -> None:

@@ -70,9 +70,9 @@ def flaw_summary(flaw: Flaw) -> str:
         return f'every frame{of} shows the board from behind: {MIRROR_WORDS[flaw.mirror]}'
     texts = {
         FlawKind.TARGET_TOO_LARGE: f'the target is {flaw.size:.0f} m across: x, y, z must be in '
-        'm, not in mm',
+        'm, not mm',
         FlawKind.SHIFT_TOO_LARGE: f'the viewpoint would shift by {1e3 * flaw.size:.0f} mm, more '
-        'than in any real lens; x, y, z are probably not in m',
+        'than in any real lens',
         FlawKind.CAMERAS_MIXED: f'{count} groups of frames come from {count} cameras',
         FlawKind.FOCAL_VARIES: f'the focal length{of} differs from frame to frame by up to '
         f'{100 * flaw.size:.2g} %',
@@ -84,13 +84,13 @@ def flaw_summary(flaw: Flaw) -> str:
         + ' too few to judge the lens',
         FlawKind.SIDES_DIFFER: f'{flaw.size:.0f} of {flaw.beside:.0f} frames see the board from '
         'behind',
-        FlawKind.NOISE_TOO_LARGE: f'the noise of the image points is {flaw.size:.1f} px, far more '
-        'than a detector leaves (0.02 to 0.3 px)',
-        FlawKind.LENS_UNKNOWN: f'these views leave rays{of} uncertain by up to {mrad} at 1 m',
+        FlawKind.NOISE_TOO_LARGE: f'the image noise is {flaw.size:.1f} px; detectors leave 0.02 '
+        'to 0.3 px',
+        FlawKind.LENS_UNKNOWN: f'rays{of} are uncertain by up to {mrad} at 1 m',
         FlawKind.ANGLE_SHORT: f'points{of} reach {angle:.0f} of {whose} '
         f'{degrees(flaw.beside):.0f} deg',
         FlawKind.OFF_CENTER: f'the principal point{of} is {flaw.size:.0f}, {flaw.beside:.0f} px '
-        'off the center of the image',
+        'off the image center',
     }
     return texts[flaw.kind]
 

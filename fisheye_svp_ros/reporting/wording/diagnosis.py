@@ -57,7 +57,7 @@ LENS = {
 _OF_RIG = {
     'keep': 'Keep the lenses',
     'use_extended': 'Use the extended lenses',
-    'recalibrate': 'Do not use these lenses as given; calibrate again, or use the extended lenses',
+    'recalibrate': 'Do not use the given lenses; recalibrate, or use the extended ones',
     'undecided': 'Undecided about the lenses; take more photographs',
 }
 VARIABLES = {
@@ -122,7 +122,7 @@ def _of_flawed_data(d: Diagnosis, words: str, lens: str) -> str:
     if decision.say == 'use_extended':
         return f'{words} for now; take more photographs'
     if decision.say == 'undecided' and kinds == {FlawKind.LENS_UNKNOWN}:
-        return f'Use {lens} only where that is good enough, or take more photographs'
+        return f'Use {lens} only where that is good enough; take more photographs'
     if is_short_of_angle(d):
         return f'Undecided about {lens} beyond'
     return words

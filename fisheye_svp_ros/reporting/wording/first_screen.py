@@ -373,7 +373,10 @@ def headline(d: Diagnosis) -> str:
     lens, rays = lens_words(d), used_rays(d)
     if d.adequacy.flaws:
         known = f'. Rays within are {rays.bound}' if rays and is_short_of_angle(d) else ''
-        return f'{flaw_headline(d.adequacy.flaws[0])}. {lens}{known}.'
+        flaw, answer = flaw_headline(d.adequacy.flaws[0]), f'{lens}{known}.'
+        if len(f'{flaw} {answer}'.split()) > MAX_WORDS:
+            flaw = flaw.partition(':')[0]  # the line below has the rest
+        return f'{flaw}. {answer}'
     if d.decision['lens'].say != 'recalibrate' and rays:
         undecided = d.decision['lens'].say == 'undecided'
         lens += f'. {"Until then, rays" if undecided else "Rays"} are {rays.quality}'
