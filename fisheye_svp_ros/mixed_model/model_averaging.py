@@ -27,6 +27,7 @@ _BATCH = 16  # models that are expanded at once
 _MOST_EXPANDED = 64  # beside each of several products
 _LEAST_REST = 1e-9  # of the squares of the residual
 _LEAST = 1e-280  # where nothing is left of it, or was
+_ROUNDING = 1e-10  # of the largest eigenvalue of a block
 _OPEN = 1e-13  # of the largest eigenvalue: what the data leave open
 
 
@@ -154,7 +155,7 @@ class _Solved:
         at, sd = gather(options.columns), gather(options.sd) * real
         signed = np.broadcast_to(options.positive[:, None], options.sd.shape)
         block = products.matrix[at[:, :, None], at[:, None]] * sd[:, :, None] * sd[:, None]
-        root = np.asarray(np.linalg.cholesky(block + np.eye(at.shape[1])), dtype=float)
+        root = _root_beside_prior(block)
         score = (products.matrix[at, -1] * sd)[..., None]
         return cls(at, sd, gather(signed) & real, root, np.linalg.solve(root, score)[..., 0])
 
@@ -173,6 +174,22 @@ class _Solved:
         """Return log marginal likelihoods (N,)."""
         logs = np.log(np.diagonal(self.root, axis1=-2, axis2=-1)).sum(axis=1)
         return np.asarray(_log_likelihood(products, self.rest(products)) - logs)
+
+
+def _root_beside_prior(block: Array) -> Array:
+    """Return lower roots (..., w, w) of blocks and the identity.
+
+    Without noise, prior sizes are large beside it without limit, and rounding of what columns
+    have in common leaves no root: no eigenvalue is less than that rounding then.
+    """
+    whole = block + np.eye(block.shape[-1])
+    try:
+        return np.asarray(np.linalg.cholesky(whole), dtype=float)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(whole)
+        least = np.maximum(1.0, _ROUNDING * np.abs(values).max(axis=-1, keepdims=True))
+        whole = (vectors * np.maximum(values, least)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+        return np.asarray(np.linalg.cholesky(whole), dtype=float)
 
 
 def _log_likelihood(products: Products, rest: Array) -> Array:
@@ -301,7 +318,7 @@ def _log_with_one_more(products: Products, options: Options, there: Mask) -> Arr
         mine = np.flatnonzero(widths == width)
         at, sd = options.columns[mine, :width], options.sd[mine, :width]
         block = left[:, at[:, :, None], at[:, None]] * sd[:, :, None] * sd[:, None]
-        root = np.linalg.cholesky(block + np.eye(width))
+        root = _root_beside_prior(block)
         z = np.linalg.solve(root, (left[:, at, -1] * sd)[..., None])[..., 0]
         share = np.minimum((z**2).sum(axis=-1) / rest[:, None], 1 - _LEAST_REST)
         determinant = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)

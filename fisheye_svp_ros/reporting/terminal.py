@@ -92,7 +92,7 @@ def print_lines(lines: Iterable[str]) -> None:
     title, *body = lines
     out.print(title)
     for line in body:
-        out.print(Padding(line, (0, 0, 0, 2)))
+        out.print(Padding(line, (0, 0, 0, 2), expand=False))
 
 
 def console() -> Console:

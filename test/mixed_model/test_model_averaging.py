@@ -14,6 +14,7 @@ from fisheye_svp_ros.mixed_model import (
     find_models,
     log_evidence,
 )
+from fisheye_svp_ros.mixed_model.model_averaging import _root_beside_prior
 
 ROWS = 40
 NONE = np.zeros((0, 5), dtype=bool)
@@ -162,3 +163,18 @@ def test_products_of_several_kinds_share_the_models_by_their_likelihoods():
     other = products._replace(log_likelihood=np.log(3.0))
     found = find_models([products, other], options, NONE)
     assert found.weight[found.base == 1].sum() == pytest.approx(0.75, abs=1e-3)
+
+
+def test_a_block_that_rounding_makes_indefinite_has_a_root():
+    """Without noise, prior sizes beside it are large: 1e30, with an eigenvalue of -1e18."""
+    rng = np.random.default_rng(5)
+    turn = np.linalg.qr(rng.normal(size=(4, 4)))[0]
+    block = (turn * [1e30, 1e29, 1e20, -1e18]) @ turn.T
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(block + np.eye(4))
+    root = _root_beside_prior(block[None])[0]
+    assert np.abs(root @ root.T - block).max() < 1e-9 * 1e30
+    sound = np.array([[2.0, 1.0], [1.0, 3.0]])
+    np.testing.assert_allclose(
+        _root_beside_prior(sound), np.linalg.cholesky(sound + np.eye(2)), rtol=1e-15
+    )

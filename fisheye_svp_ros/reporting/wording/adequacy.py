@@ -29,7 +29,7 @@ _REMEDIES = {
     FlawKind.FEW_FRAMES: f'take {MIN_FRAMES} or more, tilted, and out to the edges of the image',
     FlawKind.SIDES_DIFFER: 'number the corners in the same order in all frames, without mirroring',
     FlawKind.NOISE_TOO_LARGE: 'check the sharpness, the detector, and the order of the corners',
-    FlawKind.LENS_UNKNOWN: 'take more near and tilted views, out to the edges of the image',
+    FlawKind.LENS_UNKNOWN: 'go near, tilt the target, and cover the image out to its edges',
     FlawKind.ANGLE_SHORT: 'take photographs with the board near the edges of the image',
     FlawKind.OFF_CENTER: 'check the image size, and whether images are cropped',
 }
@@ -74,7 +74,7 @@ def flaw_summary(flaw: Flaw) -> str:
         FlawKind.SHIFT_TOO_LARGE: f'the viewpoint would shift by {1e3 * flaw.size:.0f} mm, more '
         'than in any real lens',
         FlawKind.CAMERAS_MIXED: f'{count} groups of frames come from {count} cameras',
-        FlawKind.FOCAL_VARIES: f'the focal length{of} differs from frame to frame by up to '
+        FlawKind.FOCAL_VARIES: f'the focal length{of} differs between frames by up to '
         f'{100 * flaw.size:.2g} %',
         FlawKind.CENTER_VARIES: f'the image{of} is shifted by {px} rms from frame to frame',
         FlawKind.FRAMES_DIFFER: f'frames contradict each other: residuals are {px} '

@@ -43,11 +43,8 @@ def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
         files['observations'],
         [shlex.join(['--lens', lens]) for lens in inputs.lens],
     )
-    if (
-        d.decision['lens'].say == 'undecided'
-        and d.evaluation.problem.plannable
-        and not inputs.planned
-    ):
+    is_open = d.decision['lens'].say == 'undecided' or d.decision['photographs'].say == 'more'
+    if is_open and d.evaluation.problem.plannable and not inputs.planned:
         words = [
             'fisheye-svp diagnose',
             observations,
