@@ -81,8 +81,8 @@ CLAIMS = (
         '`cv2.fisheye`',
         'make peers NAME=travel',
         'On a board that it was not calibrated on, the extended lens predicts points to '
-        '**{0} px**. `cv2.fisheye` predicts them to {2} px. With the two boards exchanged, the '
-        'errors are {1} and {3} px.',
+        '**{0} px**, and `cv2.fisheye` to {2} px. Calibrated on the other board instead, they '
+        'predict to {1} and {3} px.',
     ),
     Claim(
         'Stated ray errors hold',
