@@ -304,7 +304,7 @@ def test_a_lens_file_of_the_user(tmp_path, capsys):
 def test_the_readme_says_what_the_budget_says():
     text = (ROOT / 'README.md').read_text(encoding='utf-8')
     text = ' '.join(text.split())
-    for words in ('nearer than 0.5 m', 'beyond 67° from the axis', 'beyond 13 m if'):
+    for words in ('nearer than 0.5 m', 'within 67° of the axis', 'beyond 13 m if'):
         assert words in text
     one, other = (
         make_budget(Setup(load_lens(lens_path(name)), rig('parallel'), 0.3))
