@@ -198,7 +198,10 @@ def _log_likelihood(products: Products, rest: Array) -> Array:
 
 def log_evidence(products: Products, options: Options, there: Mask) -> Array:
     """Return log marginal likelihoods (N,) of models (N, O), with their odds before the data."""
-    solved = _Solved.solve(products, options, there)
+    return _log_evidence_of(_Solved.solve(products, options, there), products, options, there)
+
+
+def _log_evidence_of(solved: _Solved, products: Products, options: Options, there: Mask) -> Array:
     found = solved.log_evidence(products) + there @ options.log_odds
     if solved.positive.any():
         mean = (solved.inverse @ solved.half[..., None])[..., 0]
@@ -312,7 +315,7 @@ def _log_with_one_more(products: Products, options: Options, there: Mask) -> Arr
     half = np.linalg.solve(solved.root, across)
     left = products.matrix - np.swapaxes(half, -1, -2) @ half
     rest = solved.rest(products)
-    logs = log_evidence(products, options, there)[:, None] + options.log_odds
+    logs = _log_evidence_of(solved, products, options, there)[:, None] + options.log_odds
     widths = (options.sd > 0).sum(axis=1)
     for width in np.unique(widths):
         mine = np.flatnonzero(widths == width)

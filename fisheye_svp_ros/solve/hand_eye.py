@@ -374,7 +374,7 @@ class _LensKnowledge(NamedTuple):
     def add(self, state: RigState, free: Sequence[str], shared: Array, gradient: Array) -> float:
         """Add to the normal equations of a state, in place; return what the cost is more."""
         count = len(self.values)
-        change = state.shared_values(free)[:count] - self.values
+        change = state.shared_values(free) - self.values
         shared[:count, :count] += self.information
         gradient[:count] += self.information @ change + self.gradient
         return float(change @ self.information @ change + 2 * self.gradient @ change)
