@@ -76,8 +76,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=seconds,
         default=0.0,
         metavar='TIME',
-        help='time that a rolling shutter takes from the first row to the last, such as 30ms, '
-        'if the lens does not model it. Needs times of frames (t)',
+        help='longest time that a rolling shutter may take from the first row to the last, such '
+        'as 30ms, if the lens does not model it. Needs times of frames (t)',
     )
     parser.add_argument(
         '--model-error',

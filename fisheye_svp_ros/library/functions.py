@@ -158,8 +158,8 @@ def localize(
     model_error: covariances with what the lens says of its own errors (`uncertainty`).
     tag_map: `tags` of `map`, or its file: where tags hang whose corners (4 id + 0 to 3) are the
     landmarks; its errors are in the covariances, and tags are rejected as wholes.
-    readout_time: of a rolling shutter that the lens does not know, s, from the first row to the
-    last: where frames have times, what it does to a pose in motion is in the covariance.
+    readout_time: the longest that a rolling shutter may take from the first row to the last, s, if
+    the lens does not model it: where frames have times, covariances hold what it does to a pose.
     Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed,
     LensError for a lens that does not know its errors.
     """

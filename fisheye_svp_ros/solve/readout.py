@@ -1,9 +1,15 @@
-"""What the readout of a rolling shutter does to a pose, where the lens does not model it."""
+"""What the readout of a rolling shutter does to a pose, where the lens does not model it.
+
+The rows of an image are read one after the other, in a time that is unknown but bounded: it is
+zero of a global shutter.  Motion moves image points by it, and the pose follows part of that.  The
+rest stays in the residuals, row by row, which so measure the time (Ait-Aider et al., ECCV 2006).
+"""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +21,10 @@ from fisheye_svp_ros.solve.weak_geometry import CHI2_999
 
 _MAX_INTERVAL = 0.5  # s between poses that follow each other
 _MAX_CHANGE = 0.5  # of a velocity from one interval to the next
+_MEMORY = 0.95  # of the information, from set to set: errors of lens and map repeat
+_FINEST = 0.04  # of the longest time: a standard error that repeated errors leave
+_MIN_SIGMAS = 3.29  # standard errors above zero of a readout that is not by chance (99.9 %)
+_GRID = np.linspace(-1, 1, 201)  # shares of the longest time
 
 
 def steady_velocity(times: Sequence[float], poses: Sequence[Pose]) -> Array | None:
@@ -34,17 +44,29 @@ def steady_velocity(times: Sequence[float], poses: Sequence[Pose]) -> Array | No
     return kept if kept.any() else None
 
 
-def readout_bias(solved: SolvedPoses, velocity: Array, seconds: float) -> Array:
-    """Return what rows that are read one after the other move poses (S,) by, (S, 6), m and rad.
+class RowShift(NamedTuple):
+    """What one second of readout does to poses (S,), and what their residuals say of that time.
 
-    velocity (6,): of the changes in `Pose.retract`; seconds: from the first row to the last, the
-    stamp being that of the middle row.
+    bias (S, 6): m/s and rad/s; information, 1/s^2, and gradient, 1/s, (S,): the time that fits
+    best is gradient / information, by residuals in units of what that time leaves of them.
+    """
+
+    bias: Array
+    information: Array
+    gradient: Array
+
+
+def row_shift(solved: SolvedPoses, velocity: Array) -> RowShift:
+    """Return what rows that are read one after the other do to poses (S,) of a moving camera.
+
+    velocity (6,): of the changes in `Pose.retract`; the stamp is that of the middle row.
     """
     model, views = solved.model, solved.views
     linear = model.linearize(solved.pose, views)
-    seen = ((views.weight > 0) & ~solved.outliers)[..., None, None]
-    jacobian = np.where(seen, model.d_pose(linear, views) * views.weight[..., None, None], 0.0)
-    late = seconds * np.concatenate(
+    seen = ((views.weight > 0) & ~solved.outliers)[..., None]
+    weight = np.where(seen, views.weight[..., None], 0.0)
+    jacobian = np.where(seen[..., None], model.d_pose(linear, views), 0.0) * weight[..., None]
+    late = np.concatenate(
         [part.views.uv[..., 1] / part.model.lens.height - 0.5 for part in model.parts(views)],
         axis=1,
     )
@@ -53,7 +75,14 @@ def readout_bias(solved: SolvedPoses, velocity: Array, seconds: float) -> Array:
     hessian = np.einsum('snup,snuq->spq', jacobian, jacobian)
     relative, scale = with_unit_diagonal(hessian, 0.0)
     step = never_singular(np.linalg.inv, relative) @ (gradient / scale)[..., None]
-    return np.asarray(step[..., 0] / scale)
+    bias = np.asarray(step[..., 0] / scale)
+    rest = moved - np.einsum('snup,sp->snu', jacobian, bias)  # what no pose explains
+    residual = np.where(weight > 0, solved.residual, 0.0) * weight
+    information, pull = (rest**2).sum(axis=(1, 2)), (rest * residual).sum(axis=(1, 2))
+    left = (residual**2).sum(axis=(1, 2)) - pull**2 / np.maximum(information, 1e-12)
+    free = np.maximum(2 * np.count_nonzero(seen[..., 0], axis=1) - 7, 1)
+    variance = np.maximum(1.0, left / free)
+    return RowShift(bias, information / variance, pull / variance)
 
 
 def exceeds(bias: Array, covariance: Array) -> bool:
@@ -64,42 +93,68 @@ def exceeds(bias: Array, covariance: Array) -> bool:
 class Readout:
     """Covers what a rolling shutter may do to poses that follow each other.
 
-    seconds: from the first row to the last; 0: a global shutter, nothing is covered.
+    longest: time from the first row to the last, s, in either direction, which is all that is
+    known before residuals are; 0: a global shutter, nothing is covered.
     """
 
-    def __init__(self, seconds: float) -> None:
-        self._seconds = seconds
+    def __init__(self, longest: float) -> None:
+        self._longest = longest
         self._motion: deque[tuple[float, Pose]] = deque(maxlen=3)  # times, s, and poses
+        self._information = self._gradient = 0.0  # of the sets so far, see `RowShift`
+
+    @property
+    def stderr(self) -> float:
+        """Standard error, s, of the time by residuals alone."""
+        floor = _FINEST * self._longest
+        return float(np.hypot(1 / np.sqrt(max(self._information, 1e-12)), floor))
+
+    @property
+    def time(self) -> float:
+        """The time, s, that fits the residuals best; negative where the last row comes first."""
+        return self._gradient / max(self._information, 1e-12)
+
+    def mean_square(self) -> float:
+        """Return the expected square of the time, s^2: uniform where residuals say nothing."""
+        at = self._longest * _GRID
+        near = np.clip(self.time, -self._longest, self._longest)
+        odds = np.exp(-0.5 * ((at - near) / self.stderr) ** 2)
+        return float((odds * at**2).sum() / odds.sum())
 
     def cover(self, time: float, solved: SolvedPoses, covariance: Array) -> tuple[Array, str]:
         """Return the covariance (1, 6, 6) of the next set with its bias, and what is to be said.
 
-        time: of the set, s.  As it is where the bias is less than it states, where the camera does
-        not move on as it did, and where the lens knows.
+        time: of the set, s.  As it is where the camera does not move on as it did, and where the
+        lens knows.  Said is only what residuals show, and what moves a pose out of the ellipsoid
+        that sigma alone leaves it.
         """
         self._motion.append((time, solved.pose.take(0)))
         velocity = steady_velocity(*zip(*self._motion, strict=True))
         models_it = solved.model.without_motion() is not solved.model
-        if not self._seconds or models_it or velocity is None:
+        if not self._longest or models_it or velocity is None:
             return covariance, ''
-        bias = readout_bias(solved, velocity, self._seconds)
-        if not exceeds(bias[0], covariance[0]):
-            return covariance, ''
-        turn, off = (float(np.linalg.norm(part)) for part in (velocity[3:], bias[0, :3]))
-        return covariance + bias[:, :, None] * bias[:, None, :], (
-            f'a rolling shutter of {1e3 * self._seconds:.0f} ms moves the pose by '
-            f'{1e3 * off:.2g} mm at {turn:.2g} rad/s. The covariance covers that. Set '
-            'readout_time (0: global shutter)'
+        shift = row_shift(solved, velocity)
+        self._information = _MEMORY * self._information + float(shift.information[0])
+        self._gradient = _MEMORY * self._gradient + float(shift.gradient[0])
+        bias, found = shift.bias[0], abs(self.time)
+        covered = covariance + self.mean_square() * bias[:, None] * bias
+        by_noise = covariance[0] / solved.excess[0] ** 2
+        if found < _MIN_SIGMAS * self.stderr or not exceeds(found * bias, by_noise):
+            return covered, ''
+        turn, off = (float(np.linalg.norm(part)) for part in (velocity[3:], found * bias[:3]))
+        return covered, (
+            f'a rolling shutter of {1e3 * found:.0f} ± {1e3 * self.stderr:.0f} ms (by the '
+            f'residuals) moves the pose by {1e3 * off:.2g} mm at {turn:.2g} rad/s. The covariance '
+            'covers that. Turn slower, or name a lens with rolling_shutter (diagnose)'
         )
 
 
-def cover_readouts(solved: SolvedPoses, seconds: float) -> SolvedPoses:
+def cover_readouts(solved: SolvedPoses, longest: float) -> SolvedPoses:
     """Return poses (S,) of one camera or rig, by their times, with what a readout may do to them.
 
-    Sets without a time stay as they are.
+    longest: as of `Readout`.  Sets without a time stay as they are.
     """
     time = np.fmax.reduce(solved.views.t, axis=1)  # NaN where none is known
-    readout, number = Readout(seconds), np.arange(len(time))
+    readout, number = Readout(longest), np.arange(len(time))
     covariance, reasons = solved.covariance.copy(), list(solved.reasons)
     for i in np.argsort(time, kind='stable'):
         if np.isfinite(time[i]):

@@ -277,9 +277,10 @@ class RobotSettings(GateSettings):
     map_frame: str = parameter('map', 'Frame id of the tag map', fixed=True, frame=True)
     readout_time: float = parameter(
         0.03,
-        'Time that a rolling shutter takes from the first row to the last; the stamp is that '
-        'of the middle row. If motion moves a pose by more than its covariance states, this is '
-        'reported and added. 0: a global shutter',
+        'Longest time that a rolling shutter may take from the first row to the last, if the lens '
+        'does not model it. The stamp is that of the middle row. Residuals estimate the time, and '
+        'the covariance holds its effect on the pose. A warning comes only if that effect exceeds '
+        'what noise does. 0: a global shutter',
         's',
         (0.0, 1.0),
     )
