@@ -25,6 +25,7 @@ from fisheye_svp_ros.scene.pose_priors import PlanarPrior
 from fisheye_svp_ros.solve.pose_gate import GatedPose
 from fisheye_svp_ros.solve.readout import Readout
 from fisheye_svp_ros.solve.solved_poses import SolvedPoses
+from fisheye_svp_ros.solve.warm_up import load_solver
 from fisheye_svp_ros.solve.weak_geometry import is_ambiguous
 from fisheye_svp_ros.study.settings import RobotSettings
 from fisheye_svp_ros.study.solutions import LOCALIZATION_METRICS
@@ -49,11 +50,17 @@ class RobotNode(SolverNode):
     def start(self) -> None:
         """Take the parameters into use; show the map of tags."""
         super().start()
+        # The first set would wait for what it loads; a start does not, nor do connections.
+        self._warm_up = self.start_timer(0.0, self._load_solver)
         if self._tags is not None:
             shapes, frame = messages.tag_map_shapes(self._tags), self.settings.map_frame
             self.announce(MarkerArray, '~/tag_map', LATCHED).publish(
                 messages.markers_message(shapes, 0, frame)
             )
+
+    def _load_solver(self) -> None:
+        self._warm_up.cancel()
+        load_solver()
 
     def collect_landmarks(self) -> None:
         """Listen to the landmarks, or take those of a map of tags for good."""
