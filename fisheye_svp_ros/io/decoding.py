@@ -296,8 +296,9 @@ def read_camera_info(
 ) -> CameraModel:
     """Return the model of a CameraInfo, of the image as it is sent: a part, binned.
 
-    rectified: that of the rectified image, from P, which has no distortion.  Its intrinsics are
-    those of the whole image, as image_geometry takes them: the part first, then the binning.
+    rectified: that of the rectified image, from P, which has no distortion.  The part comes first,
+    as in image_geometry, then the binning: that averages pixels, whose centers are at whole
+    numbers, so that cx comes to (cx + 0.5) / 2 - 0.5.  image_geometry leaves out the halves.
     """
     name = 'p' if rectified else 'k'
     matrix = np.array([float(value) for value in getattr(message, name)]).reshape(3, -1)
@@ -321,9 +322,9 @@ def read_camera_info(
             f'{topic}: roi {part[0]}x{part[1]} at ({low[0]}, {low[1]}) is not in the image of '
             f'{width}x{height} px; width and height are those of the whole image'
         )
-    matrix[0, 2] -= low[0]
-    matrix[1, 2] -= low[1]
+    matrix[:2, 2] += 0.5 - np.array(low)
     matrix[:2] /= np.array(bins, dtype=float)[:, None]
+    matrix[:2, 2] -= 0.5
     fx, fy, cx, cy, skew = (
         float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2), (0, 1))
     )

@@ -180,14 +180,35 @@ def test_a_part_of_the_image_and_its_binning_move_the_intrinsics() -> None:
     roi = RegionOfInterest(x_offset=100, y_offset=40, width=400, height=300)
     model = read_camera_info(info(roi=roi, binning_x=2, binning_y=3))
     assert model.size == (200, 100)
-    expected = K[0] / 2, K[1] / 3, (K[2] - 100) / 2, (K[3] - 40) / 3, 0.0
+    center = (K[2] - 100 + 0.5) / 2 - 0.5, (K[3] - 40 + 0.5) / 3 - 0.5
+    expected = K[0] / 2, K[1] / 3, *center, 0.0
     assert model.intrinsics == pytest.approx(expected)
+
+
+@pytest.mark.parametrize('bins', [2, 3])
+def test_a_lens_of_binned_images_projects_to_where_these_show_a_point(bins: int) -> None:
+    """Pixels that are averaged move a spot by half of what one of them grows."""
+    point, column, row = np.array([[0.31, -0.22, 1.0]]), np.arange(600), np.arange(420)
+    known = {'width': 600, 'height': 420, 'd': [0.1, 0.0, 0.0, 0.0]}
+
+    def image_of_point(**changes: Any) -> np.ndarray:
+        model = read_camera_info(info(**known, **changes))
+        return np.asarray(project(distortion_lens(*model, 'c', 'c'), point).uv[0])
+
+    u, v = image_of_point()
+    spot = np.exp(-(((column - u) ** 2 + (row[:, None] - v) ** 2) / (2 * 8.0**2)))
+    binned = spot.reshape(420 // bins, bins, 600 // bins, bins).mean(axis=(1, 3))
+    shown = [
+        (binned.sum(axis=1 - axis) * np.arange(binned.shape[axis])).sum() / binned.sum()
+        for axis in (1, 0)
+    ]
+    assert image_of_point(binning_x=bins, binning_y=bins) == pytest.approx(shown, abs=1e-3)
 
 
 def test_of_rectified_images_p_is_the_lens() -> None:
     p = [500.0, 0.0, 310.0, -60.0, 0.0, 501.0, 235.0, 0.0, 0.0, 0.0, 1.0, 0.0]
     model = read_camera_info(info(p=p, binning_x=2), 'camera_info', rectified=True)
-    assert model == ('', (320, 480), (250.0, 501.0, 155.0, 235.0, 0.0), ())
+    assert model == ('', (320, 480), (250.0, 501.0, 154.75, 235.0, 0.0), ())
     with pytest.raises(ObservationError, match=r'p is 0.*set detections_rectified:=false'):
         read_camera_info(info(), 'camera_info', rectified=True)
 
