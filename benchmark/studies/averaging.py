@@ -19,8 +19,9 @@ import numpy as np
 
 from benchmark import study
 from benchmark.studies.boards import HEIGHT, WIDTH, draw_set
-from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK, NOISE
+from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, NOISE
 from fisheye_svp_ros.reporting.plots import legend_below, picture
+from fisheye_svp_ros.reporting.style import INK
 
 
 class Outcome(NamedTuple):

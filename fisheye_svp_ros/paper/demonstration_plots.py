@@ -16,14 +16,8 @@ from fisheye_svp_ros.io.recording import ResidualSet
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.paper.demonstration import DemoRow
-from fisheye_svp_ros.reporting.plots import (
-    FAINT,
-    OURS,
-    PUBLISHED,
-    legend_below,
-    picture,
-    round_number,
-)
+from fisheye_svp_ros.reporting.plots import legend_below, picture
+from fisheye_svp_ros.reporting.style import FAINT, OURS, PUBLISHED, round_number
 
 _TITLES = {
     'localization': 'Localization: error along the axis',

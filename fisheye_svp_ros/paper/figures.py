@@ -22,7 +22,8 @@ from fisheye_svp_ros.paper.lens_evaluation import (
 from fisheye_svp_ros.paper.results import Panel
 from fisheye_svp_ros.paper.studies import Family, shift_curves
 from fisheye_svp_ros.paper.tables import LENSES, NAMES, STYLE_NAMES
-from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, legend_below, picture
+from fisheye_svp_ros.reporting.plots import legend_below, picture
+from fisheye_svp_ros.reporting.style import FAINT, OURS, PUBLISHED
 from fisheye_svp_ros.scene.observations import RADII, SPREADS
 from fisheye_svp_ros.scene.rigs import calibration_poses, rig
 from fisheye_svp_ros.solve.stereo_depth import epipolar_curves

@@ -11,7 +11,8 @@ from matplotlib.colors import LogNorm
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, picture
+from fisheye_svp_ros.reporting.plots import picture
+from fisheye_svp_ros.reporting.style import OURS, PUBLISHED
 from fisheye_svp_ros.study.budget import QUANTITIES, UNITS, Budget, Point
 
 _LINEAR_AXIS_RATIO = 30.0  # times, from the least to the largest error

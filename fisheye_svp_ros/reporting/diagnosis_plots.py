@@ -16,11 +16,12 @@ from scipy import special
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis import Evaluation
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.reporting.plots import NARROW, panels, picture, round_number
+from fisheye_svp_ros.reporting.plots import NARROW, panels, picture
+from fisheye_svp_ros.reporting.style import INK, round_number
 from fisheye_svp_ros.scene.observations import Observations, frame_name
 from fisheye_svp_ros.solve.measured_poses import rms_px
 
-BEFORE, AFTER, NOISE, INK = '#c2410c', '#1d4ed8', '#94a3b8', '#334155'
+BEFORE, AFTER, NOISE = '#c2410c', '#1d4ed8', '#94a3b8'
 _SIDES = (('before', BEFORE), ('after', AFTER))
 _WIDTH = 9.2  # in
 _BINS = 16

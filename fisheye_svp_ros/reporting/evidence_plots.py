@@ -11,8 +11,9 @@ from matplotlib.ticker import NullFormatter
 
 from fisheye_svp_ros.diagnosis import Diagnosis
 from fisheye_svp_ros.effects.target_map import BoardMap
-from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK, File
-from fisheye_svp_ros.reporting.plots import NARROW, legend_below, panels, picture, round_number
+from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, File
+from fisheye_svp_ros.reporting.plots import NARROW, legend_below, panels, picture
+from fisheye_svp_ros.reporting.style import INK, round_number
 
 _REJECTED_COLOR = '#cbd5e1'
 _OVER_LINES = {'facecolor': 'white', 'edgecolor': 'none', 'pad': 1}  # behind a number

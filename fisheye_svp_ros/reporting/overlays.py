@@ -12,7 +12,8 @@ from fisheye_svp_ros.detect.detection import Detection, SearchedPhotograph
 from fisheye_svp_ros.detect.photographs import Photograph
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.io.image_files import to_color, write_png
-from fisheye_svp_ros.reporting.plots import FAINT, OURS, picture
+from fisheye_svp_ros.reporting.plots import picture
+from fisheye_svp_ros.reporting.style import FAINT, OURS
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 _BLUE, _ORANGE = (168, 95, 31), (40, 123, 224)  # BGR

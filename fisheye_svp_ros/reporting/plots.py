@@ -18,7 +18,6 @@ from matplotlib.ticker import AutoLocator, LogFormatter, LogFormatterSciNotation
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.files import write_bytes
 
-OURS, PUBLISHED, FAINT = '#1f5fa8', '#e07b28', '#b8bfc7'
 _STYLE: Any = {
     'font.size': 9.0,
     'axes.titlesize': 10.0,
@@ -190,12 +189,6 @@ class PlainLogFormatter(LogFormatter):
     def __call__(self, x: float, pos: Any = None) -> str:
         """Return the label of a tick, '' for those that have none."""
         return f'{x:g}' if super().__call__(x, pos) else ''
-
-
-def round_number(value: float) -> float:
-    """Return the largest of 1, 2, 5, 10, 20 ... that is not above a value."""
-    power = 10.0 ** np.floor(np.log10(max(value, 1e-12)))
-    return float(max((m * power for m in (1, 2, 5) if m * power <= value), default=power))
 
 
 def legend_below(figure: Figure, *axes: Any) -> None:

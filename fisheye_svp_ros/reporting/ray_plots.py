@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.reporting.diagnosis_plots import INK, File
+from fisheye_svp_ros.reporting.diagnosis_plots import File
 from fisheye_svp_ros.reporting.plots import NARROW, panels, picture
+from fisheye_svp_ros.reporting.style import INK, error_levels
 from fisheye_svp_ros.solve.ray_errors import RayMap
 
 _POINTS = 1500  # drawn, at most
-_LEVELS = 9  # of a map, at most
 _COLORS = 'YlGnBu'
 
 
@@ -34,7 +33,7 @@ def draw_uncertainty(file: File, maps: Mapping[str, RayMap], narrow: bool = Fals
 def draw_ray_map(figure: Figure, axes: Any, rays: RayMap, name: str = '') -> None:
     """Draw the maps of one camera into an axis for each range, with one scale of colors."""
     sd = 1e3 * rays.sd
-    levels = _levels(sd)
+    levels = error_levels(sd)
     norm = BoundaryNorm(levels, 256, extend='both')
     for axis, deviation, range_m in zip(axes, sd, rays.ranges, strict=True):
         shown = axis.contourf(
@@ -50,16 +49,6 @@ def draw_ray_map(figure: Figure, axes: Any, rays: RayMap, name: str = '') -> Non
 
 def _some(uv: Array) -> Array:
     return uv[:: max(1, len(uv) // _POINTS)]
-
-
-def _levels(sd: Array) -> list[float]:
-    """Return 1, 2, 5, 10 ... from what is least on, mrad; what lies beyond them has one color."""
-    low, high = np.nanquantile(sd, (0.02, 0.98))
-    first = np.floor(np.log10(max(low, 1e-6)))
-    steps = [m * 10.0 ** (first + power) for power in range(12) for m in (1, 2, 5)]
-    start = max(i for i, step in enumerate(steps) if step <= max(low, steps[0]))
-    stop = next(i for i, step in enumerate(steps) if step >= high)
-    return steps[start : max(stop, start + 1) + 1][:_LEVELS]
 
 
 def _frame(axis: Axes, rays: RayMap) -> None:

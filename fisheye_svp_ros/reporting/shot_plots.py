@@ -17,7 +17,8 @@ from fisheye_svp_ros.io.image_files import to_color
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.planning.guide import MIN_SCORE, DetectedBoard, Guide
 from fisheye_svp_ros.planning.plan import NextViews
-from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, picture
+from fisheye_svp_ros.reporting.plots import picture
+from fisheye_svp_ros.reporting.style import FAINT, OURS, PUBLISHED
 from fisheye_svp_ros.reporting.wording.shots import (
     expected_error,
     guide_words,

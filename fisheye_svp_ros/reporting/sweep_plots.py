@@ -15,12 +15,8 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.decoding import Points
 from fisheye_svp_ros.io.parameters import rows
 from fisheye_svp_ros.io.recording import STAMP
-from fisheye_svp_ros.reporting.plots import (
-    OURS,
-    PUBLISHED,
-    legend_below,
-    picture,
-)
+from fisheye_svp_ros.reporting.plots import legend_below, picture
+from fisheye_svp_ros.reporting.style import OURS, PUBLISHED
 from fisheye_svp_ros.reporting.terminal import draw_or_note
 from fisheye_svp_ros.reporting.wording.metrics import metric_text
 from fisheye_svp_ros.simulate.scenario import SCALARS, Scenario

@@ -115,7 +115,8 @@ def remaining_document(left: Remaining) -> dict[str, Any]:
 
 def draw_remaining(path: Path, side: Rectification, left: Remaining, what: str) -> None:
     """Draw the errors over the range, and over the image where the table has the largest."""
-    from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, picture  # not for --help
+    from fisheye_svp_ros.reporting.plots import picture  # not for --help
+    from fisheye_svp_ros.reporting.style import FAINT, OURS, PUBLISHED
 
     with picture(path, 10.0, 4.0) as figure:
         curve, image = figure.subplots(1, 2)

@@ -31,6 +31,7 @@ from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import NODES
+from fisheye_svp_ros.reporting.svg import Panel
 from fisheye_svp_ros.simulate.simulation import simulate
 
 SWEEP = 'synthetic_camera: {ros__parameters: {sweep.seed: [1, 2, 3], noise_px: 0.2}}\n'
@@ -190,6 +191,7 @@ def test_a_picture_that_cannot_be_drawn_costs_a_note(
         raise RuntimeError('no font')
 
     monkeypatch.setattr(Figure, 'savefig', fail)
+    monkeypatch.setattr(Panel, 'to_svg', fail)
     out = tmp_path / 'out'
     assert main([word.format(out=out, **given) for word in line.split()]) == 0
     assert results(out) == DRAWING[line]
