@@ -8,7 +8,7 @@ asked for.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from functools import cached_property
+from functools import cache, cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
@@ -49,7 +49,7 @@ class Registry(Mapping[str, T]):
     @cached_property
     def _entry_points(self) -> dict[str, T]:
         group = f'fisheye_svp_ros.{self._what}'
-        return {entry.name: self._load(entry) for entry in entry_points(group=group)}
+        return {entry.name: self._load(entry) for entry in _all_entry_points().select(group=group)}
 
     def _load(self, entry: EntryPoint) -> Any:
         whose = f'{entry.group} {entry.name!r} of {entry.dist.name if entry.dist else entry.value}'
@@ -67,3 +67,9 @@ class Registry(Mapping[str, T]):
         if not issubclass(kind if isinstance(kind, type) else type(kind), self._base):
             raise ParameterError(f'{whose} is not derived from {self._base.__name__}')
         return kind
+
+
+@cache
+def _all_entry_points() -> Any:
+    """Return those of all distributions: those of one group take as long."""
+    return entry_points()

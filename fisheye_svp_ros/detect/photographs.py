@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from fisheye_svp_ros.detect.image_messages import image_pixels
 from fisheye_svp_ros.detect.rig_photographs import alike_series, names_a_camera, split_names
 from fisheye_svp_ros.errors import ObservationError
-from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.files import read_bytes
 from fisheye_svp_ros.io.paths import visible_paths
 from fisheye_svp_ros.io.recording_files import ROS1_SUFFIX, is_recording
@@ -404,6 +403,8 @@ def _video(path: Path, camera: str = '', key: str = '') -> Iterator[Photograph]:
 
 
 def _recording(path: Path) -> Iterator[Photograph]:
+    from fisheye_svp_ros.io.bags import Bag  # takes a while, and photographs do without
+
     kinds = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
     bag = Bag(path)
     topics = {topic for topic, kind in bag.topics() if kind in kinds}

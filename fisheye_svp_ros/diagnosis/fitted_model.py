@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from scipy.sparse.linalg import eigsh
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.effect_forms import bump_values
@@ -271,6 +270,7 @@ class FittedModel:
         count = len(square)
         if not square.any():
             return np.zeros((count // 3, 3, 0)), np.zeros((count // 3, 3))
+        eigsh = scipy.sparse.linalg.eigsh  # not loaded for a calibration
         start = np.random.default_rng(0).standard_normal(count)  # the same modes every time
         values, vectors = eigsh(square, min(_MAX_MODES, count - 1), v0=start)
         kept = values > _MIN_MODE * np.trace(square)

@@ -200,6 +200,21 @@ def test_a_picture_that_cannot_be_drawn_costs_a_note(
         assert 'src=""' not in page.read_text() and '<img' not in page.read_text()
 
 
+def test_a_calibration_of_a_table_loads_no_matplotlib_and_no_recordings(
+    given: dict[str, Path], tmp_path: Path
+) -> None:
+    arguments = ['calibrate', str(given['obs']), '--image-size', '1536x1536', '-o', 'new.yaml']
+    code = (
+        f'import sys; from fisheye_svp_ros.cli import main; main({arguments}); '
+        'print({"matplotlib", "rosbags"} & {*sys.modules})'
+    )
+    ran = subprocess.run(
+        [sys.executable, '-c', code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert ran.stdout.splitlines()[-1] == 'set()'
+    assert '<svg ' in (tmp_path / 'new.calibrate.html').read_text()
+
+
 @pytest.mark.parametrize('backend', ['module://matplotlib_inline.backend_inline', 'foo'])
 def test_pictures_do_not_depend_on_the_backend_of_the_environment(
     backend: str, given: dict[str, Path], tmp_path: Path
