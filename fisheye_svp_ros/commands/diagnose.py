@@ -143,10 +143,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose, diagnose_against
     from fisheye_svp_ros.planning.plan import check_parameter_name
     from fisheye_svp_ros.reporting.terminal import stages
-    from fisheye_svp_ros.reporting.wording.first_screen import (
-        headline_changes,
-        provisional_headline,
-    )
+    from fisheye_svp_ros.reporting.wording.headline import headline_changes, provisional_headline
     from fisheye_svp_ros.solve.measured_poses import poses_by_frame, rig_lenses
     from fisheye_svp_ros.solve.rig_state import free_parameters
     from fisheye_svp_ros.study.trust import known_errors
@@ -299,13 +296,13 @@ def _print(
     from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE
     from fisheye_svp_ros.reporting.wording.external import sections
     from fisheye_svp_ros.reporting.wording.first_screen import first_screen, terminal_lines
-    from fisheye_svp_ros.reporting.wording.next_steps import command_to_go_on
+    from fisheye_svp_ros.reporting.wording.next_steps import next_step
 
-    command = command_to_go_on(diagnosis, _inputs(args, bool(diagnosis.evaluation.intrinsics)))
+    step = next_step(diagnosis, _inputs(args, bool(diagnosis.evaluation.intrinsics)))
     print_lines(
         [
             *terminal_lines(
-                first_screen(diagnosis, args.observations, known), command if args.output else ''
+                first_screen(diagnosis, args.observations, known), step if args.output else None
             ),
             *(f'{section.title}: {section.sentence}' for section in sections(diagnosis)),
         ]

@@ -316,7 +316,7 @@ def _lines(diagnosis: Diagnosis) -> list[str]:
     """Return the first screen of a report as sentences."""
     return [
         line.rstrip('.') + '.'
-        for line in terminal_lines(first_screen(diagnosis, 'image_points'), '')
+        for line in terminal_lines(first_screen(diagnosis, 'image_points'))
         if line
     ]
 

@@ -60,11 +60,12 @@ from fisheye_svp_ros.reporting.wording.external import (
     CARRIED_HEADER,
     sections,
 )
-from fisheye_svp_ros.reporting.wording.first_screen import first_screen, tone, verdict_words
+from fisheye_svp_ros.reporting.wording.first_screen import first_screen
+from fisheye_svp_ros.reporting.wording.headline import tone, verdict_words
 from fisheye_svp_ros.reporting.wording.next_steps import (
     ReportInputs,
-    command_to_go_on,
     follow_up_files,
+    next_step,
 )
 
 _PICTURE_OF = {
@@ -116,7 +117,7 @@ def write_report(
             moving=any(cause.effect_class.stage != 'noise' for cause in diagnosis.causes),
             removed=diagnosis.evaluation.gains['named'],
             screen=first_screen(diagnosis, inputs.observations, known),
-            command=command_to_go_on(diagnosis, inputs),
+            step=next_step(diagnosis, inputs),
             verdict=verdict_words(diagnosis),
             tone=tone(diagnosis),
             sentences=verdict_sentences(diagnosis, known),

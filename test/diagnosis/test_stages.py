@@ -20,7 +20,8 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.effects.recording_effects import FocalDriftEffect, SessionStepEffect
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.reporting.wording.first_screen import first_screen, wrong
+from fisheye_svp_ros.reporting.wording.first_screen import first_screen
+from fisheye_svp_ros.reporting.wording.whats_wrong import wrong
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state

@@ -72,7 +72,7 @@ def test_reversed_photographs_are_named_and_put_in_order() -> None:
     assert 'left03.png' in verdict_sentences(found)[2]
     (told,) = (
         line
-        for line in terminal_lines(first_screen(found, 'x'), '')
+        for line in terminal_lines(first_screen(found, 'x'))
         if line.startswith('Photographs, why: ')
     )
     assert (

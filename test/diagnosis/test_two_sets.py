@@ -67,7 +67,7 @@ def test_what_moves_with_the_lens_holds_in_the_other_set():
     # The shift moves with the lens; bent boards count for neither lens.
     assert document['travel'] == said.travel._asdict()
     assert said.travel.extended_px < 0.97 * said.travel.given_px < 0.17
-    first = terminal_lines(first_screen(found, 'a.csv'), '')[0]
+    first = terminal_lines(first_screen(found, 'a.csv'))[0]
     given, extended = (f'{px:.3g} px' for px in said.travel)
     assert first.startswith(f'On set 32, the lens as given leaves {given} and the ext')
     assert f'extended lens {extended}' in first

@@ -14,18 +14,13 @@ from fisheye_svp_ros.reporting.wording.first_screen import first_screen, termina
 
 Document = Mapping[str, Any]
 ROUNDING = 1e-9
+# What the line of the lens starts with.
 LENS = {
-    'keep': ['Keep the lens'],
-    'use_extended': ['Use '],
-    'recalibrate': ['Do not use the lens as given'],
-    'undecided': [
-        'Undecided about the lens',
-        'Use the lens only where that is good enough',
-        'Use the lenses only where that is good enough',
-        'Do not rely on the lens',
-        'Do not use a lens that was calibrated from these data',
-        'cannot be judged until lengths are in m',
-    ],
+    'keep': r'Use (this lens|these lenses)( \(|$)',
+    'use_extended': r'Use (extended_lens\.yaml|the extended lenses)',
+    'recalibrate': 'Do not use (this lens|these lenses);',
+    'undecided': 'Use (this lens|these lenses) only w|Do not use (this lens|these lenses) yet|'
+    'Do not use a lens calibrated from these data',
 }
 # Status: least and largest probability.
 RANGES = {
@@ -39,7 +34,7 @@ RANGES = {
 def check(found: Diagnosis) -> None:
     """Assert that nothing in a diagnosis contradicts anything else."""
     check_document(
-        diagnosis_document(found), '\n'.join(terminal_lines(first_screen(found, 'table'), ''))
+        diagnosis_document(found), '\n'.join(terminal_lines(first_screen(found, 'table')))
     )
 
 
@@ -191,11 +186,12 @@ def _line(screen: str, head: str) -> str:
 def _screen(document: Document, screen: str) -> Iterator[str]:
     """Yield where the first screen says something else than the document."""
     screen, say = ' '.join(screen.split()), document['decision']['lens']['say']
+    line = _line(screen, 'Lens: ')
     for answer, words in LENS.items():
-        line = _line(screen, 'Lens:')
-        if any(one in line for one in words) != (answer == say):
+        if bool(re.match(words, line)) != (answer == say):
             yield f'{say}, and the screen {"has" if answer != say else "lacks"} {words!r}'
-    if document['adequacy'] and ('Enough' in screen or '% sure' in screen):
+    beside_bounds = screen.replace('95 % sure', '')
+    if document['adequacy'] and ('Enough' in screen or '% sure' in beside_bounds):
         yield 'inadequate data, and the screen reassures'
     causes = re.split(
         'Against the (?:truth|target):|Not confirmed:|Next:', screen.partition('Causes:')[2]

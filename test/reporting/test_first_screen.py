@@ -28,12 +28,21 @@ from fisheye_svp_ros.diagnosis import (
     diagnose,
 )
 from fisheye_svp_ros.diagnosis.adequacy import Adequacy, judge_data
-from fisheye_svp_ros.diagnosis.decision import EffectBound, Figure
+from fisheye_svp_ros.diagnosis.decision import (
+    EffectBound,
+    Figure,
+    TargetError,
+    TargetFacts,
+    TargetReason,
+)
 from fisheye_svp_ros.diagnosis.findings import MAX_SHIFT
 from fisheye_svp_ros.diagnosis.variance_budget import Structure
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.reporting.diagnosis_report import write_report
-from fisheye_svp_ros.reporting.wording.adequacy import flaw_headline, frame_list
+from fisheye_svp_ros.reporting.wording.accuracy import UsedRays
+from fisheye_svp_ros.reporting.wording.actions import photographs_words, target_words
+from fisheye_svp_ros.reporting.wording.adequacy import flaw_summary, frame_list
 from fisheye_svp_ros.reporting.wording.causes import percent, size
 from fisheye_svp_ros.reporting.wording.diagnosis import (
     known_reference,
@@ -41,20 +50,23 @@ from fisheye_svp_ros.reporting.wording.diagnosis import (
     refusal_reason,
     verdict_sentences,
 )
-from fisheye_svp_ros.reporting.wording.first_screen import (
-    MAX_WORDS,
-    Photo,
-    first_screen,
-    headline,
-    largest_cause,
-    target_words,
-    terminal_lines,
-    verdict_words,
-    wrong,
-)
-from fisheye_svp_ros.reporting.wording.next_steps import ReportInputs, command_to_go_on
-from fisheye_svp_ros.scene.table_checks import MAX_TARGET_SIZE
+from fisheye_svp_ros.reporting.wording.first_screen import Photo, first_screen, terminal_lines
+from fisheye_svp_ros.reporting.wording.headline import MAX_WORDS, headline, verdict_words
+from fisheye_svp_ros.reporting.wording.next_steps import ReportInputs, next_step
+from fisheye_svp_ros.reporting.wording.whats_wrong import nothing_named, wrong
+from fisheye_svp_ros.scene.table_checks import MAX_TARGET_SIZE, target_size
 from fisheye_svp_ros.solve.mirrored_points import Mirror
+
+# Effects whose size is not one of their parameters.
+_OWN_SIZE = (
+    'target_shape',
+    'viewpoint_shift',
+    'landmark_scale',
+    'landmark_survey',
+    'sensor_tilt',
+    'decentering',
+    'skew',
+)
 
 
 @pytest.fixture(scope='module')
@@ -96,16 +108,17 @@ def test_bounds_are_read_in_percent_and_millimetres(found: Diagnosis) -> None:
 def test_the_terminal_names_photographs_after_what_to_do(found: Diagnosis) -> None:
     screen = first_screen(found, 'table')
     action = screen.actions[2]._replace(
+        below=False,
         do='Take some again',
         why='2 of 26 scatter',
         sure='',
         photographs=(Photo('10.jpg', ''), Photo('8.jpg', '')),
         more=1,
     )
-    lines = terminal_lines(screen._replace(actions=(action,)), '')
+    lines = terminal_lines(screen._replace(actions=(action,)))
     assert 'Photographs: Take some again: 10.jpg, 8.jpg and 1 more. 2 of 26 scatter.' in lines
     long = action._replace(why=' '.join(['word'] * MAX_WORDS))
-    lines = terminal_lines(screen._replace(actions=(long,)), '')
+    lines = terminal_lines(screen._replace(actions=(long,)))
     assert 'Photographs: Take some again: 10.jpg, 8.jpg and 1 more.' in lines
     assert lines.index('') < lines.index(f'Photographs, why: {long.why}.')
 
@@ -131,11 +144,7 @@ def test_a_confounded_set_without_a_size_says_what_is_open(found: Diagnosis) -> 
         'the size of each is unknown: x = -0.03 ± 0.11 deg)'
     )
     assert first_screen(alike, 'table').causes == table
-    assert largest_cause(alike) == (
-        'The sensor is tilted, 89 % sure, or the lens looks through a dome, away from its center '
-        '(11 %): one of them is present (likely, more than 99 %), the size of each is unknown'
-    )
-    assert wrong(alike).startswith('The sensor is tilted; alternatives below; ')
+    assert wrong(alike).startswith('The sensor is tilted, 89 % sure')
 
 
 def test_an_impossible_shift_asks_for_the_unit_first(found: Diagnosis) -> None:
@@ -147,8 +156,7 @@ def test_an_impossible_shift_asks_for_the_unit_first(found: Diagnosis) -> None:
     adequacy = judge_data(found.evaluation, [], found.components, {}, [shift])
     assert adequacy.flaws[0] == Flaw(FlawKind.SHIFT_TOO_LARGE, 0.049, MAX_SHIFT)
     assert _flawed(found, adequacy)[0] == (
-        'The viewpoint would shift by 49 mm, more than in any real lens. '
-        'The lens cannot be judged until lengths are in m.'
+        'Do not use this lens yet: the viewpoint would shift by 49 mm, more than in any real lens.'
     )
 
 
@@ -156,16 +164,19 @@ def test_a_board_in_mm_is_no_reason_for_another_lens(found: Diagnosis) -> None:
     """Once "Use extended_lens.yaml" for a board of 200 m, its bend 1.3 m."""
     large = Flaw(FlawKind.TARGET_TOO_LARGE, 200.0, MAX_TARGET_SIZE)
     said = _flawed(replace(found, causes=[_tilt(0.005, 0.002)]), Adequacy((large,), 1.0))
-    assert said[0].startswith('The target is 200 m across: x, y, z must be in m, not mm. ')
+    assert said[0] == (
+        'Do not use this lens yet: the target is 200 m across: x, y, z must be in m, not mm.'
+    )
     assert not any(line.startswith('Causes') for line in said)
-    assert 'Next: fisheye-svp diagnose IN_METERS.csv --lens l.yaml -o diagnosis' in said
+    command = 'fisheye-svp diagnose IN_METERS.csv --lens l.yaml -o diagnosis'
+    assert f'Next, with lengths in m: {command}' in said
 
 
 def _flawed(found: Diagnosis, adequacy: Adequacy) -> list[str]:
     """Return the lines of a terminal about data of which something is wrong."""
     flawed = replace(found, adequacy=adequacy, decision=adequacy.revise(found.decision))
     inputs = ReportInputs('a.csv', ('l.yaml',), None, None, Path('out'), True)
-    return terminal_lines(first_screen(flawed, 'table'), command_to_go_on(flawed, inputs))
+    return terminal_lines(first_screen(flawed, 'table'), next_step(flawed, inputs))
 
 
 @pytest.mark.parametrize('cameras', [('',), ('left', 'right')])
@@ -174,8 +185,8 @@ def _flawed(found: Diagnosis, adequacy: Adequacy) -> list[str]:
 def test_no_headline_of_flawed_data_is_long(
     kind: FlawKind, say: str, cameras: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rays = SimpleNamespace(bound='known only to 4.6 mrad at 0.1 m')
-    monkeypatch.setattr('fisheye_svp_ros.reporting.wording.first_screen.used_rays', lambda _: rays)
+    rays = UsedRays({'high': 4.6}, {}, 0.1, 1.6, 0.1, 0.0)
+    monkeypatch.setattr('fisheye_svp_ros.reporting.wording.headline.used_rays', lambda _: rays)
     mirror = Mirror.IMAGE if kind is FlawKind.MIRRORED else None
     flaw = Flaw(kind, 1.2, 1.5, groups=((0,), (1,)), camera=cameras[0], mirror=mirror)
     reason = LensReason.NO_CAUSE_CONFIRMED if say == 'undecided' else LensReason.RAYS_BETTER
@@ -183,11 +194,15 @@ def test_no_headline_of_flawed_data_is_long(
         adequacy=Adequacy((flaw,), 1.0),
         decision={'lens': SimpleNamespace(say=say, reason=reason)},
         lenses=dict.fromkeys(cameras),
-        offers_extended=True,
+        offers_extended=say != 'undecided',
+        is_lens_off=say == 'recalibrate',
     )
     said = headline(cast('Diagnosis', flawed))
     assert len(said.split()) <= MAX_WORDS
-    assert said.startswith(flaw_headline(flaw).partition(':')[0])
+    assert said.startswith(('Use ', 'Do not use '))
+    of_rays = say != 'recalibrate' and kind in (FlawKind.LENS_UNKNOWN, FlawKind.ANGLE_SHORT)
+    told = '4.6 mrad (0.46 mm at 0.1 m; 95 % sure' if of_rays else flaw_summary(flaw)
+    assert told.partition(': ')[0] in said
 
 
 def test_data_that_no_lens_fits_have_a_next_step(found: Diagnosis) -> None:
@@ -196,17 +211,21 @@ def test_data_that_no_lens_fits_have_a_next_step(found: Diagnosis) -> None:
     mixed = Flaw(FlawKind.CAMERAS_MIXED, 4.5, 0.05, groups)
     said = _flawed(found, Adequacy((mixed,), 1.0))
     assert said[0] == (
-        'Two groups of frames come from two cameras. '
-        'Do not use a lens that was calibrated from these data.'
+        'Do not use a lens calibrated from these data: two groups of frames come from two cameras.'
+    )
+    assert said[1] == (
+        'Wrong: One lens for all leaves 4.5 px: one camera took frames 0, 2, … 14; another '
+        'frames 1, 3, … 15.'
     )
     assert (
         'Flaw: Two groups of frames come from two cameras, and one lens for all leaves 4.5 px '
-        '(noise alone 0.071 px): frames 0, 2, … 14; frames 1, 3, … 15.'
+        '(noise alone 0.071 px): one camera took frames 0, 2, … 14; another frames 1, 3, … 15.'
     ) in said
     size = f'{found.lens.width}x{found.lens.height}'
     assert (
-        f'Next: fisheye-svp calibrate ONE_GROUP.csv --image-size {size} -o new_lens.yaml' in said
-    )
+        'Next, once for each group of frames: fisheye-svp calibrate ONE_GROUP.csv --image-size '
+        f'{size} -o new_lens.yaml'
+    ) in said
     assert not any(line.startswith(('Accuracy', 'Not ')) for line in said)
 
 
@@ -220,7 +239,7 @@ def test_data_that_no_lens_fits_have_a_next_step(found: Diagnosis) -> None:
         (
             [*range(0, 30, 3), 31],
             (),
-            'frames 0, 3, 6, 9, 12, 15, 18, 21 and 3 more (all in diagnosis.json)',
+            'frames 0, 3, 6, 9, 12, 15, 18, 21 and 3 more',
         ),
         ([1, 2], ('1.jpg', '2.jpg'), '1.jpg, 2.jpg'),
     ],
@@ -247,7 +266,7 @@ def test_an_undecided_lens_may_be_used_where_its_error_does_no_harm(found: Diagn
     assert '. Until then, use the lens only where that is good enough' in said
     high = found.ray_error_mrad()['given'][1]['high']
     assert (
-        f'. Until then, rays are accurate to {high:.2g} mrad at 1 m (95 % sure), out to '
+        f'Use this lens only where {high:.2g} mrad ({high:.2g} mm at 1 m; 95 % sure, out to '
         in headline(undecided)
     )
 
@@ -258,7 +277,7 @@ def test_of_a_lens_that_is_not_fitted_no_error_is_said(
     monkeypatch.setattr(Diagnosis, 'ray_error_mrad', lambda _: {})
     kept = _deciding(found, 'lens', say='keep')
     assert not first_screen(kept, 'table').accuracy
-    assert headline(kept).endswith('Keep the lens.')
+    assert headline(kept) == 'Use this lens.'
 
 
 def test_what_a_lens_claims_beyond_its_points_is_extrapolated(found: Diagnosis) -> None:
@@ -271,7 +290,9 @@ def test_what_a_lens_claims_beyond_its_points_is_extrapolated(found: Diagnosis) 
     assert 'extrapolated' not in whole
 
 
-@pytest.mark.parametrize(('bound', 'words'), [(1.2, 'known only to '), (0.9, 'accurate to ')])
+@pytest.mark.parametrize(
+    ('bound', 'words'), [(1.2, ' only where '), (0.9, ': rays are accurate to ')]
+)
 def test_rays_that_may_be_off_by_over_a_millimeter_at_1_m_are_not_called_good(
     found: Diagnosis, monkeypatch: pytest.MonkeyPatch, bound: float, words: str
 ) -> None:
@@ -280,9 +301,9 @@ def test_rays_that_may_be_off_by_over_a_millimeter_at_1_m_are_not_called_good(
     given = [{**error, 'high': bound} for error in rays['given']]
     monkeypatch.setattr(Diagnosis, 'ray_error_mrad', lambda _: {**rays, 'given': given})
     kept = _deciding(found, 'lens', say='keep')
-    assert f'Keep the lens. Rays are {words}{bound:.2g} mrad at 1 m' in headline(kept)
+    assert f'Use this lens{words}{bound:.2g} mrad ({bound:.2g} mm at 1 m' in headline(kept)
     varied = replace(kept, adequacy=replace(kept.adequacy, frames_error=2e-3))
-    assert f'known only to {np.hypot(bound, 2):.2g} mrad' in headline(varied)
+    assert f'this lens only where {np.hypot(bound, 2):.2g} mrad' in headline(varied)
 
 
 def test_what_remains_is_said_beside_a_better_lens(found: Diagnosis) -> None:
@@ -290,15 +311,14 @@ def test_what_remains_is_said_beside_a_better_lens(found: Diagnosis) -> None:
     left = 5 * 2**0.5 * found.noise_px
     better = _deciding(found, 'lens', say='use_extended')
     better = replace(better, file=found.file._replace(given_px=2 * left, extended_px=left))
-    said = terminal_lines(first_screen(better, 'table'), '')
+    said = terminal_lines(first_screen(better, 'table'))
     mrad = 1e3 * left / next(iter(found.lenses.values())).fx
     off = f'ingle points are off by {left:.3f} px ({mrad:.2g} mrad), 5.0 times the noise'
     (accuracy,) = (line for line in said if line.startswith('Accuracy'))
     assert f'. S{off}' in accuracy
-    followed = command_to_go_on(
-        better, ReportInputs('a.csv', ('l.yaml',), None, None, Path(), False)
-    )
-    assert ' --model-error ' in followed
+    followed = next_step(better, ReportInputs('a.csv', ('l.yaml',), None, None, Path(), False))
+    assert ' --model-error ' in followed.command
+    assert followed.purpose == 'to compute camera poses and their errors'
     noise = replace(better, file=found.file._replace(given_px=2 * left, extended_px=left / 5))
     assert 'ingle points' not in first_screen(noise, 'table').accuracy
 
@@ -330,28 +350,37 @@ def test_cards_derive_from_one_pair_of_figures(found: Diagnosis, tmp_path: Path)
     assert 'without and with the causes' in page and 'no cause to correct' not in page
 
 
-def test_what_is_wrong_counts_the_causes_that_it_does_not_name(
-    found: Diagnosis,
-) -> None:
+def test_what_is_wrong_has_the_sizes_of_all_causes_or_counts_them(found: Diagnosis) -> None:
+    """Once "also decentering and 1 more, see below"."""
     tilt = _tilt(0.005, 0.002)
     more = [replace(tilt, form=name) for name in ('decentering', 'skew')]
-    assert '; also decentering and 1 more, see below; ' in wrong(
-        replace(found, causes=[tilt, *more])
+    assert wrong(replace(found, causes=[tilt, *more])).startswith(
+        'The sensor is tilted (0.29 deg); decentering 0.29 deg; skew 0.29 deg; correction '
     )
+    many = [replace(tilt, form=name) for name in CATALOGUE if name not in _OWN_SIZE]
+    said = wrong(replace(found, causes=[tilt, *many]))
+    assert len(said.split()) < MAX_WORDS and said.endswith(' more below')
 
 
 def test_the_headline_says_that_the_target_is_imperfect_too(found: Diagnosis) -> None:
     """The decision was to measure the target again, and the headline spoke of the lens alone."""
     offsets = Figure('local_offsets', 0.38, 'px')
     again = replace(
-        _deciding(found, 'target', say='measure_again', figure=offsets),
+        _deciding(
+            found,
+            'target',
+            say='measure_again',
+            reason=TargetReason.CAUSE_AND_OFFSETS,
+            figure=offsets,
+            facts=_facts(found)._replace(local_m=0.0003),
+        ),
         causes=[_tilt(0.005, 0.002)],
     )
     assert wrong(again).startswith(
-        'The sensor is tilted (x = 0.29 ± 0.11 deg), and landmarks are displaced '
-        '(0.38 px); the held-out error '
+        'The sensor is tilted (0.29 deg); landmarks are displaced by 0.3 mm rms; correction '
     )
-    assert 'landmarks' not in wrong(_deciding(again, 'target', say='keep'))
+    harmless = _deciding(again, 'target', say='keep', reason=TargetReason.OFFSETS_HARMLESS)
+    assert 'landmarks' not in wrong(harmless)
 
 
 def _deciding(found: Diagnosis, about: str, **changes: object) -> Diagnosis:
@@ -389,9 +418,10 @@ def test_a_board_that_is_longer_one_way_is_not_one_of_another_scale(
         indistinguishable_from=['decentering'],
         odds={'sensor_tilt': 0.6, 'decentering': 0.4},
     )
-    said = largest_cause(replace(found, causes=[tilt]))
-    assert said.endswith(', 60 % sure, or lens elements are not centered on one axis (40 %)')
-    assert wrong(replace(found, causes=[scale])).startswith(f'{words} ({parameter} = 0.47')
+    said = wrong(replace(found, causes=[tilt]))
+    assert said.startswith('The sensor is tilted (0.29 deg), 60 % sure')
+    across = 4.7 * target_size(found.evaluation.problem.observations)
+    assert wrong(replace(found, causes=[scale])).startswith(f'{words} ({across:.2g} mm, 0.47 %)')
 
 
 def test_the_likelier_one_of_a_confounded_set_comes_first(found: Diagnosis) -> None:
@@ -400,21 +430,76 @@ def test_the_likelier_one_of_a_confounded_set_comes_first(found: Diagnosis) -> N
         indistinguishable_from=['frame_sag'],
         odds={'sensor_tilt': 0.005, 'frame_sag': 0.995},
     )
-    assert largest_cause(replace(found, causes=[tilt])).startswith(
-        'Bend of the board that follows its tilt (more than 99 % sure), or the sensor is tilted'
+    assert wrong(replace(found, causes=[tilt])).startswith(
+        'Bend of the board that follows its tilt'
     )
 
 
-def test_only_a_bent_target_is_to_be_flattened(found: Diagnosis) -> None:
-    again = _deciding(found, 'target', say='measure_again')
+@pytest.mark.parametrize(
+    ('error', 'words'),
+    [
+        (
+            TargetError('target_shape', 0.0019),
+            'flatten or replace it; a straightedge laid across it shows the gap of 1.9 mm',
+        ),
+        (
+            TargetError('landmark_scale', 0.01, stretched=True),
+            'measure its width and height with a steel ruler, to 0.5 mm, and correct x, y, z',
+        ),
+        (
+            TargetError('board_pose'),
+            'measure how its boards are mounted to each other, with a steel ruler',
+        ),
+        (None, 'measure the distances between its landmarks with calipers, to 0.1 mm'),
+    ],
+)
+def test_how_to_measure_a_target_is_said(
+    found: Diagnosis, error: TargetError | None, words: str
+) -> None:
+    """Once "measure the target", and not with what, nor how precisely."""
+    facts = _facts(found)._replace(largest=error, local_m=0.0003, bend_m=0.0, contradicted=False)
+    again = _deciding(found, 'target', say='measure_again', facts=facts)
+    assert target_words(again) == f'For better poses, {words}'
+    bends = _deciding(again, 'target', facts=facts._replace(bend_m=0.0004))
+    assert target_words(bends) == 'For better poses, mount it on a stiff plate'
+
+
+def _facts(found: Diagnosis) -> TargetFacts:
+    facts = found.decision['target'].facts
+    assert isinstance(facts, TargetFacts)
+    return facts
+
+
+def test_missing_photographs_are_counted(found: Diagnosis) -> None:
+    """Once "Take more", and not how many."""
+    few = Flaw(FlawKind.FEW_FRAMES, 1, 8), Flaw(FlawKind.LENS_UNKNOWN, 0.0027, 0.001)
+    adequacy = Adequacy(few, 0.9)
+    flawed = replace(found, adequacy=adequacy, decision=adequacy.revise(found.decision))
+    assert photographs_words(flawed) == 'Take 6 more'
+    one = Mock(wraps=flawed, frames=1, adequacy=adequacy, decision=flawed.decision)
+    assert photographs_words(one) == 'Take 7 more'
+    said = _flawed(found, adequacy)
+    assert said[0] == 'Do not use this lens yet: one frame is too few to judge the lens.'
+    assert said[1].startswith('Wrong: Rays are uncertain by up to ')
+    assert '95 % sure, out to 52 deg off axis)' in said[1]
     assert (
-        target_words(replace(again, causes=[]))
-        == 'For better poses, measure the target, or replace it'
+        'Photographs: Take 6 more. Go near, tilt the target, and cover the image out to its edges.'
+    ) in said
+
+
+def test_frames_that_differ_are_told_in_mrad(found: Diagnosis) -> None:
+    """Once "differs between frames by up to 4.4 %", which says little of what that costs."""
+    ends = (0, 1, 2, 3), (4, 5, 6, 7)
+    varies = Flaw(FlawKind.FOCAL_VARIES, 0.044, 0.006, ends)
+    said = _flawed(found, Adequacy((varies,), 1.0, 0.0063))
+    assert said[1] == (
+        'Wrong: Single frames are off by 6.3 mrad (6.3 mm at 1 m): frames 0 to 3 against frames '
+        '4 to 7.'
     )
-    bent = replace(_tilt(0.0, 0.0), form='target_shape')
-    assert target_words(replace(again, causes=[bent])) == (
-        'For better poses, measure the target, or flatten or replace it'
-    )
+    scattered = tuple(range(0, 90, 7)), tuple(b for a in range(3, 90, 9) for b in (a, a + 2))
+    many = _flawed(found, Adequacy((replace(varies, groups=scattered),), 1.0, 0.0063))
+    assert len(many[1].split()) <= MAX_WORDS
+    assert 'frames 0, 7, … 84 against frames 3, 5, 12, ' in many[1] and many[1].endswith(' more.')
 
 
 def test_an_undecided_lens_is_not_called_sure(found: Diagnosis) -> None:
@@ -458,7 +543,9 @@ def test_a_likely_shift_is_not_told_as_no_model_error(found: Diagnosis) -> None:
     """The headline was "No model error shows in these data. Use extended_lens.yaml."."""
     likely = replace(_deciding(found, 'lens', say='use_extended'), causes=[], remaining=[])
     assert likely.verdict == 'adequate'
-    assert headline(likely).startswith('Use extended_lens.yaml. Rays are accurate to ')
+    assert headline(likely).startswith(
+        'Use extended_lens.yaml, not this lens: rays are accurate to '
+    )
     assert wrong(likely) == 'No model error is confirmed in these data'
     assert verdict_words(likely) == 'Adequate: no model error is confirmed in these data'
     nothing, gained, _ = verdict_sentences(likely)
@@ -509,7 +596,7 @@ def test_words_about_the_target_agree_with_its_decision(found: Diagnosis) -> Non
     bent = replace(_tilt(0.0, 0.0), form='target_shape')
     kept = replace(_deciding(found, 'target', say='correct'), causes=[bent])
     assert not kept.offers_extended
-    assert target_words(kept).startswith('For better poses, correct the target: measure it, or ')
+    assert target_words(kept).startswith('For better poses, ')
     offered = _deciding(kept, 'lens', say='use_extended')
     assert target_words(offered).startswith('Use it with extended_lens.yaml')
 
@@ -538,6 +625,7 @@ def test_the_command_to_go_on_solves_the_same_problem(found: Diagnosis) -> None:
         decision=lens_open,
         lenses={'': None},
         offers_extended=False,
+        frames=20,
         evaluation=SimpleNamespace(problem=SimpleNamespace(plannable=True)),
         is_lens_off=False,
         adequacy=SimpleNamespace(is_misfit=False, flaws=()),
@@ -545,11 +633,12 @@ def test_the_command_to_go_on_solves_the_same_problem(found: Diagnosis) -> None:
         file=SimpleNamespace(given_px=0.2),
         noise_px=0.2,
     )
-    assert command_to_go_on(open_, inputs) == (
+    assert next_step(open_, inputs) == (
+        'to list 6 views to photograph',
         "fisheye-svp diagnose 'a b.csv' --lens l.yaml --poses p.csv --free intrinsics --next 6 "
-        '-o next  # lists 6 views to photograph'
+        '-o next',
     )
-    assert command_to_go_on(open_, inputs._replace(planned=True)).startswith(
+    assert next_step(open_, inputs._replace(planned=True)).command.startswith(
         "fisheye-svp localize 'a b.csv' --lens l.yaml"
     )
 
@@ -558,7 +647,9 @@ def test_no_plan_is_promised_that_the_target_does_not_allow(found: Diagnosis) ->
     """The command that the report printed ended with "the target is not one flat board"."""
     assert not found.evaluation.problem.plannable
     inputs = ReportInputs('a.csv', ('l.yaml',), None, None, Path('out'), True)
-    assert '--next' not in command_to_go_on(_deciding(found, 'lens', say='undecided'), inputs)
+    step = next_step(_deciding(found, 'lens', say='undecided'), inputs)
+    assert step.purpose == 'with more photographs'
+    assert step.command == 'fisheye-svp diagnose MORE.csv --lens l.yaml -o more'
 
 
 def test_photographs_are_named_only_beside_what_to_do_with_them(found: Diagnosis) -> None:
@@ -623,7 +714,7 @@ def test_one_frame_does_not_blame_the_target(found: Diagnosis) -> None:
         verdict='adequate',
         decision=_deciding(found, 'target', figure=figure).decision,
     )
-    assert largest_cause(one) == 'There are errors, but one frame cannot show their cause'
+    assert nothing_named(one) == 'there are errors, but one frame cannot show their cause'
 
 
 def test_evidence_tells_what_was_not_confirmed_in_the_end(
@@ -646,21 +737,22 @@ def test_an_extended_lens_that_held_out_frames_refute_is_not_offered(found: Diag
     """Beside "use the extended lenses" a warning said that their held-out error is larger."""
     off = _deciding(found, 'lens', say='recalibrate')
     better = replace(off, file=found.file._replace(given_px=0.2, extended_px=0.1))
-    assert headline(better).endswith('calibrate again, or use extended_lens.yaml.')
+    assert headline(better) == 'Do not use this lens; calibrate again, or use extended_lens.yaml.'
     worse = replace(off, file=found.file._replace(given_px=0.1, extended_px=0.2))
-    assert headline(worse).endswith('Do not use the lens as given; calibrate again.')
+    assert headline(worse) == 'Do not use this lens; calibrate again.'
     assert not first_screen(worse, 'table').warning and 'held-out frames' in refusal_reason(worse)
     inputs = ReportInputs('a.csv', ('l.yaml',), None, None, Path('out'), True)
     size = f'{found.lens.width}x{found.lens.height}'
-    assert command_to_go_on(worse, inputs) == (
-        f'fisheye-svp calibrate a.csv --image-size {size} -o recalibrated.yaml'
+    assert next_step(worse, inputs) == (
+        'to calibrate again',
+        f'fisheye-svp calibrate a.csv --image-size {size} -o recalibrated.yaml',
     )
 
 
 def test_the_truth_is_named_only_where_poses_are_given(found: Diagnosis) -> None:
     """Depths of a stereo pair on a measured target were told as "Against the truth"."""
     known = {'depth_error_m': Comparison(0.002, 0.002, -1e-9, 0.0, 0.0)}
-    lines = terminal_lines(first_screen(found, 'table', known), '')
+    lines = terminal_lines(first_screen(found, 'table', known))
     assert any(line.startswith('Against the target: ') for line in lines)
     assert not any('truth' in line for line in lines)
     assert known_reference(found) == 'the target'

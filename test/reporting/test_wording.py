@@ -34,7 +34,7 @@ from fisheye_svp_ros.reporting.wording.decisions import (
     separation,
     target_error,
 )
-from fisheye_svp_ros.reporting.wording.first_screen import headline_changes, provisional_headline
+from fisheye_svp_ros.reporting.wording.headline import headline_changes, provisional_headline
 from fisheye_svp_ros.reporting.wording.metrics import metric_text
 from fisheye_svp_ros.reporting.wording.poses import map_notes, wrong_landmark_notes
 from fisheye_svp_ros.solve.outliers import WrongLandmark
@@ -148,7 +148,7 @@ def test_every_reason_is_a_short_clause(
             PhotographsReason.FRAMES_PREDICTED,
             PHOTOGRAPHS,
             '26 frames; the error on held-out ones is 10.0 times what noise and scatter would '
-            'leave; the rest comes from the target',
+            'leave (1 would be ideal); the rest comes from the target',
         ),
         (
             PhotographsReason.FRAMES_PREDICTED,

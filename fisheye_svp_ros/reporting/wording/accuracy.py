@@ -40,16 +40,34 @@ class UsedRays(NamedTuple):
         return self.used['value'] / self.point_mrad
 
     @property
-    def bound(self) -> str:
-        """How good the lens is at a range."""
-        most = hypot(self.used['high'], self.frames_mrad)
-        how = 'known only' if most > 1e3 * MAX_RAY_ERROR else 'accurate'
-        return f'{how} to {most:.2g} mrad at {self.range_m:g} m'
+    def bound(self) -> float:
+        """By how much a ray of a single frame may be off (97.5 %), mrad."""
+        return hypot(self.used['high'], self.frames_mrad)
 
     @property
-    def quality(self) -> str:
-        """How good the lens is, how sure that is, and where."""
-        return f'{self.bound} (95 % sure), out to {degrees(self.reached):.0f} deg from the axis'
+    def is_accurate(self) -> bool:
+        """Whether that is less than what users lose little by."""
+        return self.bound <= 1e3 * MAX_RAY_ERROR
+
+    @property
+    def error(self) -> str:
+        """The bound, what it means at its range, and how sure it is."""
+        return f'{self.bound:.2g} mrad ({mrad_in_mm(self.bound, self.range_m)}; 95 % sure)'
+
+    @property
+    def accurate_to(self) -> str:
+        """The bound, and where it holds."""
+        return f'{self.error} out to {degrees(self.reached):.0f} deg off axis'
+
+    @property
+    def known_to(self) -> str:
+        """The same, as one term of a sentence."""
+        return f'{self.error[:-1]}, out to {degrees(self.reached):.0f} deg off axis)'
+
+
+def mrad_in_mm(mrad: float, range_m: float) -> str:
+    """Return what an angle amounts to at a range."""
+    return f'{mrad * range_m:.2g} mm at {range_m:g} m'
 
 
 def used_rays(d: Diagnosis) -> UsedRays | None:
@@ -145,5 +163,5 @@ def single_points(d: Diagnosis, remaining: RemainingError) -> str:
     focal = next(iter(d.lenses.values())).fx
     return (
         f'{pixels(remaining.px)} px ({1e3 * remaining.px / focal:.2g} mrad), '
-        f'{remaining.ratio:.1f} times the noise'
+        f'{remaining.ratio:.1f} times the noise (1 would be ideal)'
     )

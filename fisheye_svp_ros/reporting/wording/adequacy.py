@@ -30,7 +30,7 @@ _REMEDIES = {
     FlawKind.SIDES_DIFFER: 'number the corners in the same order in all frames, without mirroring',
     FlawKind.NOISE_TOO_LARGE: 'check the sharpness, the detector, and the order of the corners',
     FlawKind.LENS_UNKNOWN: 'go near, tilt the target, and cover the image out to its edges',
-    FlawKind.ANGLE_SHORT: 'take photographs with the board near the edges of the image',
+    FlawKind.ANGLE_SHORT: 'photograph the board near the edges of the image, too',
     FlawKind.OFF_CENTER: 'check the image size, and whether images are cropped',
 }
 _OF_LENS_MISFIT = {
@@ -49,16 +49,34 @@ _OF_LENS = {
 
 def flaw_statement(flaw: Flaw) -> str:
     """Return what is wrong as a clause, with the frames that it is about."""
-    groups = [frame_list(*pair) for pair in zip(flaw.groups, _names(flaw), strict=True)]
     frames = {
-        FlawKind.CAMERAS_MIXED: f', and one lens for all leaves {flaw.size:.2g} px '
-        f'({_noise(flaw)}): {"; ".join(groups)}',
-        FlawKind.FOCAL_VARIES: f': {" against ".join(groups)}',
-        FlawKind.SIDES_DIFFER: f', so their corners are in mirrored order: {"".join(groups)}',
+        FlawKind.CAMERAS_MIXED: f', and {common_residual(flaw)}: ',
+        FlawKind.FOCAL_VARIES: ': ',
+        FlawKind.SIDES_DIFFER: ', so their corners are in mirrored order: ',
+        FlawKind.CENTER_VARIES: ', ',
+        FlawKind.FRAMES_DIFFER: ', ',
     }
+    if flaw.kind not in frames:
+        return flaw_summary(flaw)
+    lists = group_lists(flaw)
+    where = ' (all in diagnosis.json)' if lists.endswith(' more') else ''
+    return f'{flaw_summary(flaw)}{frames[flaw.kind]}{lists}{where}'
+
+
+def common_residual(flaw: Flaw) -> str:
+    """Return what one lens for the frames of several cameras leaves."""
+    return f'one lens for all leaves {flaw.size:.2g} px ({_noise(flaw)})'
+
+
+def group_lists(flaw: Flaw, most: int = _MAX_RUNS) -> str:
+    """Return the frames of each group, or those that differ most; most: names of one group."""
     if flaw.kind in (FlawKind.CENTER_VARIES, FlawKind.FRAMES_DIFFER):
-        return f'{flaw_summary(flaw)}, most in {_first_frames(flaw)}'
-    return flaw_summary(flaw) + frames.get(flaw.kind, '')
+        return f'most in {_first_frames(flaw)}'
+    pairs = zip(flaw.groups, _names(flaw), strict=True)
+    lists = [frame_list(*pair, most) for pair in pairs]
+    if flaw.kind is FlawKind.CAMERAS_MIXED:
+        return f'one camera took {"; another ".join(lists)}'
+    return ' against '.join(lists)
 
 
 def flaw_summary(flaw: Flaw) -> str:
@@ -86,7 +104,8 @@ def flaw_summary(flaw: Flaw) -> str:
         'behind',
         FlawKind.NOISE_TOO_LARGE: f'the image noise is {flaw.size:.1f} px; detectors leave 0.02 '
         'to 0.3 px',
-        FlawKind.LENS_UNKNOWN: f'rays{of} are uncertain by up to {mrad} at 1 m',
+        FlawKind.LENS_UNKNOWN: f'rays{of} are uncertain by up to {mrad} ({1e3 * flaw.size:.2g} mm '
+        'at 1 m; 95 % sure)',
         FlawKind.ANGLE_SHORT: f'points{of} reach {angle:.0f} of {whose} '
         f'{degrees(flaw.beside):.0f} deg',
         FlawKind.OFF_CENTER: f'the principal point{of} is {flaw.size:.0f}, {flaw.beside:.0f} px '
@@ -95,9 +114,9 @@ def flaw_summary(flaw: Flaw) -> str:
     return texts[flaw.kind]
 
 
-def flaw_remedy(flaw: Flaw) -> str:
-    """Return what to do about it as a clause."""
-    return _REMEDIES[flaw.kind]
+def remedy(kind: FlawKind) -> str:
+    """Return what to do about a flaw as a clause."""
+    return _REMEDIES[kind]
 
 
 def flaw_headline(flaw: Flaw) -> str:
@@ -120,7 +139,7 @@ def flaw_reason(flaws: Sequence[Flaw], about: str) -> str:
         if worst.is_of_table:
             return 'it cannot be judged until that is corrected'
         return 'these views cannot separate its errors from those of the lens'
-    return '; '.join(dict.fromkeys(flaw_remedy(flaw) for flaw in flaws))
+    return '; '.join(dict.fromkeys(remedy(flaw.kind) for flaw in flaws))
 
 
 def flaw_document(flaw: Flaw) -> dict[str, Any]:
@@ -133,14 +152,14 @@ def flaw_document(flaw: Flaw) -> dict[str, Any]:
         'photographs': [[*names] for names in flaw.names],
         'camera': flaw.camera,
         'why': flaw_statement(flaw),
-        'do': flaw_remedy(flaw),
+        'do': remedy(flaw.kind),
     }
 
 
-def frame_list(frames: Sequence[int], names: Sequence[str] = ()) -> str:
+def frame_list(frames: Sequence[int], names: Sequence[str] = (), most: int = _MAX_RUNS) -> str:
     """Return frames as one enumerates them, ranges as such; of many, the first ones."""
     if names:
-        return _join_first([(name, 1) for name in names], _MAX_FRAMES)
+        return _join_first([(name, 1) for name in names], min(most, _MAX_FRAMES))
     step = frames[1] - frames[0] if len(frames) > 2 else 0
     if step > 1 and [*frames] == [*range(frames[0], frames[-1] + 1, step)]:
         return f'frames {frames[0]}, {frames[1]}, … {frames[-1]}'
@@ -149,13 +168,13 @@ def frame_list(frames: Sequence[int], names: Sequence[str] = ()) -> str:
         (f'{run[0]} to {run[-1]}' if len(run) > 2 else ', '.join(map(str, run)), len(run))
         for run in runs
     ]
-    return f'frame{"s" * (len(frames) > 1)} {_join_first(words, _MAX_RUNS)}'
+    return f'frame{"s" * (len(frames) > 1)} {_join_first(words, most)}'
 
 
 def _join_first(parts: Sequence[tuple[str, int]], most: int) -> str:
     """Return the first of some parts, how many frames the others are, and where these are."""
     more = sum(count for _, count in parts[most:])
-    rest = f' and {more} more (all in diagnosis.json)' if more else ''
+    rest = f' and {more} more' if more else ''
     return ', '.join(words for words, _ in parts[:most]) + rest
 
 

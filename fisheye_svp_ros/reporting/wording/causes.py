@@ -86,6 +86,11 @@ def chance(probability: float) -> str:
     return f'{100 * probability:.0f} %'
 
 
+def capital(text: str) -> str:
+    """Return the start of a sentence."""
+    return text[:1].upper() + text[1:]
+
+
 def pixels(value: float) -> str:
     """Return an error without its unit: three decimals, or three digits where these say less."""
     return f'{value:.3f}' if 0.0005 <= value < 9.9995 else f'{value:.3g}'
@@ -138,26 +143,15 @@ def size(diagnosis: Diagnosis, cause: Cause) -> str:
     if target_map == 'single':
         return _landmarks(diagnosis, cause)
     shown = {name: entry for name, entry in cause.parameters.items() if _is_determined(entry)}
-    largest = sorted(shown, key=lambda name: -_significance(shown[name]))[:_MAX_PARAMETERS]
+    largest = sorted(shown, key=lambda name: -significance(shown[name]))[:_MAX_PARAMETERS]
     text = ', '.join(f'{name} = {quantity(shown[name])}' for name in shown if name in largest)
     text += f' and {len(shown) - len(largest)} more' if len(shown) > len(largest) else ''
     errors = [entry['stderr'] for entry in shown.values()]
-    if not any(errors) or any(_significance(entry) >= 1 for entry in shown.values()):
+    if not any(errors) or any(significance(entry) >= 1 for entry in shown.values()):
         return text
     if cause.indistinguishable_from:
         return f'{ONE_IS_THERE}, {SIZE_OPEN}: {text}'
     return f'its size is within its error: {text}'
-
-
-def most_significant(parameters: Mapping[str, Mapping[str, Any]], least: float) -> str:
-    """Return the parameter that is most standard errors from zero, and its value.
-
-    '' where that is less than so many, or there is none; what has no error always counts.
-    """
-    name = max(parameters, key=lambda part: _significance(parameters[part]), default='')
-    if not name or (parameters[name]['stderr'] > 0 and _significance(parameters[name]) < least):
-        return ''
-    return f'{name} = {quantity(parameters[name])}'
 
 
 def _is_determined(entry: Mapping[str, Any]) -> bool:
@@ -167,7 +161,7 @@ def _is_determined(entry: Mapping[str, Any]) -> bool:
     return bool(abs(entry['value']) > limit)
 
 
-def _significance(entry: Mapping[str, Any]) -> float:
+def significance(entry: Mapping[str, Any]) -> float:
     """Return a parameter in standard errors; 0 where it was not estimated."""
     ratio = abs(entry['value']) / entry['stderr'] if entry['stderr'] else math.nan
     return 0.0 if math.isnan(ratio) else float(ratio)

@@ -28,6 +28,8 @@ from fisheye_svp_ros.reporting.wording.adequacy import flaw_reason
 from fisheye_svp_ros.reporting.wording.causes import chance, pixels
 from fisheye_svp_ros.solve.outliers import FRAME, VIEW
 
+COVERAGE = 'cover the image out to its edges, at different distances'
+_GOOD_RATIO = 1.5  # of a held-out error to noise and scatter: more has a reason
 _IDEAL_RATIO = 0.05  # so near to 1, a held-out error is what noise leaves
 _SUBJECTS = {LensFacts: 'lens', TargetFacts: 'target', PhotographsFacts: 'photographs'}
 _ONE_FRAME = 'one frame cannot separate errors of the lens from those of the target'
@@ -139,6 +141,15 @@ def unconfirmed_effects(facts: LensFacts) -> str:
     return f'{how} but not confirmed{by}: {" or ".join(effects)}'
 
 
+def open_effect(facts: LensFacts) -> str:
+    """Return the effect for which the lens is undecided, and how large it may be."""
+    bound = facts.possible_effects[0]
+    name, at_most = bound.effect.replace('_', ' '), f'{bound.edge_px:.2g} px at the edge'
+    if facts.is_likely(bound.effect):
+        return f'{name} is likely but not confirmed (up to {at_most})'
+    return f'{name} cannot be excluded (up to {at_most})'
+
+
 def _possible_effects(facts: LensFacts) -> str:
     possible = facts.possible_effects
     if not possible:
@@ -186,19 +197,18 @@ def _target_reasons(facts: TargetFacts) -> dict[TargetReason, str]:
         'pose error',
         TargetReason.BELOW_NOISE: 'its errors are below the noise',
     }
-    bend = frame_bend(facts)
-    return {reason: text + (bend and f'; {bend}') for reason, text in reasons.items()}
-
-
-def frame_bend(facts: LensFacts | TargetFacts | PhotographsFacts) -> str:
-    """Return by how much the board bends from frame to frame, and the remedy; '' for nothing."""
-    if not isinstance(facts, TargetFacts) or not facts.bend_m:
-        return ''
-    return (
-        f'the board bends from frame to frame by {1e3 * facts.bend_m:.2g} mm rms '
-        f'({100 * facts.bend_share:.0f} % of the error above the noise): mount it on a stiff '
-        'plate'
+    if not facts.bend_m:
+        return reasons
+    bend = (
+        f'{frame_bend(facts)} ({100 * facts.bend_share:.0f} % of the error above the noise): '
+        'mount it on a stiff plate'
     )
+    return {reason: f'{text}; {bend}' for reason, text in reasons.items()}
+
+
+def frame_bend(facts: TargetFacts) -> str:
+    """Return by how much the board bends from frame to frame."""
+    return f'the board bends from frame to frame by {1e3 * facts.bend_m:.2g} mm rms'
 
 
 def target_error(error: TargetError) -> str:
@@ -222,18 +232,21 @@ def _photographs_reasons(facts: PhotographsFacts) -> dict[PhotographsReason, str
     bad, unlike = len(facts.bad), len(facts.unlike)
     wrong = 'are outliers' if bad > 1 else 'is an outlier'
     few = f'one {unit} is' if count == 1 else f'{count} {unit}s are'
-    remedy = 'cover the image out to its edges, at different distances'
+    remedy = COVERAGE
     if facts.plannable:
         remedy = '--next 6 lists the views that would decide it'
     rest = '; the rest comes from the target' if facts.target_causes_rest else ''
-    times = f'{facts.ratio:.1f} times ' if abs(facts.ratio - 1) >= _IDEAL_RATIO else ''
+    times, good = '', ''
+    if abs(facts.ratio - 1) >= _IDEAL_RATIO:
+        times = f'{facts.ratio:.1f} times '
+        good = ' (good)' if facts.ratio < _GOOD_RATIO else ' (1 would be ideal)'
     return {
         PhotographsReason.SOME_ARE_WRONG: f'{bad} of {count} {wrong} as a whole',
         PhotographsReason.TOO_FEW_FRAMES: f'{few} too few; take {MIN_FRAMES} or more',
         PhotographsReason.LENS_UNDECIDED: f'the lens is undecided; {remedy}',
         PhotographsReason.FRAMES_NOT_PREDICTED: f'the others do not predict {unlike} of {count}',
         PhotographsReason.FRAMES_PREDICTED: f'{count} {unit}s; the error on held-out ones is '
-        f'{times}what noise and scatter would leave{rest}',
+        f'{times}what noise and scatter would leave{good}{rest}',
     }
 
 

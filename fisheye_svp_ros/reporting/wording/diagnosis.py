@@ -49,16 +49,16 @@ CAPTIONS = {
 }
 LENS_FILE = 'extended_lens.yaml'
 LENS = {
-    'keep': 'Keep the lens',
+    'keep': 'Use this lens',
     'use_extended': f'Use {LENS_FILE}',
-    'recalibrate': f'Do not use the lens as given; calibrate again, or use {LENS_FILE}',
-    'undecided': 'Undecided about the lens; take more photographs',
+    'recalibrate': f'Do not use this lens; calibrate again, or use {LENS_FILE}',
+    'undecided': 'Use this lens only where its error is acceptable; take more photographs',
 }
 _OF_RIG = {
-    'keep': 'Keep the lenses',
+    'keep': 'Use these lenses',
     'use_extended': 'Use the extended lenses',
-    'recalibrate': 'Do not use the given lenses; recalibrate, or use the extended ones',
-    'undecided': 'Undecided about the lenses; take more photographs',
+    'recalibrate': 'Do not use these lenses; calibrate again, or use the extended ones',
+    'undecided': 'Use these lenses only where their error is acceptable; take more photographs',
 }
 VARIABLES = {
     'image': 'the position in the image',
@@ -102,30 +102,23 @@ class RemainingError(NamedTuple):
 
 def lens_words(d: Diagnosis) -> str:
     """Return what to do about the lens, or the lenses of several cameras."""
-    several = 'es' if len(d.lenses) > 1 else ''
-    if d.adequacy.is_misfit:
-        if d.adequacy.flaws[0].kind.is_unit:
-            return f'The lens{several} cannot be judged until lengths are in m'
-        return 'Do not use a lens that was calibrated from these data'
-    decision = d.decision['lens']
-    words = (_OF_RIG if several else LENS)[decision.say]
-    if d.adequacy.flaws:
-        return _of_flawed_data(d, words, f'the lens{several}')
+    several = len(d.lenses) > 1
+    words = (_OF_RIG if several else LENS)[d.decision['lens'].say]
+    if d.adequacy.flaws and d.decision['lens'].say == 'undecided':
+        return _until_data_are_better(d, 'these lenses' if several else 'this lens')
     return words if d.offers_extended or not d.is_lens_off else words.partition(', or ')[0]
 
 
-def _of_flawed_data(d: Diagnosis, words: str, lens: str) -> str:
-    """Return what a lens is good for whose data reach or determine too little."""
-    decision, kinds = d.decision['lens'], {flaw.kind for flaw in d.adequacy.flaws}
-    if decision.say == 'undecided' and d.adequacy.flaws[0].kind.is_of_table:
-        return f'Undecided about {lens} until that is corrected'
-    if decision.say == 'use_extended':
-        return f'{words} for now; take more photographs'
-    if decision.say == 'undecided' and kinds == {FlawKind.LENS_UNKNOWN}:
-        return f'Use {lens} only where that is good enough; take more photographs'
+def _until_data_are_better(d: Diagnosis, lens: str) -> str:
+    """Return what a lens is good for whose data are wrong, or determine too little."""
+    worst, kinds = d.adequacy.flaws[0].kind, {flaw.kind for flaw in d.adequacy.flaws}
+    if worst.is_misfit and not worst.is_unit:
+        return 'Do not use a lens calibrated from these data'
     if is_short_of_angle(d):
-        return f'Undecided about {lens} beyond'
-    return words
+        return f'Use {lens} only within the angle of the points'
+    if kinds <= {FlawKind.LENS_UNKNOWN, FlawKind.ANGLE_SHORT}:
+        return f'Use {lens} only where the bound of its error is good enough'
+    return f'Do not use {lens} yet'
 
 
 def is_short_of_angle(d: Diagnosis) -> bool:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from fisheye_svp_ros.diagnosis import Diagnosis, FlawKind, LensErrors
 from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.reporting.wording.actions import views_to_take
 from fisheye_svp_ros.reporting.wording.diagnosis import LENS_FILE, remaining_error
 
 
@@ -30,35 +31,49 @@ class ReportInputs(NamedTuple):
     planned: bool = False
 
 
-def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
-    """Return the command to go on with, as a shell takes it.
+class NextStep(NamedTuple):
+    """A command to go on with, as a shell takes it, and what it is for.
 
-    In capitals: what the user has to make first, where these data are no use.
+    In capitals: what the user has to make first.
     """
+
+    purpose: str
+    command: str
+
+
+def next_step(diagnosis: Diagnosis, inputs: ReportInputs) -> NextStep:
+    """Return the command to go on with."""
     flaws = diagnosis.adequacy.flaws
     if diagnosis.adequacy.is_misfit or (flaws and flaws[0].kind.is_of_table):
-        return _command_for_other_data(diagnosis, inputs)
+        return _with_other_data(diagnosis, inputs)
     d, files = diagnosis, follow_up_files(diagnosis, inputs)
     observations, lenses = (
         files['observations'],
         [shlex.join(['--lens', lens]) for lens in inputs.lens],
     )
     is_open = d.decision['lens'].say == 'undecided' or d.decision['photographs'].say == 'more'
-    if is_open and d.evaluation.problem.plannable and not inputs.planned:
-        words = [
-            'fisheye-svp diagnose',
-            observations,
-            *lenses,
-            shlex.join(inputs.settings),
-            '--next 6 -o next  # lists 6 views to photograph',
-        ]
-        return ' '.join(filter(None, words))
-    if d.is_lens_off and not d.offers_extended:
-        return f'fisheye-svp calibrate {observations} {_image_sizes(d)} -o recalibrated' + (
-            '' if len(d.lenses) > 1 else '.yaml'
+    if is_open and not inputs.planned:
+        settings = filter(None, [*lenses, shlex.join(inputs.settings)])
+        again = ' '.join(['fisheye-svp diagnose', observations, *settings])
+        count = views_to_take(d)
+        if d.evaluation.problem.plannable:
+            return NextStep(
+                f'to list {count} views to photograph', f'{again} --next {count} -o next'
+            )
+        table = observations if inputs.search else 'MORE.csv'
+        return NextStep(
+            'with more photographs', f'{again.replace(observations, table, 1)} -o more'
         )
+    if d.is_lens_off and not d.offers_extended:
+        target = f'{observations} {_image_sizes(d)} -o recalibrated'
+        suffix = '' if len(d.lenses) > 1 else '.yaml'
+        return NextStep('to calibrate again', f'fisheye-svp calibrate {target}{suffix}')
     used = files['options'] if d.offers_extended else ' '.join(lenses)
-    return f'fisheye-svp localize {observations} {used}{_model_error_option(d)} -o poses'
+    option = _model_error_option(d)
+    return NextStep(
+        'to compute camera poses' + (' and their errors' if option else ''),
+        f'fisheye-svp localize {observations} {used}{option} -o poses',
+    )
 
 
 def _model_error_option(d: Diagnosis) -> str:
@@ -73,20 +88,25 @@ def _model_error_option(d: Diagnosis) -> str:
     return ' --model-error'
 
 
-def _command_for_other_data(d: Diagnosis, inputs: ReportInputs) -> str:
+def _with_other_data(d: Diagnosis, inputs: ReportInputs) -> NextStep:
     """Return the command for what replaces data that are no use."""
     kind = d.adequacy.flaws[0].kind
     if kind.is_unit:
         lenses = shlex.join(word for lens in inputs.lens for word in ('--lens', lens))
-        return f'fisheye-svp diagnose IN_METERS.csv {lenses} -o diagnosis'
-    table = {
-        FlawKind.CAMERAS_MIXED: 'ONE_GROUP.csv',
-        FlawKind.FOCAL_VARIES: 'NEW.csv',
-        FlawKind.CENTER_VARIES: 'NEW.csv',
-    }.get(kind, 'CORRECTED.csv')
+        return NextStep(
+            'with lengths in m', f'fisheye-svp diagnose IN_METERS.csv {lenses} -o diagnosis'
+        )
+    table, purpose = {
+        FlawKind.CAMERAS_MIXED: ('ONE_GROUP.csv', 'once for each group of frames'),
+        FlawKind.FOCAL_VARIES: ('NEW.csv', 'with the new photographs'),
+        FlawKind.CENTER_VARIES: ('NEW.csv', 'with the new photographs'),
+        FlawKind.OFF_CENTER: (inputs.observations, 'with the right image size'),
+    }.get(kind, ('CORRECTED.csv', 'with corrected points'))
     sizes = '--image-size WIDTHxHEIGHT' if kind is FlawKind.OFF_CENTER else _image_sizes(d)
-    return f'fisheye-svp calibrate {table} {sizes} -o new_lens' + (
-        '' if len(d.lenses) > 1 else '.yaml'
+    return NextStep(
+        purpose,
+        f'fisheye-svp calibrate {table} {sizes} -o new_lens'
+        + ('' if len(d.lenses) > 1 else '.yaml'),
     )
 
 
