@@ -32,7 +32,7 @@ from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.findings import LIKELY_PROBABILITY, Finding, Status
 from fisheye_svp_ros.diagnosis.lens_evidence import compare_lens_files, find_bounds, find_lens_rays
-from fisheye_svp_ros.diagnosis.random_effects import BEND, MILLIMETRE, SAG
+from fisheye_svp_ros.diagnosis.random_effects import BEND, MILLIMETRE, MOTION, SAG
 from fisheye_svp_ros.diagnosis.variance_budget import Component, significant_components
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.target_map import board_maps
@@ -70,6 +70,7 @@ class Action(Enum):
     NUMBER_LIKE_OTHERS = 16  # they were reordered
     CHECK_NUMBERS = 17  # they were not
     SEPARATE_CAUSE = 18
+    HOLD_STILL = 19
 
 
 _ACTION_KINDS = {
@@ -85,8 +86,9 @@ _ACTION_KINDS = {
 class Advice:
     """One thing to do: what, to which frames, landmarks and boards; gain: of held-out variance.
 
-    photographs: the files of the frames, as far as they are known; value: m of a sag, odds of a
-    turned board, s for which errors last; cause: which one, where it is about one.
+    photographs: the files of the frames, as far as they are known; value: m of a sag, rad of a
+    turn while an image is read, odds of a turned board, s for which errors last; cause: which
+    one, where it is about one.
     """
 
     action: Action
@@ -117,6 +119,8 @@ def advise(
         advice += _measure_landmarks(evaluation, (1 - gains['named'].value) * gains['local'].value)
     if any(part.name == SAG for part in parts):
         advice += _support_boards(evaluation)
+    if any(part.name == MOTION for part in parts):
+        advice.append(Advice(Action.HOLD_STILL, value=evaluation.fitted.turn_while_read()))
     if evaluation.offsets.views is not None:
         advice.append(Advice(Action.VARY_VIEWS, value=evaluation.offsets.views.lasting))
     advice += [] if held_back else _retake_frames(evaluation)

@@ -25,6 +25,7 @@ from fisheye_svp_ros.diagnosis.null_model import (
 from fisheye_svp_ros.diagnosis.random_effects import (
     BEND,
     MILLIMETRE,
+    MOTION,
     NAMES,
     SAG,
     ImageGrid,
@@ -257,6 +258,14 @@ class FittedModel:
         """Return by how much landmarks leave their boards in each frame (F, L), mm."""
         target = KnownTarget.from_views(self.linear.data.views)
         return board_bends(target, self.frame_coefficients(BEND))
+
+    def turn_while_read(self) -> float:
+        """Return the rms angle, rad, by which frames turn while their points are read.
+
+        From the first to the last row of the larger extent of the points.
+        """
+        turns = self.frame_coefficients(MOTION)[:, 3:]
+        return float(2 * np.sqrt((turns**2).sum(axis=1).mean()))
 
     def target_modes(self, sigma: float) -> tuple[Array, Array]:
         """Return how far the landmarks may be off: modes (L, 3, K) and alone (L, 3), m.

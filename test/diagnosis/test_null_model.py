@@ -96,7 +96,7 @@ def some_variances(eq, seed=0):
     return Variances(1.0, lam, np.exp(0.3 * rng.normal(size=len(first.weight))))
 
 
-@pytest.mark.parametrize(('cameras', 'frames'), [(1, 1), (2, 4), (1, 12)])
+@pytest.mark.parametrize(('cameras', 'frames'), [(1, 1), (2, 3), (1, 12)])
 def test_equations_are_those_of_the_dense_matrices(cameras, frames):
     """Either order of elimination: generalised least squares with V = I + Z D Z'."""
     linear = linearized(cameras=cameras, frames=frames)

@@ -29,6 +29,7 @@ COUNTERPARTS = {
     'board_stretch': {'landmark_scale'},
     'frame_linear': {'skew', 'landmark_scale'},
     'frame_bend': {'target_shape'},
+    'frame_motion': {'skew', 'landmark_scale'},  # turns shear and stretch the image
 }
 LEFT = 0.14  # of the information: less is another name for the same
 

@@ -17,7 +17,7 @@ from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import FlatPort
 from fisheye_svp_ros.optics.ports import DomeGlass
-from fisheye_svp_ros.pose import identity
+from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import views_of
 
 DESIGN_NAMES = {
@@ -310,17 +310,36 @@ def test_every_effect_says_where_it_stands_in_the_budget_and_what_it_is():
     assert 'along the axis' in CATALOGUE['viewpoint_shift'].summary()
 
 
+def _views_at(t):
+    views = views_of(np.eye(3), np.zeros((len(t), 3, 2)))
+    return views._replace(t=np.broadcast_to(t[:, None], views.board.shape))
+
+
 def test_no_motion_is_taken_from_a_pause():
     """Four frames, then two, then one, with seconds between: the last one's motion is unknown."""
     t = np.array([0.0, 0.1, 0.2, 0.3, 3.0, 3.1, 6.0])
     speed = np.array([0.2, -0.1, 0.3, 0.5, 0.2, -0.4])
     pose = identity(7).retract(t[:, None] * speed)
     pose.position[4:6] += 1.0
-    views = views_of(np.eye(3), np.zeros((7, 3, 2)))
-    views = views._replace(t=np.broadcast_to(t[:, None], views.board.shape))
-    twist = Scene(views, lens(), pose, np.zeros((7, 3, 2))).twist
+    twist = Scene(_views_at(t), lens(), pose, np.zeros((7, 3, 2))).twist
     assert twist[:6] == pytest.approx(np.tile(speed, (6, 1)), abs=1e-6)
     assert not twist[6].any()
+
+
+def test_velocities_of_a_hand_are_those_of_its_path():
+    """Three poses in two seconds, of swings that last four: parabolas lose a fifth."""
+    swing, step = 1.65, 1e-5
+    t = np.repeat(2 / 3 * np.arange(30), 2)[1:]  # but the first, every stamp comes twice
+
+    def path(t):
+        turns = np.stack([0.5 * np.sin(swing * t), 0.3 * np.cos(swing * t), 0 * t], axis=-1)
+        return Pose(rotation_from_vector(turns), turns[:, [1, 2, 0]])
+
+    expected = path(t + step).difference(path(t)) / step
+    found = Scene(_views_at(t), lens(), path(t), np.zeros((len(t), 3, 2))).twist
+    inner = slice(4, -4)
+    error = np.sqrt(((found - expected)[inner] ** 2).mean() / (expected[inner] ** 2).mean())
+    assert error < 0.02
 
 
 @pytest.mark.parametrize('distance', [0.5, 1e3])

@@ -10,10 +10,11 @@ from helpers.water import AIR
 FREE = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2')
 
 
-def photographs(seed, sag, bend=0.0, frames=16, noise=0.05):
+def photographs(seed, sag, bend=0.0, frames=16, noise=0.05, turn_while_read=0.0):
     """Return a board of 0.8 m, held at two edges before a camera at rest.
 
-    sag: of its middle, m, by its own weight; bend: that stays.
+    sag: of its middle, m, by its own weight; bend: that stays; turn_while_read, rad: of the camera
+    about each axis from the first to the last row of an image, another one in every frame.
     """
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(9) - 4.0, np.arange(6) - 2.5)
@@ -26,9 +27,12 @@ def photographs(seed, sag, bend=0.0, frames=16, noise=0.05):
         turn = rotation_from_vector(rng.normal(size=3) * [0.5, 0.5, 0.3])
         off = (bend + sag * turn[1, 2]) * middle  # gravity is along y
         bent = board + np.outer(off, [0.0, 0.0, 1.0])
-        image = project_corrected(
-            AIR, bent @ turn.T + np.exp(rng.uniform(-0.7, 0.4)) * np.array(way)
-        )
+        points = bent @ turn.T + np.exp(rng.uniform(-0.7, 0.4)) * np.array(way)
+        image = project_corrected(AIR, points)
+        if turn_while_read:
+            row = image.uv[:, 1:] / AIR.height - 0.5
+            points = points + np.cross(row * rng.normal(0, turn_while_read, 3), points)
+            image = project_corrected(AIR, points)
         seen = np.flatnonzero(
             image.valid
             & (image.uv > 0).all(axis=1)

@@ -69,6 +69,7 @@ COMPONENTS = {
     'frame_bumps': 'smooth image error of each frame',
     'frame_bend': 'bend of the board in each frame',
     'frame_sag': 'bend of the board that follows its tilt',
+    'frame_motion': 'motion while the rows of an image are read',
     'frame_similar': 'landmarks in similar views',
     'noise': 'noise of image points',
 }

@@ -44,6 +44,8 @@ _ACTIONS = {
     'errors',
     Action.SUPPORT_BOARD: 'support the board or hold it upright: lying face up, it bends by '
     '{mm:.1f} mm',
+    Action.HOLD_STILL: 'hold camera and target still, or use a global shutter: while an image is '
+    'read, the camera turns by {degrees:.2g} deg rms against the target',
     Action.VARY_VIEWS: 'take photographs from more different poses: errors of landmarks repeat '
     'in similar ones{soon} and do not average out. Check that the paper is flat, that nothing '
     'reflects, and that nothing is printed near the corners',
@@ -258,6 +260,7 @@ def advised_action(advice: Advice) -> str:
     return _ACTIONS[advice.action].format(
         value=advice.value,
         mm=1e3 * advice.value,
+        degrees=math.degrees(advice.value),
         soon=soon,
         effect=cause.effect if cause else '',
         how=separation(cause) if cause else '',
