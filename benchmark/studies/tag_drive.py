@@ -170,7 +170,9 @@ def drive(number: int, planar: bool = False) -> Drive:
         if solved is None or not solved.result.converged[0]:
             counts[kind, 'no pose'] += 1
             continue
-        pose, covariance = carried_pose(solved.pose.take(0), solved.covariance[0], mount.inverse())
+        pose, covariance = carried_pose(
+            solved.pose.take(0), solved.cautious_covariance[0], mount.inverse()
+        )
         change = pose.difference(base_at(image))
         wrong = not change @ np.linalg.solve(covariance, change) < CHI2_999
         sound = holds_map(views, base_at(image).compose(mount))

@@ -133,9 +133,10 @@ class RobotNode(SolverNode):
         self._pose.publish(
             messages.pose_with_covariance_message(pose, covariance[0], stamp, world)
         )
+        cautious = covariance + solved.cautious_covariance - solved.covariance
         gated = GatedPose(
             pose,
-            covariance[0],
+            cautious[0],
             bool(is_ambiguous(solved.result)[0]),
             float(solved.sigmas[0]),
             solved.suspects[0] if solved.suspects else {},

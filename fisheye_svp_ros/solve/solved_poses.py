@@ -63,6 +63,14 @@ class SolvedPoses(NamedTuple):
         return self.result.covariance
 
     @property
+    def cautious_covariance(self) -> Array:
+        """Covariances (S, 6, 6) whose 99.9 % ellipsoids hold, also in weak geometry.
+
+        There errors are not normal, and large ones are less rare than `covariance` states.
+        """
+        return self.covariance * self.result.tail[:, None, None]
+
+    @property
     def residual(self) -> Array:
         """Residuals (S, N, 2), px, measured minus predicted, NaN for outliers and padding."""
         return np.where(self.outliers[..., None], np.nan, self.result.residual)

@@ -225,4 +225,5 @@ def cover_choices(choices: TagChoices, solution: Localization) -> Localization:
         added=first.added + covariance - first.covariance,
         other=other,
         gap=gap,
+        tail=solution.tail.max(keepdims=True),
     )

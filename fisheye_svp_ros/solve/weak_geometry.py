@@ -33,6 +33,9 @@ _NODES, _MANY_NODES = 10, 26  # around a minimum
 _MANY_CURVATURE = 2.0
 _INFLATION = 2.0  # spread of nodes over the standard error of tilt
 _FOURTH_SHARE = 0.7  # of the covariance by fourth moments in the one that is given
+_TAIL, _MAX_TAIL = 1e-3, 3.0  # share of a mixture outside, and a factor on its covariance
+_HALF_DRAWS = np.random.default_rng(0).normal(size=(24, DOF))
+_DRAWS = np.concatenate([_HALF_DRAWS, -_HALF_DRAWS])  # of a normal distribution
 _MAX_SQUARE = 30.0  # Mahalanobis squared beyond which fourth moments grow no further
 _VIEWS_AT_ONCE = 64
 
@@ -49,6 +52,7 @@ def hold_weak_geometry(
     if not (deviation == 1.0).all():
         localization = localization._replace(gap=localization.gap / deviation**2)
     covariance, neglected = localization.covariance, model.neglecting()
+    tail = localization.tail.copy()
     weak, curvature = _weak_views(views, localization)
     if not weak.size and neglected is None:
         return localization
@@ -65,11 +69,15 @@ def hold_weak_geometry(
                 rows = group[start : start + at_once]
                 poses, seen = localization.take(rows), views.take(rows)
                 minima = (poses.pose, poses.other)[: 1 + two]
-                covariance[rows] = _integrate(model, seen, minima, deviation[rows], nodes)
+                covariance[rows], tail[rows] = _integrate(
+                    model, seen, minima, deviation[rows], nodes
+                )
     if neglected is not None:
         covariance = covariance + _squared_bias(model, neglected, views, localization)
     return localization._replace(
-        covariance=covariance, added=localization.added + covariance - localization.covariance
+        covariance=covariance,
+        added=localization.added + covariance - localization.covariance,
+        tail=tail,
     )
 
 
@@ -120,10 +128,10 @@ def _weak_views(views: Views, localization: Localization) -> tuple[Index, Array]
 
 def _integrate(
     model: ForwardModel, views: Views, minima: Sequence[Pose], scale: Array, nodes: int
-) -> Array:
+) -> tuple[Array, Array]:
     """Return covariances (S, 6, 6) about the first of some minima (S,), integrated over the tilt.
 
-    nodes: around each of these.
+    nodes: around each of these.  Also by what factors (S,) they would hold in 99.9 %.
     """
     center, systems = _centers(views), len(views.frame)
     node, density = _tilted_poses(model, views, minima, scale, center, nodes)
@@ -146,7 +154,9 @@ def _integrate(
     weight /= weight.sum(axis=1, keepdims=True)
     change = flat.difference(minima[0].take(repeated)).reshape(systems, count, 6)
     spread = free_columns @ inverse @ turned * scale[repeated, None, None] ** 2
-    return _mixture_scatter(weight, change, spread.reshape(systems, count, 6, 6))
+    own = spread.reshape(systems, count, 6, 6)
+    scatter = _mixture_scatter(weight, change, own)
+    return scatter, _tail_factors(weight, change, own, scatter)
 
 
 def _tilted_poses(
@@ -205,6 +215,23 @@ def _mixture_scatter(weight: Array, change: Array, own: Array) -> Array:
     limit = weight * np.minimum(1.0, _MAX_SQUARE / np.maximum(square, 1e-12))
     fourth = (limit[..., None, None] * fourth).sum(axis=1) / (DOF + 2)
     return np.asarray((1 - _FOURTH_SHARE) * second + _FOURTH_SHARE * fourth)
+
+
+def _tail_factors(weight: Array, change: Array, own: Array, covariance: Array) -> Array:
+    """Return factors (S,), 1 to _MAX_TAIL, on covariances that leave .1 % of a mixture outside.
+
+    weight (S, K), change (S, K, 6), own (S, K, 6, 6): of the parts, from each of which the same
+    points are drawn.  Its moments alone leave .6 % of two far tags outside.
+    """
+    values, vectors = np.linalg.eigh(own)
+    root = vectors * np.sqrt(np.clip(values, 0.0, None))[..., None, :]
+    drawn = change[:, :, None] + _DRAWS @ np.swapaxes(root, -1, -2)
+    square = squared_distances(drawn.reshape(len(weight), -1, DOF), covariance)
+    each = np.repeat(weight, len(_DRAWS), axis=1) / len(_DRAWS)
+    order = np.argsort(-square, axis=1)
+    outside = np.take_along_axis(each, order, axis=1).cumsum(axis=1) <= _TAIL
+    limit = np.take_along_axis(square, order, axis=1)[np.arange(len(square)), outside.sum(axis=1)]
+    return np.asarray(np.clip(limit / CHI2_999, 1.0, _MAX_TAIL))
 
 
 def _squared_bias(

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.tag_room import LENS, TagRoom, oval
 
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.lens_files import load_lens
@@ -61,6 +62,36 @@ def test_ellipsoids_of_small_flat_targets_hold(points, turn, place, engine):
     held = solve_poses(MODEL, views).result
     assert outside(held, true) < 0.04
     np.testing.assert_array_equal(held.pose.position, linear.pose.position)
+
+
+def far_pairs(count):
+    """Return views of two tags farther than 3 m, in rooms of tags, and the cameras."""
+    rng, points, uv, cameras = np.random.default_rng(3), [], [], []
+    rooms = [TagRoom(16, seed=seed) for seed in range(40)]
+    for i in range(count):
+        room = rooms[i % len(rooms)]
+        camera = oval(rng.uniform()).retract(np.array([0, 0, 0, 0, 0.6 * rng.normal(), 0]))
+        tags = room.visible(camera)
+        far = np.linalg.norm(room.tags.poses.position[tags] - camera.position, axis=-1) > 3
+        if far.sum() >= 2:
+            two = rng.permutation(tags[far])[:2]
+            points.append(room.tags.corners[two].reshape(-1, 3))
+            uv.append(room.project(camera, two) + 0.2 * rng.normal(size=(8, 2)))
+            cameras.append(camera)
+    seen = np.array(uv)
+    return views_of(np.array(points), seen, np.full(seen.shape[:2], 5.0)), Pose.stack(cameras)
+
+
+def test_cautious_ellipsoids_of_two_far_tags_hold():
+    """Linearized covariances leave 3 %, those that hold 95 % leave .6 % outside of 99.9 %."""
+    views, true = far_pairs(5000)
+    solved = solve_poses(ForwardModel(LENS), views, examined=False)
+    change = solved.pose.difference(true)[:, None]
+    cautious = squared_distances(change, solved.cautious_covariance)
+    assert len(change) > 3000 and outside(solved.result, true) > 0.004
+    assert np.mean(cautious > CHI2_999) < 0.0025
+    assert np.mean(cautious) > 3, 'and are not larger than that'
+    assert solved.result.tail.max() > 1.5 and solved.result.tail.min() == 1
 
 
 def test_strong_geometry_keeps_its_covariance():

@@ -36,6 +36,7 @@ class _PoseFields(NamedTuple):
     other: Pose
     gap: Array
     added: Array
+    tail: Array
 
 
 class Localization(_PoseFields, Batch):
@@ -45,9 +46,10 @@ class Localization(_PoseFields, Batch):
     residual (S, N, 2), px, measured minus predicted, NaN for padding; cost (S,): whitened sum of
     squares; converged, iterations (S,).  other (S,): the second minimum, as far as one is known,
     and gap (S,): by how much its cost is larger, infinite where none is known.  added (S, 6, 6):
-    what the covariance holds beyond the linearized noise, see `solve.weak_geometry`.  A view whose
-    points do not fix a pose (they lie on one line, say) has not converged; where that is so the
-    covariance is NaN.
+    what the covariance holds beyond the linearized noise, see `solve.weak_geometry`.  tail (S,):
+    the factor on the covariance by which its 99.9 % ellipsoid holds, 1 for normal errors.  A view
+    whose points do not fix a pose (they lie on one line, say) has not converged; where that is so
+    the covariance is NaN.
     """
 
     __slots__ = ()
@@ -73,6 +75,7 @@ class Localization(_PoseFields, Batch):
             Pose(pose.rotation.copy(), pose.position.copy()),
             np.full(len(cost), np.inf),
             np.zeros_like(covariance),
+            np.ones(len(cost)),
         )
 
 
