@@ -13,6 +13,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -94,15 +95,39 @@ def lasting_workers() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope='session', autouse=True)
+def undrawn() -> Iterator[None]:
     """Compose pictures, but do not draw them: half the time of a command that writes a report."""
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine, TightLayoutEngine
 
-    for engine in (ConstrainedLayoutEngine, TightLayoutEngine):
-        monkeypatch.setattr(engine, 'execute', lambda *_: None)
-    monkeypatch.setattr(Figure, 'savefig', lambda _, file, **__: file.write(b'\x89PNG'))
+    from fisheye_svp_ros.reporting.plots import MarginLayout
+
+    with pytest.MonkeyPatch.context() as patch:
+        for engine in (ConstrainedLayoutEngine, TightLayoutEngine, MarginLayout):
+            patch.setattr(engine, 'execute', _unless_drawn(engine.execute, lambda *_: None))
+        save = _unless_drawn(Figure.savefig, lambda _, file, **__: file.write(b'\x89PNG'))
+        patch.setattr(Figure, 'savefig', save)
+        yield
+
+
+_drawn = False
+
+
+def _unless_drawn(function: Callable[..., None], instead: Callable[..., Any]) -> Any:
+    def draw(*arguments: Any, **options: Any) -> Any:
+        return (function if _drawn else instead)(*arguments, **options)
+
+    return draw
+
+
+@pytest.fixture
+def drawn() -> Iterator[None]:
+    """Draw pictures, for a test that looks at them."""
+    global _drawn
+    _drawn = True
+    yield
+    _drawn = False
 
 
 @pytest.fixture(params=['numpy', 'numba'])

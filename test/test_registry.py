@@ -212,7 +212,7 @@ localizer: {ros__parameters: {lens: lens.yaml, svp: false}}
 COMMANDS = {
     'localize': 'seen.semicolon --lens lens.yaml -o found',
     'calibrate': 'seen.semicolon --model rational --image-size 1280x960 -o fitted.yaml',
-    'diagnose': 'seen.semicolon --lens lens.yaml -o causes',
+    'diagnose': 'seen.semicolon --lens lens.yaml --quick -o causes',
     'lens': 'lens.yaml',
     'budget': '--lens lens.yaml -o budget',
     'plan': '--lens lens.yaml --board chessboard:9x6:25mm --room 0.2 1 -o plan',

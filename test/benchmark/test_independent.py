@@ -501,7 +501,6 @@ def diagnosed(wanted, seed, folder):
     return score(json.loads((folder / 'truth.json').read_text()), {**told, 'seconds': 0.0})
 
 
-@pytest.mark.usefixtures('undrawn')
 @pytest.mark.parametrize('name', FIXED)
 def test_a_hidden_effect_is_named(name, tmp_path):
     facts = diagnosed(((name, 1.0),), SEED, tmp_path)
@@ -509,7 +508,6 @@ def test_a_hidden_effect_is_named(name, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures('undrawn')
 def test_fresh_sets_with_nothing_hidden_have_no_name(tmp_path):
     """False names are at most 1 in 20: two in six sets would be met once in thirty runs."""
     seed = int(np.random.SeedSequence().generate_state(1)[0])

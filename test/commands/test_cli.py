@@ -34,8 +34,6 @@ from fisheye_svp_ros.optics.ports import DomeGlass
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.outliers import Outliers
 
-pytestmark = pytest.mark.usefixtures('undrawn')
-
 ROOT = Path(__file__).resolve().parents[2]
 OV_PLANE = DATA / 'ov_plane'
 LENS = Lens('made', 1280, 960, 700.0, 700.0, 650.0, 470.0, Equidistant(), 1.1)

@@ -256,7 +256,6 @@ def test_the_report_of_a_quick_answer_has_few_pictures(scene, tmp_path):
     assert all(source.startswith('data:image/png;base64,') for source in sources)
 
 
-@pytest.mark.usefixtures('undrawn')
 class TestTerminal:
     def test_known_poses(self, scene, capsys):
         assert run('shift.csv', scene, '--poses', scene / 'poses.csv') == 0

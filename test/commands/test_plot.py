@@ -116,7 +116,7 @@ def test_noise_alone_leaves_what_is_predicted() -> None:
     assert spread.ratio.std() == pytest.approx(deviation, rel=0.2)
 
 
-def test_a_sweep_is_drawn_against_everything_that_was_swept(tmp_path: Path) -> None:
+def test_a_sweep_is_drawn_against_everything_that_was_swept(tmp_path: Path, drawn: None) -> None:
     path = tmp_path / 'file.yaml'
     path.write_text(
         'synthetic_camera: {ros__parameters: {sweep.radius: [2.0, 0.5, 0.2], '
@@ -158,7 +158,7 @@ def test_every_metric_that_is_to_be_drawn_has_its_curve(figures: list[Figure]) -
     assert 'Stereo depth: error2, px' in titles and 'Localizer: position error, mm' in titles
 
 
-def test_residuals_are_drawn_against_angle_and_range(tmp_path: Path) -> None:
+def test_residuals_are_drawn_against_angle_and_range(tmp_path: Path, drawn: None) -> None:
     columns = [np.linspace(0.1, 1.0, 50)] * 6
     cloud = structured_array(RESIDUALS, np.arange(50), *columns)
     pictures = []

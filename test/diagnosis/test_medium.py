@@ -21,8 +21,6 @@ from fisheye_svp_ros.solve.port_fit import MEDIUM_INDEX, PORT_PLACE
 from fisheye_svp_ros.solve.rig_state import group_by_frame
 from fisheye_svp_ros.study.trust import assess_lens, with_covariance
 
-pytestmark = pytest.mark.usefixtures('undrawn')
-
 PORT = FlatGlass(0.035, 1.34, 0.02, -0.01)
 CALIBRATED = replace(AIR, calibration={'rms_px': 0.1})
 

@@ -30,8 +30,6 @@ from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
 from fisheye_svp_ros.study.budget import Setup, make_budget
 from fisheye_svp_ros.study.trust import depth_errors, localize_with_errors
 
-pytestmark = pytest.mark.usefixtures('undrawn')
-
 SAMPLES = 300
 
 

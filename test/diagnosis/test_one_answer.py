@@ -22,7 +22,7 @@ from fisheye_svp_ros.solve.robust_calibration import calibrate_without_outliers
 
 FAULTS = DATA.parent / 'faults'
 # One process makes each diagnosis once.
-pytestmark = [pytest.mark.xdist_group('one_answer'), pytest.mark.usefixtures('undrawn')]
+pytestmark = pytest.mark.xdist_group('one_answer')
 SETS = {
     'after_residuals': (FAULTS / 'after_residuals', 'observations.csv', False),
     'sound_lens': (FAULTS / 'sound_lens', 'train.csv', True),

@@ -13,8 +13,6 @@ from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.reporting.diagnosis_document import diagnosis_document
 from fisheye_svp_ros.solve.hand_eye import Transforms
 
-pytestmark = pytest.mark.usefixtures('undrawn')
-
 QUICK = DiagnosisOptions(quick=True)
 # Poses that a hand-eye calibration made those of the camera, all but.
 NEAR = Transforms(

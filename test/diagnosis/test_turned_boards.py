@@ -22,8 +22,6 @@ from fisheye_svp_ros.reporting.wording.first_screen import first_screen, termina
 from fisheye_svp_ros.scene.boards import board_turns
 from fisheye_svp_ros.scene.observations import Observations, make_observations, views_of
 
-pytestmark = pytest.mark.usefixtures('undrawn')
-
 HIDDEN = (3, 8, 9, 14)
 
 

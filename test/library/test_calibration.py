@@ -24,8 +24,6 @@ from fisheye_svp_ros.scene.observations import STEREO, Observations, make_observ
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.targets import board_views
 
-pytestmark = pytest.mark.usefixtures('undrawn')
-
 SIZE = 640, 480
 LENSES = (
     Lens('left', *SIZE, 200.0, 200.4, 321.0, 236.0, KannalaBrandt(-0.01, 0.002), 1.4),

@@ -569,7 +569,8 @@ def test_measured_camera_and_localizer_agree_with_the_command(
 ) -> None:
     lens = tmp_path / 'lens.yaml'
     table = read_observations(OV_PLANE / 'train.csv')
-    save_lens(calibrate(table, 'kannala_brandt', (1280, 800)).adjusted.lens, lens)
+    few = table.take(table.frame % 4 == 0)  # any lens will do
+    save_lens(calibrate(few, 'kannala_brandt', (1280, 800)).adjusted.lens, lens)
     test = str(OV_PLANE / 'test.csv')
     assert main(['localize', test, '--lens', str(lens), '-o', str(tmp_path)]) == 0
     recorder = command('record', '-o', str(tmp_path / 'bag'))

@@ -2,6 +2,9 @@
 
 import csv
 import json
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +13,7 @@ import yaml
 from helpers.commands import unread
 
 from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.commands.executors import Workers
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import config_path, lens_path
@@ -33,10 +37,24 @@ HELD = Path(__file__).with_name('paper_cells.csv')
 Z, RESIDUAL = QUANTITIES.index('z'), QUANTITIES.index('residual')
 
 
+class Pickling(ThreadPoolExecutor):
+    """Does in this process what can be sent to another one."""
+
+    def submit(self, function, *arguments):
+        return super().submit(*pickle.loads(pickle.dumps((function, *arguments))))
+
+
+@contextmanager
+def here(_):
+    with Pickling(1) as executor:
+        yield Workers(executor, 1)
+
+
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp('paper')
-    with unread():  # the files are written nevertheless
+    with unread(), pytest.MonkeyPatch.context() as patch:  # the files are written nevertheless
+        patch.setattr('fisheye_svp_ros.commands.executors.process_pool', here)
         assert main(['paper', '-o', str(folder)]) == 141
     return folder
 

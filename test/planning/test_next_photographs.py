@@ -373,7 +373,7 @@ def test_views_past_what_a_lens_was_calibrated_for_are_named(tmp_path, capsys):
         assert noted == (reached == 50)
 
 
-def test_a_plan_before_the_first_photograph(tmp_path, capsys):
+def test_a_plan_before_the_first_photograph(tmp_path, capsys, drawn):
     command = [
         'plan',
         '--fov',

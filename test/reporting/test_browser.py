@@ -99,7 +99,6 @@ def test_nothing_is_cut_and_what_matters_is_above_the_fold(
     assert max([*found['headline'][:1], *found['actions']]) <= height
 
 
-@pytest.mark.usefixtures('undrawn')
 def test_photographs_go_by_their_names_and_the_command_runs_as_printed(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,8 @@ from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.reporting import evidence_plots
 from fisheye_svp_ros.reporting.plots import drawing
 
+pytestmark = pytest.mark.usefixtures('drawn')
+
 
 @pytest.fixture
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:

@@ -18,6 +18,7 @@ from fisheye_svp_ros.reporting.plots import NARROW, drawing, legend_below, panel
 from fisheye_svp_ros.reporting.ray_plots import draw_ray_map
 from fisheye_svp_ros.solve.ray_errors import RayMap
 
+pytestmark = pytest.mark.usefixtures('drawn')
 TEMPLATES = Path(reporting.__file__).parent / 'templates'
 
 

@@ -30,8 +30,6 @@ from fisheye_svp_ros.solve.lens_calibration import calibrate, calibrate_hand_eye
 from fisheye_svp_ros.solve.reliability import noise_sigma
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, group_by_frame
 
-pytestmark = pytest.mark.usefixtures('undrawn')
-
 
 def fit(seed: int, **settings) -> tuple[RigState, HandEye]:
     table, camera, poses = robot(seed, **settings)

@@ -17,8 +17,6 @@ from fisheye_svp_ros.solve.rig_calibration import (
     connected_cameras,
 )
 
-pytestmark = pytest.mark.usefixtures('undrawn')
-
 ALL_SEAMS = (45.0, 135.0, 225.0, 315.0)
 LENSES = dict.fromkeys(CAMERAS, LENS)
 

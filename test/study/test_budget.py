@@ -166,7 +166,7 @@ def test_a_noise_that_overflows_is_refused():
         make_budget(Setup(LENS, rig('parallel'), 1e-300))
 
 
-def test_the_command_says_yes_and_no(tmp_path, capsys):
+def test_the_command_says_yes_and_no(tmp_path, capsys, drawn):
     assert main(['budget', '--lens', 'fish214', '--max-residual', '100']) == 0
     said = ' '.join(capsys.readouterr().out.split())
     assert 'Yes: for landmarks within 106 degrees of the axis at 0.5 m SVP keeps every' in said

@@ -10,9 +10,11 @@ import sys
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pandas as pd
@@ -21,9 +23,10 @@ from helpers.commands import refused
 from helpers.nodes import ROOT, until
 
 from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.commands.executors import completed_tasks, dask
 from fisheye_svp_ros.commands.node_sweeps import read_sweep
 from fisheye_svp_ros.commands.sweep import _sole_writer
-from fisheye_svp_ros.errors import OutputError, ParameterError
+from fisheye_svp_ros.errors import OutputError, ParameterError, SweepError
 from fisheye_svp_ros.io import columns as tables
 from fisheye_svp_ros.io.columns import plain_columns, read_table
 from fisheye_svp_ros.io.files import write_text
@@ -582,6 +585,23 @@ class TestDask:
         assert process.returncode == 2 and parts_in(out) >= 1
         assert 'no worker came' in err and 'continue with --resume' in err
 
+    def test_tasks_that_nobody_works_on_any_longer_end_a_sweep(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """They waited without end, as the next test shows with processes."""
+        distributed = pytest.importorskip('distributed', reason='needs the extra `dask`')
+        monkeypatch.setattr('fisheye_svp_ros.commands.executors._CHECK_INTERVAL', 0.01)
+        client = MagicMock()
+        client.nthreads.side_effect = [{'worker': 1}, {'worker': 1}, {}]
+        client.wait_for_workers.side_effect = OSError
+        client.get_executor().submit = lambda *_: Future()
+        monkeypatch.setattr(distributed, 'Client', lambda *_, **__: client)
+        with (
+            pytest.raises(SweepError, match=r'no worker came .* continue with --resume'),
+            dask('tcp://here') as workers,
+        ):
+            list(completed_tasks(int, ['1', '2'], workers))
+
     def test_a_worker_is_awaited_with_a_word_and_up_to_a_limit(
         self,
         write: Callable[[str], Path],
@@ -678,9 +698,9 @@ def test_memory_grows_with_the_metrics_of_a_sweep_alone(
         pytest.skip('pyarrow is not here')
     if not parquet:
         monkeypatch.setattr(tables, 'arrow', lambda: (None, ''))
-    monkeypatch.setattr(tables, '_ROWS', 4096)  # of a row group, which is held, too
+    monkeypatch.setattr(tables, '_ROWS', 1024)  # of a row group, which is held, too
     peaks: list[int] = []
-    for seeds in (10, 10, 50):  # the first one loads what all need
+    for seeds in (3, 3, 13):  # the first one loads what all need
         lists = f'{{sweep.radius: {[0.5] * 512}, sweep.seed: {list(range(seeds))}}}'
         path, out = write(f'/**: {{ros__parameters: {lists}}}'), tmp_path / f'{len(peaks)}'
         solve_all_but_join(path, out)
@@ -690,9 +710,9 @@ def test_memory_grows_with_the_metrics_of_a_sweep_alone(
         tracemalloc.stop()
         written = json.loads((out / 'sweep.json').read_text())['metrics']
         assert written['localizer.rms_px']['solved'] == 512 * seeds
-    # Of the rows of 20480 more scenarios their 11 metrics, 8 bytes each, and half as much again
+    # Of the rows of 5120 more scenarios their 11 metrics, 8 bytes each, and half as much again
     # with older versions of NumPy and pandas
-    assert peaks[2] - peaks[1] < 18 * 8 * 20480
+    assert peaks[2] - peaks[1] < 18 * 8 * 5120
 
 
 def test_a_damaged_part_is_named(tmp_path: Path) -> None:
