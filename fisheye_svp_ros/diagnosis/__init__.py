@@ -70,7 +70,7 @@ from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, can_be_included
 from fisheye_svp_ros.diagnosis.stages import diagnose, diagnose_against
 from fisheye_svp_ros.diagnosis.stepwise import NAMED_P
-from fisheye_svp_ros.diagnosis.uncertainty import standard_errors, total_errors
+from fisheye_svp_ros.diagnosis.uncertainty import errors_of_named_models, standard_errors
 from fisheye_svp_ros.diagnosis.variance_budget import noise_px, stage_shares
 
 __all__ = [
@@ -122,6 +122,7 @@ __all__ = [
     'deviations',
     'diagnose',
     'diagnose_against',
+    'errors_of_named_models',
     'frames_of',
     'map_lens_rays',
     'noise_px',
@@ -133,5 +134,4 @@ __all__ = [
     'stage_shares',
     'standard_errors',
     'status_of',
-    'total_errors',
 ]

@@ -111,10 +111,10 @@ class AveragedModel:
         mean = np.zeros(into.shape[1])
         for base in np.unique(models.base):
             mine = models.base == base
-            found = posterior.estimate(models.there[mine], base)
+            found = posterior.estimate(models.there[mine], base, into)
             mean += models.weight[mine] @ found.values
             values[mine] = found.values @ into.T
-            covariances[mine] = into @ found.covariance @ into.T
+            covariances[mine] = found.covariance
         place = np.array([names.index(name) for name in shared_names(null.linear)], dtype=np.int64)
         before = np.zeros(len(names))
         for term in posterior.open_terms:

@@ -98,9 +98,12 @@ class EffectPosterior:
         """The effects in the null model that need not be there."""
         return [one for one in self.null.terms if not np.isin(one.columns, self.fixed).all()]
 
-    def estimate(self, there: Mask, base: int) -> Estimates:
-        """Return what models (N, O) beside one of the products make of all that is shared."""
-        return estimate_models(self.products[base], self.options, there)
+    def estimate(self, there: Mask, base: int, into: Array) -> Estimates:
+        """Return what models (N, O) beside one of the products make of all that is shared.
+
+        into (C, K + P): combinations of it that covariances are asked of.
+        """
+        return estimate_models(self.products[base], self.options, there, into)
 
     @property
     def fitted_models(self) -> Models:

@@ -32,6 +32,17 @@ def total_errors(null: NullModel, averaged: AveragedModel | None = None) -> Arra
     return np.hypot(standard_errors(null), averaged.added_errors())
 
 
+def errors_of_named_models(null: NullModel) -> Array:
+    """Return what other models with named effects add to standard errors (K,) of what is shared.
+
+    Without smooth fields and walks beside them, which change little of it and take most of the
+    time of a search over models.
+    """
+    return AveragedModel.of_posterior(
+        EffectPosterior.of_null_model(null, quick=True)
+    ).added_errors()
+
+
 def standard_errors(null: NullModel, jackknife: bool = True) -> Array:
     """Return the standard errors (K,) of all that is shared: rig, intrinsics, effects.
 

@@ -157,12 +157,23 @@ class _Solved:
         block = products.matrix[at[:, :, None], at[:, None]] * sd[:, :, None] * sd[:, None]
         root = _root_beside_prior(block)
         score = (products.matrix[at, -1] * sd)[..., None]
-        return cls(at, sd, gather(signed) & real, root, np.linalg.solve(root, score)[..., 0])
+        return cls(at, sd, gather(signed) & real, root, _solve_roots(root, score)[..., 0])
 
     @cached_property
     def inverse(self) -> Array:
         """Inverses (N, w, w) of the roots, transposed."""
-        return np.swapaxes(np.linalg.inv(self.root), -1, -2)
+        identity = np.broadcast_to(np.eye(self.root.shape[-1]), self.root.shape)
+        return np.swapaxes(_solve_roots(self.root, identity), -1, -2)
+
+    def positive_scores(self) -> tuple[Index, Array]:
+        """Return the models (m,) and the means over errors (m,) of what can only be positive.
+
+        Errors over the standard deviation of the noise.
+        """
+        model, place = np.nonzero(self.positive)
+        unit = np.eye(self.root.shape[-1])[place, :, None]
+        column = _solve_roots(self.root[model], unit)[..., 0]
+        return model, (column * self.half[model]).sum(axis=1) / np.linalg.norm(column, axis=1)
 
     def rest(self, products: Products) -> Array:
         """Return the squares (N,) that are left of the residual."""
@@ -174,6 +185,15 @@ class _Solved:
         """Return log marginal likelihoods (N,)."""
         logs = np.log(np.diagonal(self.root, axis1=-2, axis2=-1)).sum(axis=1)
         return np.asarray(_log_likelihood(products, self.rest(products)) - logs)
+
+
+def _solve_roots(root: Array, right: Array) -> Array:
+    """Solve the equations of lower roots (N, w, w), all at once; right (N, w, C)."""
+    found = np.empty(right.shape)
+    for i in range(right.shape[1]):
+        known = root[:, None, i, :i] @ found[:, :i]
+        found[:, i] = (right[:, i] - known[:, 0]) / root[:, i, i, None]
+    return found
 
 
 def _root_beside_prior(block: Array) -> Array:
@@ -204,10 +224,10 @@ def log_evidence(products: Products, options: Options, there: Mask) -> Array:
 def _log_evidence_of(solved: _Solved, products: Products, options: Options, there: Mask) -> Array:
     found = solved.log_evidence(products) + there @ options.log_odds
     if solved.positive.any():
-        mean = (solved.inverse @ solved.half[..., None])[..., 0]
         noise = np.sqrt(solved.rest(products) / products.freedom)
-        z = mean / np.sqrt((solved.inverse**2).sum(axis=-1)) / noise[:, None]
-        found = found + ((special.log_ndtr(z) + np.log(2)) * solved.positive).sum(axis=1)
+        model, score = solved.positive_scores()
+        logs = special.log_ndtr(score / noise[model]) + np.log(2)
+        found = found + np.bincount(model, logs, len(found))
     return np.asarray(found)
 
 
@@ -220,7 +240,7 @@ def find_coefficients(products: Products, options: Options, there: Mask) -> Coef
 
 
 class Estimates(NamedTuple):
-    """Of N models: values (N, K + P) and covariances (N, K + P, K + P).
+    """Of N models: values (N, K + P) and covariances (N, C, C), of C combinations of these.
 
     Of what is always there and then of all columns, zeros for those that a model does not have.
     """
@@ -229,8 +249,13 @@ class Estimates(NamedTuple):
     covariance: Array
 
 
-def estimate_models(products: Products, options: Options, there: Mask) -> Estimates:
-    """Return what models (N, O) make of all columns."""
+def estimate_models(
+    products: Products, options: Options, there: Mask, into: Array | None = None
+) -> Estimates:
+    """Return what models (N, O) make of all columns.
+
+    into (C, K + P): combinations that covariances are asked of, None for all columns themselves.
+    """
     found = find_coefficients(products, options, there)
     (count, width), (always, columns) = found.columns.shape, products.follow.shape
     rows, places = np.arange(count)[:, None], always + found.columns
@@ -240,8 +265,9 @@ def estimate_models(products: Products, options: Options, there: Mask) -> Estima
     np.add.at(root, (rows[..., None], places[..., None], np.arange(width)), found.root)
     values[:, :always] = products.fixed - values[:, always:] @ products.follow.T
     root[:, :always] = -products.follow @ root[:, always:]
-    covariance = root @ np.swapaxes(root, -1, -2)
-    covariance[:, :always, :always] += products.inverse
+    into = np.eye(always + columns) if into is None else into
+    root, own = into @ root, into[:, :always]
+    covariance = root @ np.swapaxes(root, -1, -2) + own @ products.inverse @ own.T
     return Estimates(values, covariance * found.variance[:, None, None])
 
 
@@ -312,7 +338,7 @@ def _log_with_one_more(products: Products, options: Options, there: Mask) -> Arr
     """
     solved = _Solved.solve(products, options, there)
     across = products.matrix[solved.at] * solved.sd[..., None]
-    half = np.linalg.solve(solved.root, across)
+    half = _solve_roots(solved.root, across)
     left = products.matrix - np.swapaxes(half, -1, -2) @ half
     rest = solved.rest(products)
     logs = _log_evidence_of(solved, products, options, there)[:, None] + options.log_odds

@@ -16,9 +16,9 @@ from fisheye_svp_ros.diagnosis import (
     LensErrors,
     NullModel,
     compare_errors,
+    errors_of_named_models,
     noise_px,
     standard_errors,
-    total_errors,
 )
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import FisheyeSvpError
@@ -116,12 +116,13 @@ def assess_cameras(data: RigViews, state: RigState, names: Sequence[str]) -> Sha
     start = 6 * (len(state.rig.position) - 1)
     count = start + len(names)
     # What else a lens has, its corrections, is fitted along and follows them.
-    errors = total_errors(null)[:count]
+    between_frames = standard_errors(null)
+    errors = np.hypot(between_frames, errors_of_named_models(null))[:count]
     targets = _fit_targets(null, count)
     moved, covariance = _average_fits([_fit_without_random_parts(null, targets[0]), *targets])
     # What frames left out say of the errors holds for any target.
     errors_of_noise = np.sqrt(np.diag(targets[0].covariance))
-    larger = np.nan_to_num(standard_errors(null)[:count])
+    larger = np.nan_to_num(between_frames[:count])
     # A broad image field turns a camera on the rig; of one by itself the poses take that up.
     larger[:start] = np.nan_to_num(errors[:start])
     larger = np.maximum(larger, errors_of_noise) / np.maximum(errors_of_noise, 1e-300)
