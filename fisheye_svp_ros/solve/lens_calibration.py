@@ -104,6 +104,21 @@ def calibrate(
     return _as_calibration(observations, fit_lens(start, views, names), views, left_out)
 
 
+def refit(calibration: Calibration, observations: Observations) -> Calibration | None:
+    """Fit a calibrated lens anew to nearly all rows that it was fitted to, from where that ended.
+
+    None where it is not fitted from there: behind a port, or where its views are other ones.
+    Raises GeometryError where the rows do not determine it.
+    """
+    lens, names = calibration.adjusted.lens, calibration.adjusted.names
+    views, left_out = posable_views(observations)
+    if lens.port is not None or not np.array_equal(views.frame, calibration.views.frame):
+        return None
+    _check_row_count(observations.source, views, names)
+    adjusted = _adjust_until_stable(lens, views, names)
+    return _as_calibration(observations, adjusted, views, left_out)
+
+
 def calibrate_port(
     observations: Observations, lens: Lens, port: Port, free: Sequence[str] | None = None
 ) -> Calibration:

@@ -12,12 +12,13 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.table_checks import check_frames_differ
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.lens_calibration import Calibration
+from fisheye_svp_ros.solve.lens_calibration import Calibration, refit
 from fisheye_svp_ros.solve.outliers import NO_OUTLIERS, Outliers, find_outliers
 from fisheye_svp_ros.solve.rig_state import group_by_frame
 from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
 
 _MAX_ROUNDS = 4
+_FEW_OUTLIERS = 0.02  # of the rows: a lens that they were fitted with is near that without them
 
 
 def calibrate_without_outliers(
@@ -42,7 +43,9 @@ def calibrate_without_outliers(
     rows = np.delete(np.arange(len(observations)), rejected.rows)
     while True:
         if result is None or rounds or wrong:
-            result = calibrate(observations.take(rows))
+            fewer = observations.take(rows)
+            near = result and len(rejected.rows) <= _FEW_OUTLIERS * len(observations)
+            result = (result and near and refit(result, fewer)) or calibrate(fewer)
         rows = rows[~np.isin(observations.frame[rows], result.left_out)]
         table = observations.take(rows)
         data = group_by_frame(table)

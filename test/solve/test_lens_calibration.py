@@ -18,7 +18,7 @@ from fisheye_svp_ros.optics.lens import Lens, field_of_view
 from fisheye_svp_ros.scene.observations import group_views
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.bundle_adjustment import adjust_lens
-from fisheye_svp_ros.solve.lens_calibration import _check_focal, calibrate
+from fisheye_svp_ros.solve.lens_calibration import _check_focal, calibrate, refit
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured_poses import posable_views, rms_px
 from fisheye_svp_ros.solve.table_poses import solve_table
@@ -385,3 +385,27 @@ class TestMeasuredPoses:
         table = make_table(model.lens, plane, 2, 16)
         with pytest.raises(GeometryError, match='inside the field of view of lens'):
             solve_table(table, ForwardModel(replace(model.lens, max_incidence=1e-3)))
+
+
+@pytest.mark.parametrize('target', TARGETS.values(), ids=TARGETS)
+@pytest.mark.parametrize(('model', 'corner_deg'), [('kannala_brandt', 110), ('stereographic', 95)])
+def test_a_lens_fitted_anew_without_some_points_is_that_of_a_fit_from_nothing(
+    target, model, corner_deg
+):
+    table = make_table(make_lens(model, corner_deg), target, 10, 8)
+    uv = table.uv.copy()
+    uv[::97] += 3.0  # of outliers
+    table = replace(table, uv=uv)
+    fewer = table.take(np.arange(len(table)) % 97 > 0)
+    first, expected = (calibrate(some, model, SIZE) for some in (table, fewer))
+    found, names = refit(first, fewer), first.adjusted.names
+    off, error = (
+        parameters(found.adjusted.lens, names) - parameters(expected.adjusted.lens, names),
+        np.sqrt(np.diag(expected.adjusted.covariance)),
+    )
+    assert np.abs(off / error).max() < 1e-3
+    for figures in (found.adjusted.lens.calibration, expected.adjusted.lens.calibration):
+        assert figures['observations'] == len(fewer)
+    moved = parameters(first.adjusted.lens, names) - parameters(expected.adjusted.lens, names)
+    assert np.abs(moved / error).max() > 0.1  # the points that are gone mattered
+    assert refit(first, table.take(table.frame > table.frame.min())) is None
