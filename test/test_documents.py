@@ -150,6 +150,19 @@ def test_the_schema_is_that_of_the_records() -> None:
     assert diagnosis_schema.SCHEMA.read_text(encoding='utf-8') == diagnosis_schema.text(), stale
 
 
+def test_the_glossary_has_the_terms_of_first_screens() -> None:
+    """Of whoever has never seen a diagnosis."""
+    page = (ROOT / 'docs' / 'reference' / 'glossary.md').read_text(encoding='utf-8')
+    entries = re.findall(r'^\| ([^|]+) \|', page, re.MULTILINE)
+    terms = {term for entry in entries for term in entry.split(', ')}
+    used = (
+        'extended lens, extrapolated, intrinsics, landmark, left-out error, mrad, noise, '
+        'off axis, outlier, photograph, ray error, readout, rms, sensor tilt, single frame, sure, '
+        'target, viewpoint'
+    )
+    assert {*used.split(', ')} <= terms
+
+
 def test_the_figures_of_the_first_pages_are_those_of_the_results() -> None:
     sys.path.insert(0, str(ROOT / 'docs'))
     try:

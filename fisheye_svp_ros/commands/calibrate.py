@@ -44,6 +44,7 @@ from fisheye_svp_ros.reporting.wording.calibration import (
     calibration_warnings,
     estimate_sentence,
     hand_eye_sentence,
+    reached_sentence,
 )
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras
 from fisheye_svp_ros.solve.rig_calibration import RigCalibration, connected_cameras
@@ -219,10 +220,8 @@ def _print(camera: CalibratedCamera) -> None:
         print(f'  {sentence}')
     if open_ones:
         print(f'  {ANY_TARGET_NOTE}')
-    print(
-        f'  image points reach {np.degrees(camera.result.reached):.2f} deg of max_incidence_deg '
-        f'{np.degrees(lens.max_incidence):.2f}; {STANDARD_ERRORS}'
-    )
+    print(f'  {reached_sentence(camera.result.reached, lens.max_incidence)}')
+    print(f'  {STANDARD_ERRORS}')
     if camera.hand_eye:
         print_table(
             hand_eye_sentence(camera.hand_eye), ROBOT_HEADER, hand_eye_rows(camera.hand_eye)

@@ -272,20 +272,20 @@ def _print_poses(
     )
     if more := len(pose.position) - len(rows):
         print(f'  and {more} more frames')
-    print(f'  {errors}, largest over all directions')
+    print(f'  Standard errors are the largest over all directions. {errors}.')
 
 
 def _parts_text(uncertainty: _Parts) -> str:
     by = uncertainty['position_m']
     shares = ', '.join(
-        f'{words} {1000 * by[name]:.3g} mm'
+        f'{1000 * by[name]:.2g} mm from {words}'
         for name, words in (
             ('noise', 'noise'),
-            ('parameters', 'parameters of the lens'),
+            ('parameters', 'the parameters of the lens'),
             ('misfit', 'unexplained model error'),
         )
     )
-    return f'standard errors with those of the lens (rms of positions: {shares})'
+    return f'Rms of positions: {shares}'
 
 
 def _write_poses(

@@ -28,6 +28,7 @@ from fisheye_svp_ros.reporting.ray_plots import draw_uncertainty
 from fisheye_svp_ros.reporting.shot_plots import draw_shots
 from fisheye_svp_ros.reporting.terminal import draw_or_note
 from fisheye_svp_ros.reporting.wording import shots
+from fisheye_svp_ros.reporting.wording.adequacy import remedy
 from fisheye_svp_ros.reporting.wording.causes import (
     bare_probability,
     belief,
@@ -279,7 +280,8 @@ def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
         'total_px2': f'{total:.3g}',
         'budget_rows': list(budget_rows(diagnosis)),
         'intrinsics': list(intrinsic_rows(diagnosis)),
-        'advice': [
+        'advice': [(remedy(flaw.kind), '') for flaw in diagnosis.adequacy.flaws]
+        + [
             (advice_text(advice), percent(advice.gain) if advice.gain > 0 else '')
             for advice in diagnosis.advice
         ],

@@ -92,6 +92,9 @@ def print_lines(lines: Iterable[str]) -> None:
     title, *body = lines
     out.print(title)
     for line in body:
+        if not line:
+            out.print()  # padding alone prints nothing
+            continue
         out.print(Padding(line, (0, 0, 0, 2), expand=False))
 
 
@@ -144,8 +147,10 @@ def interval(low: float, high: float) -> str:
 def noise_text(sigma: float | None) -> str:
     """Say what noise the standard errors rest on: sigma, px, estimated, or None if given."""
     if sigma is None:
-        return 'standard errors from the sigma of the observations'
-    return f'standard errors from {sigma:.4f} px in u and in v, estimated from the residuals'
+        return 'They follow from the sigma of the observations'
+    return (
+        f'They follow from a noise of {sigma:.4f} px in u and in v, estimated from the residuals'
+    )
 
 
 @contextmanager

@@ -354,7 +354,8 @@ class TestCalibrate:
         shown, err = capsys.readouterr()
         assert f'{len(table)} points in 6 frames' in shown
         assert err == ''
-        assert '; standard errors include local errors of target, frames, and image' in shown
+        assert '\n  Standard errors include local errors of target, frames, and image' in shown
+        assert re.search(r'\n  Image points reach \d+ deg off axis', shown)
         assert 'std. error   unit' in shown  # no column of ranges where all are settled
         lens = load_lens(out)
         assert lens.name == 'mine'
@@ -449,7 +450,7 @@ class TestCalibrate:
         reached = json.loads(out.with_suffix('.calibrate.json').read_text())['reached_deg']
         assert reached == pytest.approx(np.degrees(250 / 700), abs=0.6)
         assert f'the curve is extrapolated beyond {reached:.0f} deg' in said['middle'].err
-        assert f'image points reach {reached:.2f} deg' in said['middle'].out
+        assert f'Image points reach {reached:.0f} deg off axis; from there' in said['middle'].out
 
     def test_a_file_is_written_for_one_camera_with_a_name(self, scene, tmp_path):
         _, _, table = scene

@@ -444,7 +444,7 @@ def test_the_likelier_one_of_a_confounded_set_comes_first(found: Diagnosis) -> N
         ),
         (
             TargetError('landmark_scale', 0.01, stretched=True),
-            'measure its width and height with a steel ruler, to 0.5 mm, and correct x, y, z',
+            'measure its width and height with a steel ruler, to 0.5 mm',
         ),
         (
             TargetError('board_pose'),
@@ -461,7 +461,9 @@ def test_how_to_measure_a_target_is_said(
     again = _deciding(found, 'target', say='measure_again', facts=facts)
     assert target_words(again) == f'For better poses, {words}'
     bends = _deciding(again, 'target', facts=facts._replace(bend_m=0.0004))
-    assert target_words(bends) == 'For better poses, mount it on a stiff plate'
+    stiff = 'For better poses, mount it on a stiff plate'
+    of_shape = error is None or error.effect == 'target_shape'
+    assert target_words(bends) == (stiff if of_shape else f'{stiff}, and {words}')
 
 
 def _facts(found: Diagnosis) -> TargetFacts:
@@ -493,13 +495,13 @@ def test_frames_that_differ_are_told_in_mrad(found: Diagnosis) -> None:
     varies = Flaw(FlawKind.FOCAL_VARIES, 0.044, 0.006, ends)
     said = _flawed(found, Adequacy((varies,), 1.0, 0.0063))
     assert said[1] == (
-        'Wrong: Single frames are off by 6.3 mrad (6.3 mm at 1 m): frames 0 to 3 against frames '
+        'Wrong: Single frames are off by 6.3 mrad (6.3 mm at 1 m): frames 0 to 3 differ from '
         '4 to 7.'
     )
     scattered = tuple(range(0, 90, 7)), tuple(b for a in range(3, 90, 9) for b in (a, a + 2))
     many = _flawed(found, Adequacy((replace(varies, groups=scattered),), 1.0, 0.0063))
     assert len(many[1].split()) <= MAX_WORDS
-    assert 'frames 0, 7, … 84 against frames 3, 5, 12, ' in many[1] and many[1].endswith(' more.')
+    assert 'frames 0, 7, … 84 differ from 3, 5, 12, ' in many[1] and many[1].endswith(' more.')
 
 
 def test_an_undecided_lens_is_not_called_sure(found: Diagnosis) -> None:

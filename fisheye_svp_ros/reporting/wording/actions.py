@@ -47,23 +47,24 @@ def _remedy(d: Diagnosis, facts: TargetFacts) -> str:
     """Return how to correct a target: what to measure, how precisely, with what tool."""
     if facts.contradicted:
         return 'find out whether it was bent or exchanged between the photographs of two cameras'
-    if facts.bend_m:
-        return _STIFF_PLATE
+    stiff = [_STIFF_PLATE] if facts.bend_m else []
     largest = facts.largest
     if largest is None or largest.effect == 'landmark_survey':
-        return f'measure the distances between its landmarks {_tool(1e3 * facts.local_m)}'
-    if largest.effect == 'target_shape':
-        return (
+        how = f'measure the distances between its landmarks {_tool(1e3 * facts.local_m)}'
+    elif largest.effect == 'target_shape':
+        how = (
             'flatten or replace it; a straightedge laid across it shows the gap of '
             f'{1e3 * largest.size:.2g} mm'
         )
-    if largest.effect == 'landmark_scale':
+    elif largest.effect == 'landmark_scale':
         across = 1e3 * largest.size * target_size(d.evaluation.problem.observations)
-        what = 'width and height' if largest.stretched else 'width'
-        return f'measure its {what} {_tool(across)}, and correct x, y, z'
-    if largest.effect == 'board_pose':
-        return 'measure how its boards are mounted to each other, with a steel ruler'
-    return 'measure it, or replace it'
+        how = f'measure its {"width and height" if largest.stretched else "width"} {_tool(across)}'
+    elif largest.effect == 'board_pose':
+        how = 'measure how its boards are mounted to each other, with a steel ruler'
+    else:
+        how = 'measure it, or replace it'
+    of_shape = largest is None or largest.effect == 'target_shape'
+    return ', and '.join(stiff if stiff and of_shape else [*stiff, how])
 
 
 def _tool(error_mm: float) -> str:

@@ -76,7 +76,9 @@ def group_lists(flaw: Flaw, most: int = _MAX_RUNS) -> str:
     lists = [frame_list(*pair, most) for pair in pairs]
     if flaw.kind is FlawKind.CAMERAS_MIXED:
         return f'one camera took {"; another ".join(lists)}'
-    return ' against '.join(lists)
+    return ' differ from '.join(
+        [*lists[:1], *(names.removeprefix('frames ') for names in lists[1:])]
+    )
 
 
 def flaw_summary(flaw: Flaw) -> str:

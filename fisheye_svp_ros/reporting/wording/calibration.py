@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.solve.rig_calibration import RigCalibration
 
 STANDARD_ERRORS = (
-    'standard errors include local errors of target, frames, and image, and likely errors in '
-    'the shape and scale of the target'
+    'Standard errors include local errors of target, frames, and image, and likely errors in '
+    'the shape and scale of the target.'
 )
 ANY_TARGET = '95 %, any target'  # heads the range of a parameter
 ANY_TARGET_NOTE = (
@@ -53,8 +53,15 @@ def estimate_sentence(figures: Mapping[str, Any]) -> str:
     return (
         f'rms {figures["rms_px"]:.4f} px on the board as stated. Plain least squares leaves '
         f'{least:.4f} px, because it absorbs board errors into the lens (--plain writes that '
-        'lens)'
+        'lens).'
     )
+
+
+def reached_sentence(reached: float, claimed: float) -> str:
+    """Return how far off axis the points reach, and what is beyond; angles in rad."""
+    points, lens = (round(float(np.degrees(angle))) for angle in (reached, claimed))
+    beyond = f'; from there to {lens} deg, the lens is extrapolated' if lens > points else ''
+    return f'Image points reach {points} deg off axis{beyond}.'
 
 
 def calibration_warnings(camera: CalibratedCamera) -> tuple[str, ...]:

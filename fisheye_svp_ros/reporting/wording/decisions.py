@@ -73,7 +73,8 @@ _ACTIONS = {
 
 def decision_reason(decision: Decision) -> str:
     """Return why, as a clause that begins in lower case and ends without a stop."""
-    if decision.flaws:
+    # What is to be done about a target in spite of flaws has its own reason.
+    if decision.flaws and decision.say not in ('correct', 'measure_again'):
         return flaw_reason(decision.flaws, _SUBJECTS[type(decision.facts)])
     return _reasons(decision.facts)[decision.reason]
 

@@ -19,13 +19,14 @@ from fisheye_svp_ros.diagnosis import (
     Comparison,
     Decision,
     Diagnosis,
+    FlawKind,
     LensReason,
     Status,
     frames_of,
     status_of,
 )
 from fisheye_svp_ros.reporting.blocks import image_uri
-from fisheye_svp_ros.reporting.wording.accuracy import accuracy
+from fisheye_svp_ros.reporting.wording.accuracy import accuracy, used_rays
 from fisheye_svp_ros.reporting.wording.actions import (
     photographs_reason,
     photographs_words,
@@ -116,6 +117,9 @@ def first_screen(
     """Return the first screen; source: what was diagnosed; known: of `known_rows`."""
     paths = _paths(d)
     kind = {'retake': RETAKE, 'more': UNLIKE}.get(d.decision['photographs'].say, '')
+    # The bound of the rays stands above, with the angle that it holds for.
+    told = FlawKind.LENS_UNKNOWN if used_rays(d) else None
+    flaws = [flaw for flaw in d.adequacy.flaws if flaw.kind is not told]
     about = frames_of(d.advice, kind) if kind and not d.adequacy.is_misfit else []
     answers: tuple[tuple[str, str, Decision, list[str]], ...] = (
         (_LENS, lens_words(d), d.decision['lens'], []),
@@ -130,7 +134,7 @@ def first_screen(
     return Screen(
         headline(d),
         wrong(d),
-        tuple(map(flaw_statement, d.adequacy.flaws)),
+        tuple(map(flaw_statement, flaws)),
         _facts(d, source),
         _warning(d),
         tuple(

@@ -15,7 +15,9 @@ from fisheye_svp_ros.diagnosis import (
     Status,
     TargetFacts,
     TargetReason,
+    status_of,
 )
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.wording.accuracy import mrad_in_mm, used_rays
 from fisheye_svp_ros.reporting.wording.adequacy import common_residual, flaw_statement, group_lists
 from fisheye_svp_ros.reporting.wording.causes import (
@@ -46,7 +48,7 @@ _BRIEF = {
     'landmark_scale': 'target scale',
     'landmark_survey': 'displaced:',
     'board_pose': 'misplaced boards',
-    'session_step': 'intrinsics step',
+    'session_step': 'jump of intrinsics',
     'radial_profile': 'lens curve',
     'pupil_decentering': 'sideways pupil',
 }
@@ -75,7 +77,7 @@ def _named(d: Diagnosis) -> Iterator[str]:
     brief = [_brief(d, cause) for cause in causes]
     first = _plain_statement(d, causes[0])
     forms = [full, [*full[:1], *brief[1:]], [first, *brief[1:]]]
-    others, gains = _other_errors(d), _gains(d)
+    others, gains = [*_target_errors(d), *_lens_errors(d)], _gains(d)
     for count in range(len(others), -1, -1):
         for gain in (*([gain] for gain in gains), []):
             yield from (_join([*form, *others[:count], *gain]) for form in forms)
@@ -127,18 +129,32 @@ def _gains(d: Diagnosis) -> list[str]:
     verb = 'lowers' if named < base else 'raises'
     return [
         f'correction {verb} the error on left-out frames from {before} to {after} px',
-        f'corrected: {before} → {after} px on left-out frames',
+        f'left-out error {before} → {after} px if corrected',
     ]
 
 
-def _other_errors(d: Diagnosis) -> list[str]:
-    """Return what is wrong beside the named causes: of the target, of the lens."""
-    target, others = d.decision['target'], []
+def _target_errors(d: Diagnosis) -> list[str]:
+    """Return what is wrong with the target beside the named causes."""
+    target, errors = d.decision['target'], []
     if isinstance(target.facts, TargetFacts):
-        others += [frame_bend(target.facts)] if target.facts.bend_m else []
+        errors += [frame_bend(target.facts)] if target.facts.bend_m else []
         if target.reason in _DISPLACED and target.facts.local_m:
-            others.append(_displaced(target.facts))
-    return others + ([open_effect(d.open_lens)] if d.open_lens is not None else [])
+            errors.append(_displaced(target.facts))
+    return errors
+
+
+def _lens_errors(d: Diagnosis) -> list[str]:
+    """Return what may be wrong with the lens beside the named causes."""
+    if d.open_lens is not None:
+        return [open_effect(d.open_lens)]
+    if not d.offers_extended:
+        return []
+    return [
+        f'{one.effect.name.replace("_", " ")} is likely ({chance(one.weight)})'
+        for one in d.evaluation.averaged_model.effects
+        if status_of(one.weight, False) is Status.LIKELY
+        and CATALOGUE[one.effect.name].budget_stage() == 'lens'
+    ]
 
 
 def _displaced(facts: TargetFacts) -> str:
@@ -152,15 +168,15 @@ def nothing_named(d: Diagnosis) -> str:
         return 'there are errors, but one frame cannot show their cause'
     if lens.say == 'recalibrate':
         return decision_reason(lens)
-    if d.open_lens is not None:
-        return _join(_other_errors(d)[::-1])
+    of_lens, of_target = _lens_errors(d), _target_errors(d)
+    if of_lens:
+        return _join([*of_lens, *of_target])
     if only_gross(d):
         count = len(d.gross)
         which = f'{count} image points are outliers' if count > 1 else 'one point is an outlier'
         return f'{which}; nothing else is wrong'
-    off = _other_errors(d)
-    if off:
-        return ('only the target: ' if d.verdict == 'adequate' else '') + _join(off)
+    if of_target:
+        return ('only the target: ' if d.verdict == 'adequate' else '') + _join(of_target)
     if d.verdict == 'adequate':
         confirmed = 'confirmed' if d.offers_extended else 'visible'
         return f'no model error is {confirmed} in these data'
