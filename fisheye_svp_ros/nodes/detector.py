@@ -277,11 +277,12 @@ class Detector(BaseNode):
         self._searches.start(task, self.settings.longest_search)
 
     def _finish(self, result: Any, stamp: int, frame: str, pixels: Pixels) -> None:
+        ids, uv = (result.ids, result.uv) if isinstance(result, Points) else _NOTHING
+        # Where one camera of a rig sees no tag, the set of the others waits for it.
+        if isinstance(result, Points) or self._pattern.kind == LOOSE_TAGS:
+            self._points.publish(messages.image_points_message(ids, uv, stamp, frame))
         if isinstance(result, Points):
             self._near, self._size = result.uv, pixels.shape
-            self._points.publish(
-                messages.image_points_message(result.ids, result.uv, stamp, frame)
-            )
         else:
             self._near = None
             self._counts['images without board'] += 1
@@ -292,7 +293,6 @@ class Detector(BaseNode):
             if isinstance(result, Exception):
                 self.unforeseen(result)
         if self._drawn.get_subscription_count():
-            ids, uv = (result.ids, result.uv) if isinstance(result, Points) else _NOTHING
             drawn = draw_points(pixels, ids, uv)
             self._drawn.publish(messages.image_message(drawn, stamp, frame))
         if self._guiding is not None:

@@ -13,7 +13,7 @@ from helpers.tag_room import LEFT, LENS, TagRoom, oval
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # isort: skip
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # isort: skip
-from sensor_msgs.msg import PointCloud2  # isort: skip
+from sensor_msgs.msg import Image, PointCloud2  # isort: skip
 from visualization_msgs.msg import MarkerArray  # isort: skip
 
 import fisheye_svp_ros as fsvp
@@ -23,6 +23,7 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.io.tag_maps import write_tag_map
 from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes.detector import Detector
 from fisheye_svp_ros.nodes.rig_localizer import RigLocalizer
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.scene.rigs import rig
@@ -138,5 +139,43 @@ def test_a_camera_that_sees_no_tag_is_no_hindrance(
     front.publish(kinds.AprilTagDetectionArray(header=header, detections=found))
     side.publish(kinds.AprilTagDetectionArray(header=header))
     g.until(lambda: poses)
+    off = read_pose(poses[0].pose, 'pose').difference(oval(0.0))
+    assert np.linalg.norm(off[:3]) < 0.02
+
+
+def test_a_detector_that_finds_no_tag_holds_up_no_rig(
+    graph: Callable[..., Graph], tmp_path: Path
+) -> None:
+    """Each camera has a detector of its own; the rig has its landmarks, and no map of tags."""
+    write_tag_map(ROOM.tags, tmp_path / 'tags.yaml')
+    save_lens(LENS, tmp_path / 'lens.yaml')
+    save_rig(LEFT.inverse(), tmp_path / 'rig.yaml', CAMERAS)
+    g = graph(
+        f'rig_localizer:rig:={tmp_path}/rig.yaml',
+        f'board:=tags:{tmp_path}/tags.yaml',
+        f'lens:={tmp_path}/lens.yaml',
+        f'sigma_px:={SIGMA}',
+        'patience:=60.0',
+    )
+    poses = g.hear(PoseWithCovarianceStamped, 'rig_localizer/pose')
+    found = g.hear(PointCloud2, 'side/image_points')
+    g.start(RigLocalizer)
+    g.start(lambda: Detector(namespace='side'))
+    g.tell(PointCloud2, 'landmarks', LATCHED).publish(
+        messages.landmarks_message(ROOM.tags.landmarks(), 0, 'map')
+    )
+    front, images = g.tell(PointCloud2, 'front/image_points'), g.tell(Image, 'side/image')
+    seen = ROOM.table()
+    seen = seen.take(seen.frame == 0)
+    front.publish(messages.image_points_message(seen.landmark, seen.uv, 10**9, 'front'))
+    wall = messages.image_message(np.full((120, 160), 128, np.uint8), 10**9, 'side')
+
+    def posed() -> bool:
+        images.publish(wall)  # again: one before all are connected is lost
+        g.idle(0.3)
+        return bool(poses)
+
+    g.until(posed)
+    assert stamp_of(found[0]) == 10**9 and found[0].width == 0
     off = read_pose(poses[0].pose, 'pose').difference(oval(0.0))
     assert np.linalg.norm(off[:3]) < 0.02
