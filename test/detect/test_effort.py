@@ -81,12 +81,12 @@ def test_once_a_board_is_found_all_are_searched_thoroughly(
 def test_inverted_boards_are_found_at_a_first_look(
     tmp_path: Path, looks: list[Look], images: list[np.ndarray]
 ) -> None:
-    write(tmp_path, [255 - image for image in images])
+    write(tmp_path, [255 - image for image in images[:3]])
     inverted = found(tmp_path)
     if inverted.searched[0].points is None:
         pytest.skip('this OpenCV does not find the first inverted board')
-    assert looks == [Look.SAMPLE, Look.INVERTED_IMAGE, Look.INVERTED_IMAGE, Look.INVERTED_IMAGE]
-    for one, image in zip(inverted.searched, images, strict=True):
+    assert looks == [Look.SAMPLE, Look.INVERTED_IMAGE, Look.INVERTED_IMAGE]
+    for one, image in zip(inverted.searched, images[:3], strict=True):
         alone = points.find_points(255 - image, parse_pattern(BOARD), 'saddle')
         assert np.abs(one.points.uv - alone.uv).max() < 0.1 * alone.sigma.max()
 

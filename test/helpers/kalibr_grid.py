@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -112,16 +113,21 @@ def project(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return middle + (FOCAL * theta / np.maximum(across, 1e-12))[:, None] * points[:, :2]
 
 
-def photograph(
-    grids: list[tuple[Grid, NDArray[np.float64], NDArray[np.float64]]], seed: int = 0
-) -> tuple[NDArray[np.uint8], list[NDArray[np.float64]]]:
-    """Return a photograph of grids at poses, and where the corners of each are in it, px."""
+@cache
+def _rays() -> NDArray[np.float64]:
     width, height = SIZE
     v, u = np.mgrid[: height * _FINE, : width * _FINE]
     at = (np.stack([u, v], axis=-1) + 0.5) / _FINE - 0.5 - (np.array(SIZE) - 1) / 2
     radius = np.linalg.norm(at, axis=-1, keepdims=True)
     theta = radius / FOCAL
-    rays = np.concatenate([at / np.maximum(radius, 1e-9) * np.sin(theta), np.cos(theta)], axis=-1)
+    return np.concatenate([at / np.maximum(radius, 1e-9) * np.sin(theta), np.cos(theta)], axis=-1)
+
+
+def photograph(
+    grids: list[tuple[Grid, NDArray[np.float64], NDArray[np.float64]]], seed: int = 0
+) -> tuple[NDArray[np.uint8], list[NDArray[np.float64]]]:
+    """Return a photograph of grids at poses, and where the corners of each are in it, px."""
+    rays = _rays()
     image, truth = np.full(rays.shape[:2], 120, np.uint8), []
     for grid, turn, place in grids:
         sheet, low = grid.draw()

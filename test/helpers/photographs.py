@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache, lru_cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.optics.camera import Rays, project
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.simulate.render import Exposure, Print, render
+from fisheye_svp_ros.simulate.render import Exposure, Print, pixel_rays, render
 from fisheye_svp_ros.simulate.targets import board_views
 
 LENS = Lens(
@@ -42,7 +43,21 @@ def photograph(
     pose: Pose, printed: Print = PRINTED, exposure: Exposure | None = None, seed: int = 0
 ) -> NDArray[np.uint8]:
     """Render one photograph."""
-    return render(LENS, printed, pose, exposure or Exposure(), np.random.default_rng(seed))
+    if printed is PRINTED and exposure is None:  # of one pose many tests ask
+        return _rendered(pose.rotation.tobytes(), pose.position.tobytes(), seed).copy()
+    rng = np.random.default_rng(seed)
+    return render(LENS, printed, pose, exposure or Exposure(), rng, rays=_rays())
+
+
+@lru_cache(64)
+def _rendered(rotation: bytes, position: bytes, seed: int) -> NDArray[np.uint8]:
+    pose = Pose(np.frombuffer(rotation).reshape(3, 3), np.frombuffer(position))
+    return render(LENS, PRINTED, pose, Exposure(), np.random.default_rng(seed), rays=_rays())
+
+
+@cache
+def _rays() -> Rays:
+    return pixel_rays(LENS)
 
 
 def true_corners(pose: Pose, printed: Print = PRINTED) -> NDArray[np.float64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -38,12 +39,14 @@ def lens_of(table: Observations) -> Lens:
     return calibrate(table, 'kannala_brandt', (640, 480)).adjusted.lens
 
 
-LENS = lens_of(sound(angle=0.8))
+@cache
+def known_lens() -> Lens:
+    return lens_of(sound(angle=0.8))
 
 
 @pytest.mark.parametrize('mirror', MIRRORS)
 def test_a_mirror_image_is_told_by_a_lens_that_is_known(mirror: Mirror) -> None:
-    assert find_mirror(MIRRORS[mirror](sound()), LENS) == mirror
+    assert find_mirror(MIRRORS[mirror](sound()), known_lens()) == mirror
 
 
 @pytest.mark.parametrize('mirror', MIRRORS)
@@ -83,7 +86,7 @@ def test_a_board_whose_y_points_up_is_no_mirror_image(
     table = observe(rng, [CAMERA] * 10, draw_views(rng, points, 10), points)
     other = of(points)
     table = replace(table, xyz=other[table.landmark])
-    assert find_mirror(table, LENS) == mirror
+    assert find_mirror(table, known_lens()) == mirror
 
 
 def test_of_mirror_images_only_a_board_whose_y_points_up_leaves_a_diagnosis_sound(
@@ -94,15 +97,15 @@ def test_of_mirror_images_only_a_board_whose_y_points_up_leaves_a_diagnosis_soun
     def flaws(points: Array) -> list[Flaw]:
         evaluation: Any = SimpleNamespace(
             problem=SimpleNamespace(observations=replace(table, xyz=points)),
-            simulation=SimpleNamespace(state=SimpleNamespace(lenses=(LENS,))),
+            simulation=SimpleNamespace(state=SimpleNamespace(lenses=(known_lens(),))),
         )
         return list(adequacy._mirrors(evaluation))
 
     (flaw,) = flaws(table.xyz * [1, -1, 1])
     assert flaw.mirror == Mirror.Y_REVERSED
     assert not flaws(upwards(table.xyz))
-    note_upwards(replace(table, xyz=upwards(table.xyz)), {'': LENS})
-    note_upwards(table, {'': LENS})
+    note_upwards(replace(table, xyz=upwards(table.xyz)), {'': known_lens()})
+    note_upwards(table, {'': known_lens()})
     (line,) = capsys.readouterr().err.splitlines()
     assert 'its y points up' in line and 'count y downward' in line
 
@@ -110,4 +113,4 @@ def test_of_mirror_images_only_a_board_whose_y_points_up_leaves_a_diagnosis_soun
 def test_a_view_alone_or_seen_edge_on_has_no_side() -> None:
     table = sound()
     few = table.take(np.isin(table.landmark, [0, 1, 2, 3, 4, 5, 6]))  # on one line
-    assert mirror_by_lens(group_views(MIRRORS[Mirror.V_UPWARDS](few)), LENS) is None
+    assert mirror_by_lens(group_views(MIRRORS[Mirror.V_UPWARDS](few)), known_lens()) is None
