@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -27,10 +26,9 @@ def frequent_reports(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
 
 
 @pytest.fixture(autouse=True)
-def compiles_nothing(same_engine: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have nodes compile nothing in the background where Numba has not compiled yet."""
-    if find_spec('numba') is None or not engines.cache.is_compiled():
-        monkeypatch.setenv(engines.VARIABLE, 'numpy')
+def reference_engine(same_engine: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have nodes solve by the reference, whatever was compiled before."""
+    monkeypatch.setenv(engines.VARIABLE, 'numpy')
 
 
 @pytest.fixture(scope='session')
