@@ -125,7 +125,7 @@ class Readout:
 
         time: of the set, s.  As it is where the camera does not move on as it did, and where the
         lens knows.  Said is only what residuals show, and what moves a pose out of the ellipsoid
-        that sigma alone leaves it.
+        that sigma alone leaves it; a longer readout is an error of another kind.
         """
         self._motion.append((time, solved.pose.take(0)))
         velocity = steady_velocity(*zip(*self._motion, strict=True))
@@ -138,7 +138,8 @@ class Readout:
         bias, found = shift.bias[0], abs(self.time)
         covered = covariance + self.mean_square() * bias[:, None] * bias
         by_noise = covariance[0] / solved.excess[0] ** 2
-        if found < _MIN_SIGMAS * self.stderr or not exceeds(found * bias, by_noise):
+        margin = _MIN_SIGMAS * self.stderr
+        if not margin < found < self._longest + margin or not exceeds(found * bias, by_noise):
             return covered, ''
         turn, off = (float(np.linalg.norm(part)) for part in (velocity[3:], found * bias[:3]))
         return covered, (

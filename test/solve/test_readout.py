@@ -62,6 +62,17 @@ def test_a_velocity_is_that_of_a_steady_motion() -> None:
     assert steady_velocity(times, [poses[0], poses[2], poses[1]]) is None, 'noise'
 
 
+def test_residuals_of_another_error_are_no_rolling_shutter() -> None:
+    velocity, known = np.array([0.3, 0.1, 0.0, 0.0, 0.0, 1.0]), Readout(0.03)
+    for i in range(10):
+        camera = oval(0.1).retract(0.1 * i * velocity)
+        uv, tags = rolled(camera, velocity, 0.2), ROOM.visible(camera)
+        views = ROOM.views(camera, uv, tags, 0.2, np.random.default_rng(i))
+        solved = solve_poses(MODEL, views)
+        assert not known.cover(0.1 * i, solved, solved.covariance)[1]
+    assert known.time > 0.1
+
+
 @pytest.mark.parametrize('readout', [0.0, 0.005, 0.02, -0.02])
 @pytest.mark.parametrize('fx', [330.0, 331.5])
 def test_residuals_tell_the_readout_of_a_turning_camera(readout: float, fx: float) -> None:
