@@ -86,6 +86,7 @@ DECISION: Fields = {
 }
 FIELDS: Fields = {
     'verdict': Verdict,
+    'first_screen': dict.fromkeys(('headline', 'wrong', 'target', 'photographs'), str),
     'noise_px': float,
     'frames': int,
     'observations': int,

@@ -13,9 +13,12 @@ from math import degrees
 from typing import Any
 
 from fisheye_svp_ros.diagnosis import Decision, Diagnosis
+from fisheye_svp_ros.reporting.wording.actions import photographs_words, target_words
 from fisheye_svp_ros.reporting.wording.adequacy import flaw_document
 from fisheye_svp_ros.reporting.wording.causes import finding_reason
 from fisheye_svp_ros.reporting.wording.decisions import advised_action, decision_reason, separation
+from fisheye_svp_ros.reporting.wording.headline import headline
+from fisheye_svp_ros.reporting.wording.whats_wrong import wrong
 from fisheye_svp_ros.scene.observations import photograph_names
 
 Keys = Mapping[str, str | Callable[[Any], Any]]  # JSON key to attribute, or to what computes it
@@ -62,6 +65,12 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
     field = d.evaluation.written_field
     return {
         'verdict': d.verdict,
+        'first_screen': {
+            'headline': headline(d),
+            'wrong': wrong(d),
+            'target': target_words(d),
+            'photographs': photographs_words(d),
+        },
         'noise_px': d.noise_px,
         'frames': d.frames,
         'observations': d.observations,

@@ -136,6 +136,8 @@ def flaw_reason(flaws: Sequence[Flaw], about: str) -> str:
     if about == 'target':
         if worst.is_unit:
             return 'it cannot be judged until lengths are in m'
+        if worst is FlawKind.MIRRORED:
+            return 'it cannot be judged until the points are corrected'
         if worst.is_misfit:
             return 'it cannot be judged while no single lens fits the frames'
         if worst.is_of_table:

@@ -117,7 +117,7 @@ def _until_data_are_better(d: Diagnosis, lens: str) -> str:
     if is_short_of_angle(d):
         return f'Use {lens} only within the angle of the points'
     if kinds <= {FlawKind.LENS_UNKNOWN, FlawKind.ANGLE_SHORT}:
-        return f'Use {lens} only where the bound of its error is good enough'
+        return f'Use {lens} only where that error bound is good enough'
     return f'Do not use {lens} yet'
 
 

@@ -206,9 +206,15 @@ def _answer_lines(action: AnswerLine) -> tuple[list[str], list[str]]:
     if action.about == _LENS:
         return [], [f'{_LENS}: {action.do}{sure}. {action.why}.']
     do, why = f'{action.about}: {action.do}{names and f": {names}"}.', f'{action.why}{sure}.'
-    if not action.below and len(f'{do} {why}'.split()) <= MAX_WORDS:
-        return [f'{do} {why}'], []
-    return [do], [f'{action.about}, why: {why}']
+    if action.below:
+        return [do], [f'{action.about}, why: {why}']
+    brief = f'{action.why.partition("; ")[0]}.'
+    shown = next((f'{do} {text}' for text in (why, brief) if _is_short(f'{do} {text}')), do)
+    return [shown], [] if shown.endswith(why) else [f'{action.about}, why: {why}']
+
+
+def _is_short(text: str) -> bool:
+    return len(text.split()) <= MAX_WORDS
 
 
 def _facts(d: Diagnosis, source: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,10 +78,14 @@ def _named(d: Diagnosis) -> Iterator[str]:
     brief = [_brief(d, cause) for cause in causes]
     first = _plain_statement(d, causes[0])
     forms = [full, [*full[:1], *brief[1:]], [first, *brief[1:]]]
-    others, gains = [*_target_errors(d), *_lens_errors(d)], _gains(d)
+    others, gains = [*_target_errors(d), *_lens_errors(d)], [[gain] for gain in _gains(d)]
     for count in range(len(others), -1, -1):
-        for gain in (*([gain] for gain in gains), []):
-            yield from (_join([*form, *others[:count], *gain]) for form in forms)
+        kept = [
+            [other.full for other in others[:count]],
+            [other.brief for other in others[:count]],
+        ]
+        for rest in (*(also + gain for gain in gains for also in kept), *kept):
+            yield from (_join([*form, *rest]) for form in forms)
     yield _join(brief)
     for count in range(len(brief) - 1, 0, -1):
         yield _join([first, *brief[1:count], f'{len(brief) - count} more below'])
@@ -93,6 +98,9 @@ def _join(clauses: Iterable[str]) -> str:
 def _misfit(d: Diagnosis) -> Iterator[str]:
     """Yield by how much no one lens fits, and in which frames, of these ever fewer."""
     flaw, off, meaning = d.adequacy.flaws[0], '', ''
+    if flaw.kind is FlawKind.MIRRORED:
+        yield 'the points fit a lens, but poses from them are mirror images'
+        return
     if flaw.kind is FlawKind.CAMERAS_MIXED:
         off, _, meaning = common_residual(flaw).partition(' (')
         meaning = f' ({meaning}'
@@ -133,32 +141,43 @@ def _gains(d: Diagnosis) -> list[str]:
     ]
 
 
-def _target_errors(d: Diagnosis) -> list[str]:
+class _Error(NamedTuple):
+    """An error without a named cause, with its size: as a clause, and in few words."""
+
+    full: str
+    brief: str
+
+
+def _target_errors(d: Diagnosis) -> list[_Error]:
     """Return what is wrong with the target beside the named causes."""
     target, errors = d.decision['target'], []
-    if isinstance(target.facts, TargetFacts):
-        errors += [frame_bend(target.facts)] if target.facts.bend_m else []
-        if target.reason in _DISPLACED and target.facts.local_m:
-            errors.append(_displaced(target.facts))
+    if not isinstance(target.facts, TargetFacts):
+        return []
+    bend, far = (f'{1e3 * rms:.2g} mm rms' for rms in (target.facts.bend_m, target.facts.local_m))
+    if target.facts.bend_m:
+        errors.append(_Error(frame_bend(target.facts), f'bend between frames {bend}'))
+    if target.reason in _DISPLACED and target.facts.local_m:
+        errors.append(_Error(f'landmarks are displaced by {far}', f'displaced landmarks {far}'))
     return errors
 
 
-def _lens_errors(d: Diagnosis) -> list[str]:
+def _lens_errors(d: Diagnosis) -> list[_Error]:
     """Return what may be wrong with the lens beside the named causes."""
     if d.open_lens is not None:
-        return [open_effect(d.open_lens)]
+        text = open_effect(d.open_lens)
+        return [_Error(text, text)]
     if not d.offers_extended:
         return []
-    return [
-        f'{one.effect.name.replace("_", " ")} is likely ({chance(one.weight)})'
+    likely = {
+        one.effect.name.replace('_', ' '): chance(one.weight)
         for one in d.evaluation.averaged_model.effects
         if status_of(one.weight, False) is Status.LIKELY
         and CATALOGUE[one.effect.name].budget_stage() == 'lens'
+    }
+    return [
+        _Error(f'{name} is likely ({sure})', f'{name} likely ({sure})')
+        for name, sure in likely.items()
     ]
-
-
-def _displaced(facts: TargetFacts) -> str:
-    return f'landmarks are displaced by {1e3 * facts.local_m:.2g} mm rms'
 
 
 def nothing_named(d: Diagnosis) -> str:
@@ -168,7 +187,9 @@ def nothing_named(d: Diagnosis) -> str:
         return 'there are errors, but one frame cannot show their cause'
     if lens.say == 'recalibrate':
         return decision_reason(lens)
-    of_lens, of_target = _lens_errors(d), _target_errors(d)
+    of_lens, of_target = (
+        [error.full for error in errors] for errors in (_lens_errors(d), _target_errors(d))
+    )
     if of_lens:
         return _join([*of_lens, *of_target])
     if only_gross(d):
