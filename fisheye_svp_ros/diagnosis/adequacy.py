@@ -32,6 +32,7 @@ _MAX_GROUPS = 3
 _MAX_NOISE = 1.0  # px: detectors of corners leave .02 to .3, those of blurred tags .5
 _MIN_SINE = 0.1  # of the angle between a line of sight and a board, to tell its sides apart
 _NEAR_RANGE = RANGES.index(1.0)
+_SURE = 1.96  # standard errors: 97.5 % of a normal distribution on one side
 
 
 @dataclass(frozen=True)
@@ -132,8 +133,10 @@ def _impossible_lengths(evaluation: Evaluation, candidates: Sequence[Finding]) -
         yield Flaw(FlawKind.TARGET_TOO_LARGE, across, MAX_TARGET_SIZE)
     for candidate in candidates:
         if candidate.reason is Reason.IMPLAUSIBLE:
-            shift = next(abs(entry['value']) for entry in candidate.parameters.values())
-            yield Flaw(FlawKind.SHIFT_TOO_LARGE, shift, MAX_SHIFT)
+            shift = next(iter(candidate.parameters.values()))
+            # One that only stands against another effect may be anything.
+            if abs(shift['value']) - _SURE * shift['stderr'] > MAX_SHIFT:
+                yield Flaw(FlawKind.SHIFT_TOO_LARGE, abs(shift['value']), MAX_SHIFT)
 
 
 def _differing_sides(evaluation: Evaluation) -> Iterator[Flaw]:

@@ -60,7 +60,7 @@ class HeldOut(NamedTuple):
     @property
     def is_predictable(self) -> Mask:
         """Which frames (F,) are not far worse than most: those show what no other frame does."""
-        size = np.sqrt(self.squares / self.counts)
+        size = np.sqrt(self.squares / np.maximum(self.counts, 1))
         return np.asarray(size <= _PREDICTED_RATIO * np.median(size))
 
     def take(self, rows: Index | Mask) -> HeldOut:
@@ -79,7 +79,7 @@ class HeldOut(NamedTuple):
         rows: the frames (B, F) that count.
         """
         squares, counts = self.squares[rows].sum(axis=1), self.counts[rows].sum(axis=1)
-        freedom = 2 * counts - 6 * rows.shape[1]
+        freedom = np.maximum(2 * self.counts - 6, 0)[rows].sum(axis=1)
         return np.asarray((squares - noise**2 * freedom) / counts)
 
 
@@ -246,10 +246,12 @@ def cross_validate(
     for frame, information in enumerate(null.information_without_frames(at)):
         _, _, combination = refit_shared(null, information, without, held)
         residual[frame] = rows[frame] @ combination
+    near = predictable_rows(linear)
     left = project_out(
-        (residual * ratio - repeating)[..., None], linear.frame_columns * ratio[..., None]
+        ((residual * ratio - repeating) * near)[..., None],
+        linear.frame_columns * (ratio * near)[..., None],
     )
-    return sum_squares(linear, left[..., 0] / ratio)
+    return sum_squares(linear, left[..., 0] / ratio, near)
 
 
 def noise_ratio(linear: Linearization) -> Array:
@@ -259,11 +261,30 @@ def noise_ratio(linear: Linearization) -> Array:
     return np.where(own > 0, weight / np.maximum(own, 1e-300), 1.0)
 
 
-def sum_squares(linear: Linearization, whitened: Array) -> HeldOut:
-    """Return the figures of whitened residuals (F, M)."""
+def predictable_rows(linear: Linearization, block: Index | None = None) -> Mask:
+    """Return which rows (F, M) other frames can predict: those no farther from the axis.
+
+    block (F,): frames that are left out together, None for one by one.  Beyond all points of the
+    others a lens is extrapolated, and the better model may be the one that is farther off.
+    """
+    data, views = linear.data, linear.data.views
+    block = np.arange(data.frames) if block is None else block
+    theta = np.where(views.used, np.nan_to_num(linear.scene.theta), -np.inf)
+    farthest = np.full((data.cameras, int(block.max()) + 2), -np.inf)  # the last of no block
+    np.maximum.at(farthest, (data.camera_of, block[data.frame_of]), theta.max(axis=1))
+    ranked = np.sort(farthest, axis=1)
+    limit = np.where(farthest == ranked[:, -1:], ranked[:, -2:-1], ranked[:, -1:])
+    limit = np.where(np.isfinite(limit), limit, np.inf)[data.camera_of, block[data.frame_of]]
+    near = views.used & (theta <= limit[:, None])
+    return np.asarray(data.blocks(near[..., None] * np.ones(2)) > 0)
+
+
+def sum_squares(linear: Linearization, whitened: Array, counted: Mask | None = None) -> HeldOut:
+    """Return the figures of whitened residuals (F, M); counted (F, M): of some of the rows."""
     weight = linear.row_weight
-    px = np.where(weight > 0, whitened / np.maximum(weight, 1e-12), 0.0)
-    return HeldOut((px**2).sum(axis=1), (weight > 0).sum(axis=1) / 2)
+    rows = weight > 0 if counted is None else counted
+    px = np.where(rows, whitened / np.maximum(weight, 1e-12), 0.0)
+    return HeldOut((px**2).sum(axis=1), rows.sum(axis=1) / 2)
 
 
 @dataclass(frozen=True)
@@ -359,9 +380,13 @@ def split_frames(
 
 
 def misfits(linear: Linearization, out: Mask, rows: Array) -> Array:
-    """Return sums of squares (C,), px^2, of whitened rows (F, M, C) of frames, poses refitted."""
-    left, weight = project_out(rows, linear.frame_columns[out]), linear.row_weight[out]
-    used = weight > 0
+    """Return sums of squares (C,), px^2, of whitened rows (F, M, C) of frames, poses refitted.
+
+    out (F,): those frames; rows that the others cannot predict do not count.
+    """
+    used = predictable_rows(linear, out.astype(np.int64))[out]
+    near, weight = used[..., None], linear.row_weight[out]
+    left = project_out(rows * near, linear.frame_columns[out] * near)
     return np.asarray(((left[used] / weight[used][:, None]) ** 2).sum(axis=0))
 
 

@@ -14,6 +14,7 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
     HeldOut,
     gain_and_confidence,
     noise_ratio,
+    predictable_rows,
     sum_squares,
 )
 from fisheye_svp_ros.diagnosis.decision import (
@@ -110,9 +111,11 @@ def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
         residual[frame, :, 0] += null.fixed.border[frame][:, at[:-1]] @ off
         if has_field:
             residual[frame, :, 0] += fields[frame] @ left.combination
-    even = ratio[..., None]
-    left_over = project_out(residual * even, linear.frame_columns * even) / even
-    return sum_squares(linear, left_over[..., 0]), sum_squares(linear, left_over[..., 1])
+    near, even = predictable_rows(linear), ratio[..., None]
+    kept = near[..., None] * even
+    left_over = project_out(residual * kept, linear.frame_columns * kept) / even
+    before_px, after_px = (sum_squares(linear, left_over[..., i], near) for i in (0, 1))
+    return before_px, after_px
 
 
 def _rig_response(null: NullModel, at: Index) -> Array:

@@ -162,6 +162,16 @@ def test_an_impossible_shift_asks_for_the_unit_first(found: Diagnosis) -> None:
     )
 
 
+def test_a_shift_that_may_be_anything_is_no_impossible_one(found: Diagnosis) -> None:
+    """Beside one that does the same, "76 mm, more than in any real lens" was 76 ± 39 mm."""
+    parameters = {'e0': {'value': -0.076, 'stderr': 0.039, 'unit': 'm'}}
+    shift = Finding(
+        'viewpoint_shift(order=1)', Reason.IMPLAUSIBLE, 1e-9, 1e-8, parameters=parameters
+    )
+    flaws = judge_data(found.evaluation, [], found.components, {}, [shift]).flaws
+    assert FlawKind.SHIFT_TOO_LARGE not in {flaw.kind for flaw in flaws}
+
+
 def test_a_board_in_mm_is_no_reason_for_another_lens(found: Diagnosis) -> None:
     """Once "Use extended_lens.yaml" for a board of 200 m, its bend 1.3 m."""
     large = Flaw(FlawKind.TARGET_TOO_LARGE, 200.0, MAX_TARGET_SIZE)
