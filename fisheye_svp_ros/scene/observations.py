@@ -104,27 +104,32 @@ class Observations:
         return replace(self, **rows)
 
     def to_dataframe(self) -> DataFrame:
-        """Return the rows as a pandas.DataFrame, by the names of the CSV.
+        """Return the rows as a pandas.DataFrame, by the names of the CSV that it can become.
 
-        Raises ObservationError where pandas is not installed.
+        Without the columns that have no value in any row.  Raises ObservationError where pandas is
+        not installed.
         """
         try:
             from pandas import DataFrame
         except ImportError as cause:
             raise ObservationError('to_dataframe needs pandas; pip install pandas') from cause
         names = np.array(self.cameras, dtype=object)
-        return DataFrame(
-            {
-                'frame': self.frame,
-                'camera': names[self.camera],
-                'landmark': self.landmark,
-                **dict(zip('uv', self.uv.T, strict=True)),
-                **dict(zip('xyz', self.xyz.T, strict=True)),
-                'board': self.board,
-                't': self.t,
-                'sigma': self.sigma,
-            }
-        )
+        columns = {
+            'frame': self.frame,
+            'camera': names[self.camera],
+            'landmark': self.landmark,
+            **dict(zip('uv', self.uv.T, strict=True)),
+            **dict(zip('xyz', self.xyz.T, strict=True)),
+            'board': self.board,
+            't': self.t,
+            'sigma': self.sigma,
+        }
+        empty = {
+            'camera': not any(self.cameras),
+            't': np.isnan(self.t).all(),
+            'sigma': np.isnan(self.sigma).all(),
+        }
+        return DataFrame({name: values for name, values in columns.items() if not empty.get(name)})
 
     @property
     def frames(self) -> Index:

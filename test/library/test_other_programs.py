@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -65,10 +66,21 @@ def test_pinhole_lenses_have_the_coefficients_of_opencv(
     np.testing.assert_allclose(fsvp.project(lens, points).uv, told, atol=1e-9)
 
 
+def test_a_dataframe_is_written_as_a_table_that_is_read(tmp_path: Path) -> None:
+    """Columns without a value were refused: "t is ''; a number is needed"."""
+    one = replace(seen(), cameras=('left',), t=np.arange(len(seen())) / 10)
+    for table in (one, seen()):
+        table.to_dataframe().to_csv(tmp_path / 'table.csv', index=False)
+        again = fsvp.read_observations(tmp_path / 'table.csv')
+        for name in ('frame', 'landmark', 'uv', 'xyz', 'board', 't', 'sigma'):
+            np.testing.assert_array_equal(getattr(again, name), getattr(table, name))
+        assert again.cameras == table.cameras
+
+
 def test_observations_are_a_dataframe(monkeypatch: pytest.MonkeyPatch) -> None:
     table = seen()
     frame = table.to_dataframe()
-    assert [*frame] == ['frame', 'camera', 'landmark', *'uv', *'xyz', 'board', 't', 'sigma']
+    assert [*frame] == ['frame', 'landmark', *'uv', *'xyz', 'board', 'sigma']
     np.testing.assert_array_equal(frame[['u', 'v']], table.uv)
     monkeypatch.setitem(sys.modules, 'pandas', None)
     with pytest.raises(ObservationError, match='needs pandas; pip install pandas'):
