@@ -23,7 +23,6 @@ from math import prod
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-import scipy
 
 from fisheye_svp_ros.arrays import Array, Index, gather_rows, scatter
 from fisheye_svp_ros.errors import LensError
@@ -420,9 +419,13 @@ def _velocities(pose: Pose, t: Array) -> Array:
     if len(times) == 2:
         change = known.take(np.array([1])).difference(known.take(np.array([0])))
         return np.repeat(change / (times[1] - times[0]), len(t), axis=0)
-    place = scipy.interpolate.CubicSpline(times, known.position)(t, 1)
-    rotation = scipy.spatial.transform.Rotation.from_matrix(known.rotation)
-    turn = scipy.spatial.transform.RotationSpline(times, rotation)(t, 1)  # about the body's axes
+    # Not while nodes start
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    place = CubicSpline(times, known.position)(t, 1)
+    rotation = Rotation.from_matrix(known.rotation)
+    turn = RotationSpline(times, rotation)(t, 1)  # about the body's axes
     return np.concatenate([place, (pose.rotation @ turn[..., None])[..., 0]], axis=-1)
 
 

@@ -9,14 +9,13 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from fisheye_svp_ros.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.lens_files import save_lens
@@ -34,12 +33,12 @@ from fisheye_svp_ros.nodes.set_collection import (
 from fisheye_svp_ros.nodes.solver import SolverNode
 from fisheye_svp_ros.nodes.validation import Items
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.reporting.wording.decisions import decision_reason
-from fisheye_svp_ros.reporting.wording.diagnosis import refusal_reason
-from fisheye_svp_ros.reporting.wording.first_screen import first_screen, terminal_lines
 from fisheye_svp_ros.scene.observations import STEREO, Observations
 from fisheye_svp_ros.solve.measured_poses import usable_observations
 from fisheye_svp_ros.study.settings import RigSettings
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.diagnosis import Diagnosis
 
 T = TypeVar('T')
 
@@ -293,7 +292,7 @@ class ModelCritic(SolverNode):
         try:
             if self._verdict is None:
                 raise ObservationError(self._refusal or self._what_is_missing())
-            save_lens(self._verdict.lens, path, refusal_reason(self._verdict))
+            save_lens(self._verdict.lens, path, _refusal_reason(self._verdict))
         except FisheyeSvpError as error:
             response.success, response.message = False, str(error)
         else:
@@ -308,12 +307,23 @@ class ModelCritic(SolverNode):
 
 def judge(table: Observations, lens: Lens, free_intrinsics: bool) -> Diagnosis:
     """Diagnose the frames that can be posed; raise FisheyeSvpError where none can."""
+    # Half of a start would be spent on it, and the first frames come long before a diagnosis.
+    from fisheye_svp_ros.diagnosis import diagnose
+
     usable = usable_observations(table, lens)
     return diagnose(usable.observations, lens, free_intrinsics=free_intrinsics)
 
 
+def _refusal_reason(diagnosis: Diagnosis) -> str:
+    from fisheye_svp_ros.reporting.wording.diagnosis import refusal_reason
+
+    return refusal_reason(diagnosis)
+
+
 def _lines(diagnosis: Diagnosis) -> list[str]:
     """Return the first screen of a report as sentences."""
+    from fisheye_svp_ros.reporting.wording.first_screen import first_screen, terminal_lines
+
     return [
         line.rstrip('.') + '.'
         for line in terminal_lines(first_screen(diagnosis, 'image_points'))
@@ -323,6 +333,8 @@ def _lines(diagnosis: Diagnosis) -> list[str]:
 
 def decisions(diagnosis: Diagnosis) -> dict[str, object]:
     """Return what to do about lens, target and photographs, each with its figure, and bounds."""
+    from fisheye_svp_ros.reporting.wording.decisions import decision_reason
+
     words: dict[str, object] = {}
     for name, one in diagnosis.decision.items():
         unit = _suffix(one.figure.unit)

@@ -215,7 +215,7 @@ def test_a_rig_is_judged_as_one(graph: Callable[..., Graph], scene: Path) -> Non
 def test_a_lens_that_cannot_be_written_is_answered_with_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(model_critic, 'refusal_reason', lambda _: '')
+    monkeypatch.setattr(model_critic, '_refusal_reason', lambda _: '')
     (tmp_path / 'file').write_text('')
     critic = Mock(**{'_verdict.lens': LENS, 'settings.output': tmp_path / 'file' / 'lens.yaml'})
     answer = ModelCritic._write_extended_lens(critic, None, SimpleNamespace())
