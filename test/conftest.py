@@ -131,13 +131,17 @@ def _unless_drawn(function: Callable[..., None], instead: Callable[..., Any]) ->
     return draw
 
 
-@pytest.fixture
-def drawn() -> Iterator[None]:
+def _draw() -> Iterator[None]:
     """Draw pictures, for a test that looks at them."""
     global _drawn
     _drawn = True
     yield
     _drawn = False
+
+
+drawn = pytest.fixture(_draw, name='drawn')
+# For the fixtures of a module whose tests look at them.
+drawn_in_module = pytest.fixture(_draw, scope='module', name='drawn_in_module')
 
 
 @pytest.fixture(params=['numpy', 'numba'])

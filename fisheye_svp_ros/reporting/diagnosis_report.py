@@ -28,7 +28,7 @@ from fisheye_svp_ros.reporting.ray_plots import draw_uncertainty
 from fisheye_svp_ros.reporting.shot_plots import draw_shots
 from fisheye_svp_ros.reporting.terminal import draw_or_note
 from fisheye_svp_ros.reporting.wording import shots
-from fisheye_svp_ros.reporting.wording.adequacy import remedy
+from fisheye_svp_ros.reporting.wording.actions import photographs_reason, photographs_words
 from fisheye_svp_ros.reporting.wording.causes import (
     bare_probability,
     belief,
@@ -280,12 +280,20 @@ def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
         'total_px2': f'{total:.3g}',
         'budget_rows': list(budget_rows(diagnosis)),
         'intrinsics': list(intrinsic_rows(diagnosis)),
-        'advice': [(remedy(flaw.kind), '') for flaw in diagnosis.adequacy.flaws]
+        'advice': _flaw_advice(diagnosis)
         + [
             (advice_text(advice), percent(advice.gain) if advice.gain > 0 else '')
             for advice in diagnosis.advice
         ],
     }
+
+
+def _flaw_advice(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """Return what to do about photographs that are no ground for an answer, as on the screen."""
+    if not diagnosis.adequacy.flaws:
+        return []
+    words = photographs_words(diagnosis)
+    return [(f'{words[0].lower()}{words[1:]}: {photographs_reason(diagnosis)}', '')]
 
 
 def _remaining_structures(diagnosis: Diagnosis) -> dict[str, Any]:

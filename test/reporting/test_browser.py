@@ -38,7 +38,7 @@ _FRAME = '<body><iframe style="width: {}px; height: {}px; border: 0" srcdoc="{}"
 
 
 @pytest.fixture(scope='module')
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, drawn_in_module: None) -> Path:
     """Return a folder with the reports of a calibration and a diagnosis of photographs."""
     if not PHOTOGRAPHS.exists():
         pytest.skip(NO_DATA)

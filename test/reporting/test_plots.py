@@ -75,7 +75,8 @@ def test_on_a_telephone_tables_scroll_and_pictures_are_as_wide_as_it(name: str) 
         assert page.count('<img') - page.count('<img alt="{{ photo.name }}"') == page.count(
             '<source media="(max-width: 600px)"'
         )
-    if 'table { display: block; overflow-x: auto; overflow-wrap: normal; }' in page:
+    if 'table { display: block;' in page:
+        assert 'max-width: 100%; overflow-x: auto; overflow-wrap: normal; }' in page
         assert 'td { min-width: 8em; }' in narrow and 'th.n { white-space: normal;' in narrow
     else:
         assert '.wide { overflow-x: auto; }' in page

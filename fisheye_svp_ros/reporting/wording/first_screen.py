@@ -117,9 +117,6 @@ def first_screen(
     """Return the first screen; source: what was diagnosed; known: of `known_rows`."""
     paths = _paths(d)
     kind = {'retake': RETAKE, 'more': UNLIKE}.get(d.decision['photographs'].say, '')
-    # The bound of the rays stands above, with the angle that it holds for.
-    told = FlawKind.LENS_UNKNOWN if used_rays(d) else None
-    flaws = [flaw for flaw in d.adequacy.flaws if flaw.kind is not told]
     about = frames_of(d.advice, kind) if kind and not d.adequacy.is_misfit else []
     answers: tuple[tuple[str, str, Decision, list[str]], ...] = (
         (_LENS, lens_words(d), d.decision['lens'], []),
@@ -134,7 +131,7 @@ def first_screen(
     return Screen(
         headline(d),
         wrong(d),
-        tuple(map(flaw_statement, flaws)),
+        _flaws_to_add(d),
         _facts(d, source),
         _warning(d),
         tuple(
@@ -160,6 +157,14 @@ def first_screen(
         accuracy(d),
         '' if d.against is None else travel_sentence(d.against),
     )
+
+
+def _flaws_to_add(d: Diagnosis) -> tuple[str, ...]:
+    """Return what the lines above do not say of the data; they bound the rays, with an angle."""
+    said = f'{headline(d)} {wrong(d)}'.lower()
+    told = FlawKind.LENS_UNKNOWN if used_rays(d) else None
+    texts = [flaw_statement(flaw) for flaw in d.adequacy.flaws if flaw.kind is not told]
+    return tuple(text for text in texts if text.lower() not in said)
 
 
 def _reason(decision: Decision, d: Diagnosis) -> str:
