@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Timer
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -594,13 +595,17 @@ class TestDask:
         client = MagicMock()
         client.nthreads.side_effect = [{'worker': 1}, {'worker': 1}, {}]
         client.wait_for_workers.side_effect = OSError
-        client.get_executor().submit = lambda *_: Future()
+        never: Future[str] = Future()
+        client.get_executor().submit = lambda *_: never
         monkeypatch.setattr(distributed, 'Client', lambda *_, **__: client)
+        hang = Timer(5.0, never.set_result, [''])  # or a fault would wait without end, too
+        hang.start()
         with (
             pytest.raises(SweepError, match=r'no worker came .* continue with --resume'),
             dask('tcp://here') as workers,
         ):
-            list(completed_tasks(int, ['1', '2'], workers))
+            list(completed_tasks(str, ['1'], workers))
+        hang.cancel()
 
     def test_a_worker_is_awaited_with_a_word_and_up_to_a_limit(
         self,
