@@ -13,6 +13,8 @@ from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, diagnose
 from fisheye_svp_ros.mixed_model import pseudo_inverse
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
+# One process makes each diagnosis once.
+pytestmark = pytest.mark.xdist_group('invariance')
 # The best answer is 0: a lens to use now is one, as given or extended.
 RANKS = {
     'lens': {'keep': 0, 'use_extended': 0, 'undecided': 1, 'recalibrate': 2},

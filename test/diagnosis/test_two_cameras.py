@@ -39,6 +39,8 @@ from fisheye_svp_ros.solve.rig_checks import rig_is_inconsistent
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 from fisheye_svp_ros.study.trust import known_errors
 
+# One process draws and calibrates each pair once.
+pytestmark = pytest.mark.xdist_group('two cameras')
 pair = cache(two_cameras.pair)
 SMALL = Hidden(bend=1e-3, frames=14, columns=6, rows=5, reversed_frames=1)
 
