@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from itertools import pairwise
+from collections.abc import Callable, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
-from fisheye_svp_ros.reporting.blocks import page
+from fisheye_svp_ros.reporting.blocks import page, png_uri
 from fisheye_svp_ros.reporting.calibrated_camera import CalibratedCamera
-from fisheye_svp_ros.reporting.style import INK, OURS, PUBLISHED, error_levels, round_number
-from fisheye_svp_ros.reporting.svg import WIDE, WIDTH, Axis, Panel
+from fisheye_svp_ros.reporting.diagnosis_plots import draw_arrows
+from fisheye_svp_ros.reporting.plots import NARROW, drawing
+from fisheye_svp_ros.reporting.ray_plots import draw_ray_map
+from fisheye_svp_ros.reporting.style import OURS, PUBLISHED
 from fisheye_svp_ros.reporting.terminal import draw_or_note
 from fisheye_svp_ros.reporting.wording.calibration import (
     ANY_TARGET,
@@ -34,23 +37,9 @@ from fisheye_svp_ros.solve.ray_errors import (
     typical_points,
 )
 
-_ARROWS, _DOTS = 2500, 1500  # drawn, at most
-_TICKS = 30  # named frames of a panel of the usual width, at most
+_WIDE, _HEIGHT = 9.2, 3.3  # in
+_ARROWS, _TICKS = 2500, 60
 _ARROW_LENGTH = 0.03  # of the image, the typical residual
-_MARGIN = 0.05  # of an axis, beyond what is drawn
-# From pale yellow to dark blue. Source: Brewer, ColorBrewer 2.0, YlGnBu.
-_COLORS = [
-    '#ffffd9',
-    '#edf8b1',
-    '#c7e9b4',
-    '#7fcdbb',
-    '#41b6c4',
-    '#1d91c0',
-    '#225ea8',
-    '#253494',
-    '#081d58',
-    '#040e2c',
-]
 
 
 def write_calibration_report(
@@ -94,11 +83,10 @@ def _camera_section(name: str, camera: CalibratedCamera) -> dict[str, Any]:
             (f'{e.range_m:g}', f'{1e3 * e.value:.2g}', f'{1e3 * e.low:.2g}', f'{1e3 * e.high:.2g}')
             for e in rays.errors()
         ],
-        'coverage': _draw('coverage', _coverage, camera),
-        'residuals': _draw('residuals', _residuals, camera),
-        'frames_picture': _draw('residuals by frame', _frames, camera),
-        'uncertainty': _draw('uncertainty', _uncertainty, ray_map),
-        'scale': _scale(error_levels(1e3 * ray_map.sd)),
+        'coverage': _panels('coverage', [_image_points, _field], camera),
+        'residuals': _panels('residuals', [_residuals, _radial_residuals], camera),
+        'frames_picture': _panels('residuals by frame', [_frames], camera, _WIDE),
+        'uncertainty': _panels('uncertainty', [_near_rays, _far_rays], ray_map, tight=False),
     }
 
 
@@ -121,43 +109,59 @@ def _rays(camera: CalibratedCamera) -> tuple[RayModel, RayMap]:
     return model, map_rays(rays_of, uv, (camera.lens.width, camera.lens.height))
 
 
-def _draw(name: str, draw: Callable[..., list[Panel]], *arguments: Any) -> list[str]:
-    """Return the panels of a picture as parts of the page; none where they cannot be drawn."""
-    drawn: list[str] = []
+def _panels(
+    name: str,
+    draw: Sequence[Callable[[Figure, Any], None]],
+    shown: Any,
+    width: float = NARROW,
+    tight: bool = True,
+) -> list[str]:
+    """Return the panels of a picture as parts of the page; none where they cannot be drawn.
 
-    def keep(_: Path) -> None:
-        drawn.extend(panel.to_svg() for panel in draw(*arguments))
+    draw: each takes a figure of a width, in, and what is shown; tight: see `drawing`.  A panel is
+    drawn once, as wide as a telephone; the page places them side by side or below each other.
+    """
+    files = [BytesIO() for _ in draw]
 
-    return drawn if draw_or_note(Path(name), keep) else []
+    def draw_panels(_: Path) -> None:
+        for file, draw_panel in zip(files, draw, strict=True):
+            with drawing(file, width, _HEIGHT, tight=tight) as figure:
+                draw_panel(figure, shown)
 
-
-def _image_panel(title: str, lens: Lens) -> Panel:
-    """Return axes that show the image."""
-    x = Axis('u / px', -0.5, lens.width - 0.5)
-    y = Axis('v / px', lens.height - 0.5, -0.5)
-    return Panel(title, x, y, lens.height / lens.width)
-
-
-def _range(values: Array) -> tuple[float, float]:
-    """Return the ends of an axis around values."""
-    low, high = float(values.min()), float(values.max())
-    margin = _MARGIN * (high - low) or 1.0
-    return low - margin, high + margin
+    if not draw_or_note(Path(name), draw_panels):
+        return []
+    return [png_uri(file.getvalue()) for file in files]
 
 
-def _coverage(camera: CalibratedCamera) -> list[Panel]:
-    views, limit = camera.result.views, float(np.degrees(camera.lens.max_incidence))
-    image = _image_panel('image points', camera.lens)
-    image.dots(views.uv[views.used], OURS)
-    theta, distance = _angles(camera)
-    field = Panel(
-        'angles and distances (line: max_incidence_deg)',
-        Axis('incidence angle / deg', 0.0, (1 + _MARGIN) * max(limit, float(theta.max()))),
-        Axis('distance / m', 0.0, (1 + _MARGIN) * float(distance.max())),
+def _show_image(axis: Any, lens: Lens) -> None:
+    axis.set(
+        xlim=(-0.5, lens.width - 0.5),
+        ylim=(lens.height - 0.5, -0.5),
+        aspect='equal',
+        xlabel='u / px',
+        ylabel='v / px',
     )
-    field.dots(np.stack([theta, distance], axis=-1), OURS)
-    field.line(np.array([(limit, field.y.first), (limit, field.y.last)]), PUBLISHED)
-    return [image, field]
+
+
+def _image_points(figure: Figure, camera: CalibratedCamera) -> None:
+    axis, views = figure.subplots(), camera.result.views
+    axis.plot(*views.uv[views.used].T, '.', color=OURS, ms=2)
+    _show_image(axis, camera.lens)
+    axis.set_title('image points')
+
+
+def _field(figure: Figure, camera: CalibratedCamera) -> None:
+    axis = figure.subplots()
+    theta, distance = _angles(camera)
+    axis.plot(theta, distance, '.', color=OURS, ms=2)
+    axis.axvline(np.degrees(camera.lens.max_incidence), color=PUBLISHED, lw=1)
+    axis.set(
+        xlabel='incidence angle / deg',
+        ylabel='distance / m',
+        xlim=(0, None),
+        ylim=(0, None),
+        title='angles and distances (line: max_incidence_deg)',
+    )
 
 
 def _angles(camera: CalibratedCamera) -> tuple[Array, Array]:
@@ -168,79 +172,55 @@ def _angles(camera: CalibratedCamera) -> tuple[Array, Array]:
     return np.degrees(np.arccos(points[:, 2] / distance)), distance
 
 
-def _residuals(camera: CalibratedCamera) -> list[Panel]:
-    views, lens = camera.result.views, camera.lens
+def _residuals(figure: Figure, camera: CalibratedCamera) -> None:
+    axis, views = figure.subplots(), camera.result.views
     uv, residual = views.uv[views.used], camera.result.adjusted.residual[views.used]
     step = max(1, len(uv) // _ARROWS)
     typical = max(float(np.quantile(np.linalg.norm(residual, axis=1), 0.9)), 1e-9)
-    zoom, known = _ARROW_LENGTH * lens.width / typical, round_number(typical)
-    image = _image_panel('residuals', lens)
-    opacity = 0.55 if len(uv) > 600 * step else 0.9
-    image.arrows(uv[::step], zoom * residual[::step], OURS, opacity)
-    image.key(f'{known:g} px', OURS, round(zoom * known / lens.width * image.size[0]))
-    arm = uv - (lens.cx, lens.cy)
+    length = _ARROW_LENGTH * camera.lens.width
+    draw_arrows(axis, uv[::step], residual[::step], typical, length, OURS)
+    _show_image(axis, camera.lens)
+    axis.set_title('residuals')
+
+
+def _radial_residuals(figure: Figure, camera: CalibratedCamera) -> None:
+    axis, views, lens = figure.subplots(), camera.result.views, camera.lens
+    arm = views.uv[views.used] - (lens.cx, lens.cy)
+    residual = camera.result.adjusted.residual[views.used]
     radial = (residual * arm).sum(axis=1) / np.maximum(np.linalg.norm(arm, axis=1), 1e-9)
     theta, _ = _angles(camera)
-    angles = Panel(
-        'radial residuals',
-        Axis('incidence angle / deg', *_range(theta)),
-        Axis('radial residual / px', *_range(radial)),
-    )
-    angles.dots(np.stack([theta, radial], axis=-1), OURS, 22, 0.5)
+    axis.plot(theta, radial, '.', color=OURS, ms=2, alpha=0.4)
     parts = np.array_split(np.argsort(theta), max(1, min(16, len(theta) // 8)))
     means = np.array([(theta[part].mean(), radial[part].mean()) for part in parts])
-    angles.line(means, PUBLISHED, 20, 60)
-    angles.key('means', PUBLISHED, dot=60)
-    return [image, angles]
+    axis.plot(*means.T, 'o-', color=PUBLISHED, ms=4, label='means')
+    axis.set(xlabel='incidence angle / deg', ylabel='radial residual / px')
+    axis.legend(loc='upper right')
 
 
-def _frames(camera: CalibratedCamera) -> list[Panel]:
-    """Return the residuals of all frames, for a wide page and for a narrow one."""
-    views = camera.result.views
+def _frames(figure: Figure, camera: CalibratedCamera) -> None:
+    axis, views = figure.subplots(), camera.result.views
     squares = np.where(views.used, (camera.result.adjusted.residual**2).sum(axis=-1), 0.0)
     rms = np.sqrt(squares.sum(axis=1) / views.used.sum(axis=1))
-    ends = -0.6, len(rms) - 0.4
-    highest = 1.2 * float(rms.max()) or 1.0  # room for the key
-    panels = []
-    for width, ticks in ((WIDE, 2 * _TICKS), (WIDTH, _TICKS)):
-        step = -(-len(rms) // ticks)
-        names = [
-            (float(at), frame_name(camera.table, frame).removeprefix('frame '))
-            for at, frame in [*enumerate(views.frame.tolist())][::step]
-        ]
-        panel = Panel(
-            'residuals by photograph' if camera.table.photographs else 'residuals by frame',
-            Axis('' if camera.table.photographs else 'frame', *ends, names),
-            Axis('rms residual / px', 0.0, highest),
-            width=width,
-        )
-        panel.bars(rms, OURS)
-        panel.line(np.array([(end, np.median(rms)) for end in ends]), PUBLISHED)
-        panel.key('median', PUBLISHED)
-        panels.append(panel)
-    return panels
+    place, step = np.arange(len(rms)), -(-len(rms) // _TICKS)
+    axis.bar(place, rms, color=OURS)
+    axis.axhline(float(np.median(rms)), color=PUBLISHED, lw=1, label='median')
+    names = [
+        frame_name(camera.table, frame).removeprefix('frame ')
+        for frame in views.frame[::step].tolist()
+    ]
+    axis.set_xticks(place[::step], names, rotation=90, fontsize=7)
+    highest = 1.15 * float(rms.max())  # room for the legend
+    axis.set(
+        ylabel='rms residual / px',
+        xlabel='' if camera.table.photographs else 'frame',
+        ylim=(0, highest or None),
+    )
+    axis.legend(loc='upper right')
 
 
-def _uncertainty(rays: RayMap) -> list[Panel]:
-    levels, panels = error_levels(1e3 * rays.sd), []
-    uv = rays.uv[:: max(1, len(rays.uv) // _DOTS)]
-    for deviation, range_m in zip(1e3 * rays.sd, rays.ranges, strict=True):
-        x, y = Axis('u / px', rays.u[0], rays.u[-1]), Axis('v / px', rays.v[-1], rays.v[0])
-        aspect = float(rays.v[-1] / rays.u[-1])
-        panel = Panel(f'standard error at {range_m:g} m', x, y, aspect)
-        panel.map(deviation, levels, _colors(len(levels) + 1))
-        panel.dots(uv, INK, 16, 0.4)
-        panels.append(panel)
-    return panels
+def _near_rays(figure: Figure, rays: RayMap) -> None:
+    draw_ray_map(figure, [figure.subplots()], rays)
 
 
-def _colors(count: int) -> list[str]:
-    """Return colors, from the first to the last of all there are."""
-    return [_COLORS[i] for i in np.linspace(0, len(_COLORS) - 1, count).round().astype(int)]
-
-
-def _scale(levels: list[float]) -> list[tuple[str, str]]:
-    """Return the colors of a map and what each stands for."""
-    middle = (f'{low:g} to {high:g}' for low, high in pairwise(levels))
-    texts = [f'below {levels[0]:g}', *middle, f'above {levels[-1]:g}']
-    return list(zip(_colors(len(texts)), texts, strict=True))
+def _far_rays(figure: Figure, rays: RayMap) -> None:
+    draw_ray_map(figure, [figure.subplots()], rays, first=1)

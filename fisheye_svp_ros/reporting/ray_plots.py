@@ -30,12 +30,16 @@ def draw_uncertainty(file: File, maps: Mapping[str, RayMap], narrow: bool = Fals
             draw_ray_map(figure, row, each, name)
 
 
-def draw_ray_map(figure: Figure, axes: Any, rays: RayMap, name: str = '') -> None:
-    """Draw the maps of one camera into an axis for each range, with one scale of colors."""
+def draw_ray_map(figure: Figure, axes: Any, rays: RayMap, name: str = '', first: int = 0) -> None:
+    """Draw the maps of one camera into an axis for each range, with one scale of colors.
+
+    first: the range of the first axis.
+    """
     sd = 1e3 * rays.sd
     levels = error_levels(sd)
     norm = BoundaryNorm(levels, 256, extend='both')
-    for axis, deviation, range_m in zip(axes, sd, rays.ranges, strict=True):
+    shown_ranges = zip(axes, sd[first:], rays.ranges[first:], strict=False)
+    for axis, deviation, range_m in shown_ranges:
         shown = axis.contourf(
             rays.u, rays.v, deviation, levels, cmap=_COLORS, norm=norm, extend='both'
         )

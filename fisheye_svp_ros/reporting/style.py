@@ -1,4 +1,4 @@
-"""Colors, ticks and levels of pictures, whatever draws them."""
+"""Colors and levels of pictures."""
 
 from __future__ import annotations
 
@@ -9,22 +9,12 @@ from fisheye_svp_ros.arrays import Array
 OURS, PUBLISHED, FAINT = '#1f5fa8', '#e07b28', '#b8bfc7'
 INK = '#334155'
 _LEVELS = 9  # of a map, at most
-_TICK_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 
 
 def round_number(value: float) -> float:
     """Return the largest of 1, 2, 5, 10, 20 ... that is not above a value."""
     power = 10.0 ** np.floor(np.log10(max(value, 1e-12)))
     return float(max((m * power for m in (1, 2, 5) if m * power <= value), default=power))
-
-
-def tick_places(low: float, high: float, intervals: int) -> list[float]:
-    """Return round places from low to high, in so many intervals at most."""
-    least = (high - low) / intervals
-    power = 10.0 ** np.floor(np.log10(least))
-    step = next(m * power for m in _TICK_STEPS if m * power >= least * (1 - 1e-9))
-    first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
-    return [float(step * i) for i in np.arange(first, last + 1)]
 
 
 def error_levels(sd: Array) -> list[float]:

@@ -31,7 +31,6 @@ from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import NODES
-from fisheye_svp_ros.reporting.svg import Panel
 from fisheye_svp_ros.simulate.simulation import simulate
 
 SWEEP = 'synthetic_camera: {ros__parameters: {sweep.seed: [1, 2, 3], noise_px: 0.2}}\n'
@@ -191,7 +190,6 @@ def test_a_picture_that_cannot_be_drawn_costs_a_note(
         raise RuntimeError('no font')
 
     monkeypatch.setattr(Figure, 'savefig', fail)
-    monkeypatch.setattr(Panel, 'to_svg', fail)
     out = tmp_path / 'out'
     assert main([word.format(out=out, **given) for word in line.split()]) == 0
     assert results(out) == DRAWING[line]
@@ -200,19 +198,18 @@ def test_a_picture_that_cannot_be_drawn_costs_a_note(
         assert 'src=""' not in page.read_text() and '<img' not in page.read_text()
 
 
-def test_a_calibration_of_a_table_loads_no_matplotlib_and_no_recordings(
+def test_a_calibration_of_a_table_loads_no_recordings(
     given: dict[str, Path], tmp_path: Path
 ) -> None:
     arguments = ['calibrate', str(given['obs']), '--image-size', '1536x1536', '-o', 'new.yaml']
     code = (
         f'import sys; from fisheye_svp_ros.cli import main; main({arguments}); '
-        'print({"matplotlib", "rosbags"} & {*sys.modules})'
+        'print({"mcap", "rosbags"} & {*sys.modules})'
     )
     ran = subprocess.run(
         [sys.executable, '-c', code], cwd=tmp_path, capture_output=True, text=True, check=True
     )
     assert ran.stdout.splitlines()[-1] == 'set()'
-    assert '<svg ' in (tmp_path / 'new.calibrate.html').read_text()
 
 
 @pytest.mark.parametrize('backend', ['module://matplotlib_inline.backend_inline', 'foo'])
