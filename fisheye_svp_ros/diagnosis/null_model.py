@@ -441,7 +441,11 @@ def cluster_frames(linear: Linearization) -> Index:
     away = np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-300)
     turn = pose.rotation.reshape(-1, 9) / np.sqrt(2)  # so far apart as the angle, if small
     places = np.concatenate([middle / away, np.log(away), turn], axis=1)
-    hierarchy = scipy.cluster.hierarchy
+    squares = (places**2).sum(axis=1)
+    apart = squares[:, None] + squares - 2 * places @ places.T
+    if np.sum(apart < _SIMILAR_POSE**2) == len(frames):  # each is near itself alone
+        return frames
+    hierarchy = scipy.cluster.hierarchy  # not loaded for most calibrations
     tree = hierarchy.linkage(places, 'complete')
     cluster = hierarchy.fcluster(tree, _SIMILAR_POSE, 'distance').astype(np.int64) - 1
     return frames if cluster.max() + 1 < _MIN_CLUSTERS else cluster
