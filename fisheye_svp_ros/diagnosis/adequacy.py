@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.causes import Cause
@@ -187,7 +188,7 @@ def _misfits(
 def _least_share(frames: int) -> float:
     """Return what share of a standard deviation over some frames is sure (95 %), by chi-square."""
     dof = max(frames - 1, 1)
-    return float(np.sqrt(dof / scipy.stats.chi2.ppf(0.95, dof)))
+    return float(np.sqrt(dof / special.chdtri(dof, 0.05)))
 
 
 def _camera_groups(evaluation: Evaluation, noise: float) -> tuple[tuple[int, ...], ...]:

@@ -37,7 +37,7 @@ from fisheye_svp_ros.diagnosis.posterior import EffectPosterior
 from fisheye_svp_ros.diagnosis.problem import Problem, extended_lenses
 from fisheye_svp_ros.diagnosis.selection import Selection, known_effects
 from fisheye_svp_ros.diagnosis.similar_views import similar_views
-from fisheye_svp_ros.diagnosis.uncertainty import standard_errors, total_errors
+from fisheye_svp_ros.diagnosis.uncertainty import LensCovariance, standard_errors, total_errors
 from fisheye_svp_ros.diagnosis.variance_budget import (
     Component,
     cause_squares,
@@ -191,6 +191,12 @@ class Evaluation:
     def uncertainty(self) -> dict[str, dict[str, float]]:
         """How far off poses and image points are by the lens that is written: a summary."""
         return self.model_errors.summary(self.written_model)
+
+    @cached_property
+    def lens_covariance(self) -> LensCovariance:
+        """What is known of the parameters of the lens that is written."""
+        quick = self.problem.options.quick
+        return LensCovariance.from_model(self.null, self.averaged_model, quick)
 
     @cached_property
     def errors(self) -> Array:

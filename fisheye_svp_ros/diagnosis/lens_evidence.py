@@ -222,8 +222,7 @@ def find_lens_rays(
     """
     if evaluation.medium is not None:
         return {}, None
-    quick = evaluation.problem.options.quick
-    known = LensCovariance.from_model(evaluation.null, evaluation.averaged_model, quick)
+    known = evaluation.lens_covariance
     fresh = evaluation.extended_lenses(_generalized_state(evaluation.selection.first))
     views = known.linear.data.views
     errors, offsets, asked = {}, [], evaluation.problem.options.range_m
@@ -255,8 +254,7 @@ def map_lens_rays(evaluation: Evaluation) -> dict[str, RayMap]:
     """
     if evaluation.medium is not None:
         return {}
-    quick = evaluation.problem.options.quick
-    known = LensCovariance.from_model(evaluation.null, evaluation.averaged_model, quick)
+    known = evaluation.lens_covariance
     if not lens_columns(known.linear).any():
         return {}
     views, lenses = known.linear.data.views, evaluation.problem.inputs.lenses
