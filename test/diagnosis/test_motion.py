@@ -1,6 +1,7 @@
 """A camera in the hand moves while the rows of an image are read: no fault of its lens."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from fisheye_svp_ros.diagnosis import Action, NullModel, diagnose
 from fisheye_svp_ros.diagnosis.fitted_model import refit
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, make_random_effects
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
+from fisheye_svp_ros.reporting.wording.whats_wrong import wrong
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
@@ -54,6 +56,9 @@ def test_a_motion_is_told_with_its_size_and_forbids_no_lens():
     (advice,) = (one for one in found.advice if one.action is Action.HOLD_STILL)
     assert advice.value == pytest.approx(math.sqrt(3) * TURN, rel=0.3)
     assert found.decision['lens'].say == 'keep' and not found.adequacy.is_misfit
+    assert re.search(
+        r'the camera turns by 0\.\d+ deg rms while an image is read', wrong(found), re.I
+    )
 
 
 def test_a_global_shutter_has_no_motion():

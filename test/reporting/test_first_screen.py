@@ -539,7 +539,7 @@ def test_missing_photographs_are_counted(found: Diagnosis) -> None:
     adequacy = Adequacy(few, 0.9)
     flawed = replace(found, adequacy=adequacy, decision=adequacy.revise(found.decision))
     assert photographs_words(flawed) == 'Take 6 more'
-    one = Mock(wraps=flawed, frames=1, adequacy=adequacy, decision=flawed.decision)
+    one = Mock(wraps=flawed, frames=1, adequacy=adequacy, decision=flawed.decision, advice=[])
     assert photographs_words(one) == 'Take 7 more'
     said = _flawed(found, adequacy)
     assert said[0] == 'Do not use this lens yet: one frame is too few to judge the lens.'

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fisheye_svp_ros.diagnosis import (
     MIN_FRAMES,
+    Action,
     Diagnosis,
     FlawKind,
     PhotographsReason,
@@ -85,8 +86,10 @@ def photographs_words(d: Diagnosis) -> str:
         return 'Do not use them' + (' together' if flaws[0].kind is FlawKind.CAMERAS_MIXED else '')
     if flaws and flaws[0].kind.is_of_table:
         return 'Correct their points, or retake them'
+    moved = any(advice.action is Action.HOLD_STILL for advice in d.advice)
     if say == 'more':
-        return f'Take {views_to_take(d)} more'
+        still = ', with camera and target held still' if moved else ''
+        return f'Take {views_to_take(d)} more{still}'
     if say == 'enough':
         return f'Enough for this answer: {count_frames(d)}'
     return 'For a better answer, retake some'

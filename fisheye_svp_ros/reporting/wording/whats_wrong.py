@@ -10,6 +10,7 @@ import numpy as np
 from fisheye_svp_ros.diagnosis import (
     CONFIRMED_PROBABILITY,
     NAMED_P,
+    Action,
     Cause,
     Diagnosis,
     FlawKind,
@@ -78,7 +79,8 @@ def _named(d: Diagnosis) -> Iterator[str]:
     brief = [_brief(d, cause) for cause in causes]
     first = _plain_statement(d, causes[0])
     forms = [full, [*full[:1], *brief[1:]], [first, *brief[1:]]]
-    others, gains = [*_target_errors(d), *_lens_errors(d)], [[gain] for gain in _gains(d)]
+    others = [*_target_errors(d), *_motion(d), *_lens_errors(d)]
+    gains = [[gain] for gain in _gains(d)]
     for count in range(len(others), -1, -1):
         kept = [
             [other.full for other in others[:count]],
@@ -161,6 +163,18 @@ def _target_errors(d: Diagnosis) -> list[_Error]:
     return errors
 
 
+def _motion(d: Diagnosis) -> list[_Error]:
+    """Return by how much the camera moves while an image is read."""
+    turns = [advice.value for advice in d.advice if advice.action is Action.HOLD_STILL]
+    return [
+        _Error(
+            f'the camera turns by {np.degrees(turn):.2g} deg rms while an image is read',
+            f'motion within images {np.degrees(turn):.2g} deg rms',
+        )
+        for turn in turns
+    ]
+
+
 def _lens_errors(d: Diagnosis) -> list[_Error]:
     """Return what may be wrong with the lens beside the named causes."""
     if d.open_lens is not None:
@@ -187,11 +201,12 @@ def nothing_named(d: Diagnosis) -> str:
         return 'there are errors, but one frame cannot show their cause'
     if lens.say == 'recalibrate':
         return decision_reason(lens)
-    of_lens, of_target = (
-        [error.full for error in errors] for errors in (_lens_errors(d), _target_errors(d))
+    of_lens, of_target, motion = (
+        [error.full for error in errors]
+        for errors in (_lens_errors(d), _target_errors(d), _motion(d))
     )
-    if of_lens:
-        return _join([*of_lens, *of_target])
+    if of_lens or motion:
+        return _join([*of_lens, *of_target, *motion])
     if only_gross(d):
         count = len(d.gross)
         which = f'{count} image points are outliers' if count > 1 else 'one point is an outlier'
