@@ -262,8 +262,9 @@ def draw(
         stderr = np.sqrt(track.covariance[:, 0, 0] + track.covariance[:, 1, 1])
         right.plot(1e3 * np.linalg.norm(track.error[:, :2], axis=1), color=color, label=name)
         right.plot(2e3 * stderr, ':', color=color, label=f'{name}: two standard errors')
-    right.set(xlabel='image', ylabel='position error (mm)', ylim=(0, None))
-    right.legend(fontsize=8)
+    top = 1.6 * right.get_ylim()[1]  # room for the legend
+    right.set(xlabel='image', ylabel='position error (mm)', ylim=(0, top))
+    right.legend(fontsize=8, loc='upper center')
     figure.tight_layout()
     figure.savefig(path, dpi=110)
 

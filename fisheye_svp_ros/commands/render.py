@@ -30,7 +30,8 @@ from fisheye_svp_ros.simulate.targets import TARGETS, board, board_views, target
 
 Cameras = Mapping[str, tuple[Lens, Pose]]  # lens of each camera, and the camera in the first one
 Ranges = tuple[float, float]  # nearest and furthest, m
-_COUNT, _RANGES = 30, (0.12, 0.35)
+_COUNT, _MAX_COUNT = 30, 100_000
+_RANGES, _MAX_RANGE = (0.12, 0.35), 1e4  # m
 _MIN_SIZE = 10.0  # px of the corners in sight; in millimetres, poses are a thousand times too far
 
 
@@ -148,9 +149,10 @@ def _of_random_poses(args: argparse.Namespace) -> tuple[int, Ranges]:
     """Return number and ranges of random poses; raise ParameterError where nothing has them."""
     count = _COUNT if args.count is None else args.count
     near, far = args.ranges or _RANGES
-    if count < 1 or not 0 < near <= far < np.inf:
+    if not 1 <= count <= _MAX_COUNT or not 0 < near <= far <= _MAX_RANGE:
         raise ParameterError(
-            '--count must be above 0, --ranges two distances above 0, the nearer first'
+            f'--count must be 1 to {_MAX_COUNT}, --ranges two distances above 0, at most '
+            f'{_MAX_RANGE:g} m, the nearer first'
         )
     return count, (near, far)
 

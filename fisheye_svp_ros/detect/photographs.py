@@ -22,6 +22,7 @@ from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.files import read_bytes
 from fisheye_svp_ros.io.paths import visible_paths
 from fisheye_svp_ros.io.recording_files import ROS1_SUFFIX, is_recording
+from fisheye_svp_ros.io.streams import silent_libraries
 from fisheye_svp_ros.scene.observations import STEREO
 
 Pixels = NDArray[Any]  # (H, W), uint8 or uint16, grey
@@ -385,7 +386,8 @@ def _video(path: Path, camera: str = '', key: str = '') -> Iterator[Photograph]:
     """
     if not path.is_file():
         raise ObservationError(f'{path}: it must be a regular file')
-    video = cv2.VideoCapture(str(path))
+    with silent_libraries():  # of the kinds of files that it may be, each tells why it is none
+        video = cv2.VideoCapture(str(path))
     rate = video.get(cv2.CAP_PROP_FPS) or 30.0
     number = 0
     while True:

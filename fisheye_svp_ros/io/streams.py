@@ -78,6 +78,19 @@ def tolerant_streams() -> Iterator[Callable[[], OSError | None]]:
         sys.stdout, sys.stderr = before
 
 
+@contextmanager
+def silent_libraries() -> Iterator[None]:
+    """Have nothing that a library of C writes to standard error in the block reach anybody."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        _open_nowhere(2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
 def _open_nowhere(descriptor: int) -> None:
     """Make a descriptor one of /dev/null, which child processes inherit."""
     nowhere = os.open(os.devnull, os.O_RDWR)

@@ -472,6 +472,8 @@ def test_few_boards_may_be_another_board(
         ('--noise', 'inf'),
         ('--bow', 'nan'),
         ('--ranges', '0.1', 'inf'),
+        ('--ranges', '1e300', '1e308'),
+        ('--count', '100000000000'),
     ],
 )
 def test_render_with_what_is_no_size(said, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

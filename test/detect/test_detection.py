@@ -611,10 +611,16 @@ class TestPhotographs:
 
     @pytest.mark.parametrize('name', ['a.mp4', 'a.avi', 'a.mkv'])
     @pytest.mark.parametrize('size', [0, 5000])
+    @pytest.mark.parametrize('head', [b'', b'RIFF\0\0\0\0AVI '])
     def test_a_broken_video(
-        self, name: str, size: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+        self,
+        name: str,
+        size: int,
+        head: bytes,
+        tmp_path: Path,
+        capfd: pytest.CaptureFixture[str],
     ) -> None:
-        (tmp_path / name).write_bytes(np.random.default_rng(0).bytes(size))
+        (tmp_path / name).write_bytes(head + np.random.default_rng(0).bytes(size))
         with pytest.raises(ObservationError, match='the video is empty or cannot be decoded'):
             list(find_photographs([str(tmp_path / name)]))
         assert capfd.readouterr().err == ''
