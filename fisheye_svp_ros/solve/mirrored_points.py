@@ -32,9 +32,12 @@ class Mirror(Enum):
 
     V_UPWARDS = 1
     UV_EXCHANGED = 2
-    IMAGE = 3  # one of both
+    IMAGE = 3  # one of these
     Y_REVERSED = 4
     Y_UPWARDS = 5  # y up, z out of the board: a right-handed convention, and the lens is right
+    U_LEFTWARDS = 6
+    X_REVERSED = 7
+    ONE_AXIS = 8  # of the image: as that of a camera upside down, either way
 
 
 def find_mirror(table: Observations, lens: Lens) -> Mirror | None:
@@ -56,8 +59,11 @@ def mirror_by_lens(views: Views, lens: Lens) -> Mirror | None:
     from fisheye_svp_ros.solve.lens_calibration import select_points
 
     few = select_points(views, _VIEWS)
-    flipped = few.uv * [1.0, -1.0] + [0.0, lens.height - 1.0]
-    images = {Mirror.V_UPWARDS: flipped, Mirror.UV_EXCHANGED: few.uv[..., ::-1]}
+    images = {
+        Mirror.V_UPWARDS: few.uv * [1.0, -1.0] + [0.0, lens.height - 1.0],
+        Mirror.U_LEFTWARDS: few.uv * [-1.0, 1.0] + [lens.width - 1.0, 0.0],
+        Mirror.UV_EXCHANGED: few.uv[..., ::-1],
+    }
     rms_given = _median_rms(lens, few)
     rms = {kind: _median_rms(lens, few._replace(uv=uv)) for kind, uv in images.items()}
     best = min(rms, key=lambda kind: rms[kind])
@@ -116,6 +122,11 @@ def _mirror_by_numbers(table: Observations, lens: Lens) -> Mirror | None:
         return None
     downwards = np.cov(landmarks.ids, y)[0, 1] > 0
     if downwards:
+        rows, row = np.unique(np.round(y, 6), return_inverse=True)
+        first = np.array([landmarks.ids[row == i].min() for i in range(len(rows))])
+        rightwards = np.cov(landmarks.ids - first[row], x)[0, 1] > 0
+        if not rightwards and x.max() <= 0:
+            return Mirror.X_REVERSED
         return _mirror_of_image(table.uv, lens)
     return Mirror.Y_REVERSED if y.max() <= 0 else Mirror.Y_UPWARDS
 
@@ -132,7 +143,7 @@ def _mirror_of_image(uv: Array, lens: Lens) -> Mirror:
     Exchanged ones, and their principal point, lie in an image of exchanged size.
     """
     if uv[:, 0].max() > lens.height:
-        return Mirror.V_UPWARDS
+        return Mirror.ONE_AXIS
     middle = np.array([lens.width - 1, lens.height - 1]) / 2
     off, exchanged = (
         float(np.linalg.norm(np.array([lens.cx, lens.cy]) - place))

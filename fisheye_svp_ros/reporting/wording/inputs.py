@@ -160,8 +160,11 @@ def compilation_text(state: str) -> str:
 MIRROR_WORDS = {
     Mirror.V_UPWARDS: 'v is counted upward',
     Mirror.UV_EXCHANGED: 'u and v are exchanged',
-    Mirror.IMAGE: 'v is counted upward, or u and v are exchanged',
+    Mirror.IMAGE: 'v is counted upward, u leftward, or u and v are exchanged',
     Mirror.Y_REVERSED: 'y of the board is reversed',
+    Mirror.U_LEFTWARDS: 'u is counted leftward',
+    Mirror.X_REVERSED: 'x of the board is reversed',
+    Mirror.ONE_AXIS: 'v is counted upward, or u leftward',
 }
 MIRROR_REMEDY = 'write u to the right, v down, x, y, z right-handed with z into the board'
 
