@@ -160,7 +160,7 @@ def compilation_text(state: str) -> str:
 MIRROR_WORDS = {
     Mirror.V_UPWARDS: 'v is counted upward',
     Mirror.UV_EXCHANGED: 'u and v are exchanged',
-    Mirror.IMAGE: 'v is counted upward, u leftward, or u and v are exchanged',
+    Mirror.IMAGE: 'v is counted upward, u leftward, or both are exchanged',
     Mirror.Y_REVERSED: 'y of the board is reversed',
     Mirror.U_LEFTWARDS: 'u is counted leftward',
     Mirror.X_REVERSED: 'x of the board is reversed',
