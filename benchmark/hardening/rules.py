@@ -31,17 +31,37 @@ PACKAGE = 'fisheye_svp_ros'
 TESTS = {
     **{
         f'mixed_model/{name}.py': [f'mixed_model/test_{name}.py']
-        for name in ('equations', 'model_columns', 'reml', 'score_tests', 'solution')
+        for name in (
+            'equations',
+            'model_averaging',
+            'model_columns',
+            'reml',
+            'score_tests',
+            'solution',
+        )
     },
     'solve/outliers.py': ['solve/test_outliers.py'],
     'solve/reliability.py': ['solve/test_examination.py', 'solve/test_reliability.py'],
     'solve/weak_geometry.py': ['solve/test_weak_geometry.py'],
     'solve/wrong_landmarks.py': ['solve/test_wrong_landmarks.py'],
     'solve/ray_errors.py': ['solve/test_ray_errors.py'],
+    **{
+        f'solve/{name}.py': [f'solve/test_{name}.py']
+        for name in (
+            'hand_eye',
+            'mirrored_points',
+            'pose_gate',
+            'readout',
+            'tag_mapping',
+            'tag_units',
+        )
+    },
     'diagnosis/effect_tests.py': ['diagnosis/test_effect_tests.py'],
     'diagnosis/cross_validation.py': ['diagnosis/test_cross_validation.py'],
     'diagnosis/variance_budget.py': ['diagnosis/test_variance_budget.py'],
     'diagnosis/decision.py': ['diagnosis/test_decision.py'],
+    'diagnosis/adequacy.py': ['diagnosis/test_adequacy.py'],
+    'diagnosis/similar_views.py': ['diagnosis/test_similar_views.py'],
 }
 BY_HAND = '\n<!-- what the survivors are: by hand -->\n'  # kept from here on
 _DROPPED = {'sqrt', 'abs', 'absolute', 'square', 'clip', 'log1p', 'nan_to_num'}

@@ -2,7 +2,8 @@
 
 Photographs of a board through a camera of a simulator of its own, which shares no code with the
 package. Of sound kinds the lens is good, whatever the residuals are: boards that are flat, bent,
-bumpy, or bent by another amount in every photograph, landmarks that are off, light that changes.
+bumpy, or bent by another amount in every photograph, landmarks that are off, light that changes,
+a camera in the hand that moves while its rows are read.
 Of bad kinds it is not, or the world is not what the table says: a focal length or a center that
 differs from frame to frame, few photographs, absurd noise, corners that are mirrored in a quarter
 of the photographs, an image size that is too large. Each set is calibrated and diagnosed, with
@@ -40,10 +41,19 @@ Rng = np.random.Generator
 SIZE, TOO_LARGE = (1280, 960), (1600, 1200)
 FOCAL, CENTER = 300.0, (643.0, 477.0)
 CURVE = (-0.02, 0.004, -0.001, 0.0003)
-SOUND = ('flat', 'bent', 'bumpy', 'bends by frame', 'landmarks off', 'light changes')
+SOUND = (
+    'flat',
+    'bent',
+    'bumpy',
+    'bends by frame',
+    'landmarks off',
+    'light changes',
+    'moves while read',
+)
 BAD = ('breathes', 'center moves', 'few frames', 'absurd noise', 'mirrored', 'size too large')
 GOOD, NOISES = 3e-4, 2.0  # rad, and times the noise of a point: rays so good are sound
 COLUMNS, ROWS, SQUARE = 9, 6, 0.03
+TURN = 0.01  # rad about each axis, from the first row to the last: .3 rad/s in 30 ms
 
 
 class Outcome(NamedTuple):
@@ -136,7 +146,12 @@ def draw(kind: str, rng: Rng) -> tuple[Observations, float]:
         points[:, 2] += shape(kind, rng, at, size) if kind == 'bends by frame' else 0
         focal = FOCAL * (1 + change * rng.normal() * (kind == 'breathes'))
         center = CENTER + 8 * rng.normal(size=2) * (kind == 'center moves')
-        uv, theta = project((points - middle) @ rotation.T + place, focal, center)
+        points = (points - middle) @ rotation.T + place
+        uv, theta = project(points, focal, center)
+        if kind == 'moves while read':
+            row = uv[:, 1:] / SIZE[1] - 0.5
+            points = points + np.cross(row * rng.normal(0, TURN, 3), points)
+            uv, theta = project(points, focal, center)
         light = float(np.exp(0.4 * rng.normal())) if kind == 'light changes' else 1.0
         uv = uv + light * noise * rng.normal(size=uv.shape)
         seen = (uv > 5).all(axis=1) & (uv < np.array(SIZE) - 5).all(axis=1) & (theta < 1.7)

@@ -6,7 +6,7 @@ A change of the camera frame that is common to all ranges is a convention, and t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import hypot, inf
+from math import hypot, inf, prod
 from typing import NamedTuple
 
 import numpy as np
@@ -274,7 +274,7 @@ def _split_motion(points: Array, change: Array, datum: int | None = None) -> tup
 
     shifts = np.broadcast_to(np.eye(3), (*points.shape, 3))
     motion = across_rays(np.concatenate([shifts, -cross_matrix(points)], axis=-1))
-    angles = across_rays(change.reshape(*points.shape, -1))
+    angles = across_rays(change.reshape(*points.shape, prod(change.shape[3:])))
     rows = points[:, :datum].size
     fixed, moved = (array[:, :datum].reshape(rows, array.shape[-1]) for array in (motion, angles))
     motion_fit = np.asarray(np.linalg.lstsq(fixed, moved, rcond=None)[0], dtype=float)

@@ -158,3 +158,9 @@ def test_what_is_drawn_follows_the_last_digits_of_a_covariance_no_further() -> N
     )
     np.testing.assert_allclose(one.errors(), other.errors(), rtol=1e-6)
     np.testing.assert_allclose(one.sample(1), other.sample(1), atol=1e-6 * one.sd.max())
+
+
+def test_a_lens_without_any_ray_has_no_errors_of_rays():
+    """Frames of two cameras fit a lens that sees nothing: diagnose ended in a ValueError."""
+    left = without_motion(np.zeros((3, 0, 3)), np.zeros((3, 0, 3, 5)))
+    assert left.shape == (3, 0, 3, 5)
