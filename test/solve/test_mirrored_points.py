@@ -118,3 +118,20 @@ def test_a_view_alone_or_seen_edge_on_has_no_side() -> None:
     table = sound()
     few = table.take(np.isin(table.landmark, [0, 1, 2, 3, 4, 5, 6]))  # on one line
     assert mirror_by_lens(group_views(MIRRORS[Mirror.V_UPWARDS](few)), known_lens()) is None
+
+
+def test_one_bad_view_hides_no_mirror_image() -> None:
+    """The typical view decides: a mean would follow the one with wrong points."""
+    mirrored = MIRRORS[Mirror.V_UPWARDS](sound())
+    wild = replace(mirrored, uv=mirrored.uv.copy())
+    wild.uv[mirrored.frame == 0] += np.random.default_rng(1).uniform(-200, 200, (54, 2))
+    assert mirror_by_lens(group_views(wild), known_lens()) == Mirror.V_UPWARDS
+
+
+@pytest.mark.parametrize(('noise', 'size'), [(0.005, 0.5), (4.0, 0.1)])
+def test_small_misfits_and_much_noise_are_no_mirror_image(noise: float, size: float) -> None:
+    """Near the axis a small board fits either way, to .1 px or to its noise."""
+    rng, points = np.random.default_rng(4), board() * size
+    views = draw_views(rng, points, 8, 0.05)
+    table = MIRRORS[Mirror.V_UPWARDS](observe(rng, [CAMERA] * 8, views, points, noise))
+    assert mirror_by_lens(group_views(table), known_lens()) is None
