@@ -51,9 +51,9 @@ def estimate_sentence(figures: Mapping[str, Any]) -> str:
     if least is None or figures['rms_px'] < _WORTH_SAYING * least:
         return ''
     return (
-        f'On the board as stated, the rms is {figures["rms_px"]:.4f} px. Plain least squares leaves '
-        f'{least:.4f} px, because it absorbs board errors into the lens (--plain writes that '
-        'lens).'
+        f'On the board as stated, the rms is {figures["rms_px"]:.4f} px. Plain least squares '
+        f'leaves {least:.4f} px, because it absorbs board errors into the lens (--plain writes '
+        'that lens).'
     )
 
 

@@ -88,6 +88,23 @@ class AnswerLine(NamedTuple):
     more: int
     below: bool = False
 
+    @property
+    def what(self) -> str:
+        """What to do, with the names of what it is about."""
+        names = ', '.join(photo.name for photo in self.photographs)
+        names += f' and {self.more} more' if self.more else ''
+        return f'{self.do}{names and f": {names}"}.'
+
+    @property
+    def brief(self) -> str:
+        """As much of the reason as one reads at first; the first clause of a long one."""
+        if self.below:
+            return ''
+        sure = f' ({self.sure})' if self.sure else ''
+        first = len(f'{self.about}: {self.what}'.split())
+        texts = (f'{self.why}{sure}.', f'{self.why.partition("; ")[0]}.')
+        return next((text for text in texts if first + len(text.split()) <= MAX_WORDS), '')
+
 
 class Screen(NamedTuple):
     """What is read first; warning: '' unless an error rises with the causes in the model.
@@ -205,21 +222,15 @@ def terminal_lines(screen: Screen, step: NextStep | None = None) -> list[str]:
 
 def _answer_lines(action: AnswerLine) -> tuple[list[str], list[str]]:
     """Return a line of what is read first, and of the details; the headline has the lens."""
-    names = ', '.join(photo.name for photo in action.photographs)
-    names += f' and {action.more} more' if action.more else ''
     sure = f' ({action.sure})' if action.sure else ''
     if action.about == _LENS:
         return [], [f'{_LENS}: {action.do}{sure}. {action.why}.']
-    do, why = f'{action.about}: {action.do}{names and f": {names}"}.', f'{action.why}{sure}.'
-    if action.below:
-        return [do], [f'{action.about}, why: {why}']
-    brief = f'{action.why.partition("; ")[0]}.'
-    shown = next((f'{do} {text}' for text in (why, brief) if _is_short(f'{do} {text}')), do)
-    return [shown], [] if shown.endswith(why) else [f'{action.about}, why: {why}']
-
-
-def _is_short(text: str) -> bool:
-    return len(text.split()) <= MAX_WORDS
+    below = (
+        []
+        if action.brief == f'{action.why}{sure}.'
+        else [f'{action.about}, why: {action.why}{sure}.']
+    )
+    return [' '.join(filter(None, [f'{action.about}: {action.what}', action.brief]))], below
 
 
 def _facts(d: Diagnosis, source: str) -> str:
