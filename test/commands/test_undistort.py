@@ -56,7 +56,9 @@ def matrix(document: dict[str, object], name: str) -> NDArray[np.float64]:
     return np.array(document[name])
 
 
-def test_one_camera(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_camera(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], drawn: None
+) -> None:
     lens = folder / 'lenses' / 'left.yaml'
     run(
         lens,
