@@ -147,7 +147,9 @@ def test_color_stays(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('way', ['folder', 'options'])
-def test_a_rig(folder: Path, tmp_path: Path, way: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rig(
+    folder: Path, tmp_path: Path, way: str, capsys: pytest.CaptureFixture[str], drawn: None
+) -> None:
     lenses = folder / 'lenses'
     given: list[object] = (
         [f'{lenses}/']
