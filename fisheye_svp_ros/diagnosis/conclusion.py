@@ -16,7 +16,7 @@ from fisheye_svp_ros.diagnosis.adequacy import Adequacy, are_rays_known, judge_d
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
-from fisheye_svp_ros.diagnosis.cross_validation import gain_and_confidence
+from fisheye_svp_ros.diagnosis.cross_validation import gain_and_confidence, predictable_rows
 from fisheye_svp_ros.diagnosis.decision import (
     Decision,
     FileFigure,
@@ -47,6 +47,7 @@ RETAKE, UNLIKE, TURNED = 'retake', 'unlike', 'turned'
 _OUTSTANDING_RATIO = 2.0  # times the typical one
 _MAX_LISTED = 8
 _MIN_SAG = _MIN_BEND = 0.05  # mm
+_REACHED = 0.75  # of the points of a frame, by other frames: less, and it alone shows a part
 
 
 class Action(Enum):
@@ -201,7 +202,9 @@ def _check_held_out(evaluation: Evaluation) -> list[Advice]:
     """Return what to do about held-out frames that are no measure of a model."""
     test = evaluation.held_out
     if test is None:
-        alone = evaluation.null.linear.data.frame_numbers[~evaluation.counted_frames]
+        linear = evaluation.null.linear
+        near = predictable_rows(linear).sum(axis=1) / linear.row_mask.sum(axis=1)
+        alone = linear.data.frame_numbers[~evaluation.counted_frames | (near < _REACHED)]
         return (
             [
                 _about_frames(

@@ -74,7 +74,8 @@ def test_a_broad_field_of_the_image_widens_the_errors_of_the_intrinsics_it_resem
         found = np.array([getattr(fitted.lens, name) for name in free])
         off.append((found - true) / total_errors(null))
     spread = np.sqrt(np.mean(np.square(off), axis=0))
-    assert (spread > 0.45).all() and (spread < 1.75).all(), spread
+    # Of eight sets, a spread is uncertain by a quarter; without what widens them, that of cy is 5.
+    assert (spread > 0.45).all() and (spread < 2.0).all(), spread
 
 
 @pytest.mark.parametrize('size', [0.0, 4e-4])
