@@ -672,8 +672,8 @@ def test_the_calibrator_counts_a_set_that_is_played_again_once(
     results = g.hear(DiagnosticArray, 'stereo_calibrator/result')
     g.start(StereoCalibrator)
     g.start(MeasuredCamera)
-    g.until(lambda: len(results) == 8)
-    assert [float(values(m)['views']) for m in results] == [1, 2, 3, 3, 3, 3, 3, 3]
+    g.until(lambda: len(results) >= 8)
+    assert [float(values(m)['views']) for m in results[:8]] == [1, 2, 3, 3, 3, 3, 3, 3]
 
 
 def test_depth_with_a_rig_from_a_topic(graph: Callable[..., Graph]) -> None:

@@ -71,6 +71,9 @@ def test_on_a_telephone_tables_scroll_and_pictures_are_as_wide_as_it(name: str) 
     if name == 'blocks':  # its pictures have no narrow form
         assert 'figure { overflow-x: auto; }' in narrow
         assert 'figure img { max-width: none; width: 760px; }' in narrow
+    elif name == 'calibration':  # panels as wide as a telephone; the one that is not scrolls
+        assert '.panels img { flex-basis: 100%; }' in narrow
+        assert '.panels.one { overflow-x: auto;' in page
     else:
         assert page.count('<img') - page.count('<img alt="{{ photo.name }}"') == page.count(
             '<source media="(max-width: 600px)"'
