@@ -83,10 +83,12 @@ def _camera_section(name: str, camera: CalibratedCamera) -> dict[str, Any]:
             (f'{e.range_m:g}', f'{1e3 * e.value:.2g}', f'{1e3 * e.low:.2g}', f'{1e3 * e.high:.2g}')
             for e in rays.errors()
         ],
-        'coverage': _panels('coverage', [_image_points, _field], camera),
-        'residuals': _panels('residuals', [_residuals, _radial_residuals], camera),
-        'frames_picture': _panels('residuals by frame', [_frames], camera, _WIDE),
-        'uncertainty': _panels('uncertainty', [_near_rays, _far_rays], ray_map, tight=False),
+        'coverage': _panel_uris('coverage', [_draw_image_points, _draw_field], camera),
+        'residuals': _panel_uris('residuals', [_draw_residuals, _draw_radial_residuals], camera),
+        'frames_picture': _panel_uris('residuals by frame', [_draw_frames], camera, _WIDE),
+        'uncertainty': _panel_uris(
+            'uncertainty', [_draw_near_rays, _draw_far_rays], ray_map, tight=False
+        ),
     }
 
 
@@ -109,7 +111,7 @@ def _rays(camera: CalibratedCamera) -> tuple[RayModel, RayMap]:
     return model, map_rays(rays_of, uv, (camera.lens.width, camera.lens.height))
 
 
-def _panels(
+def _panel_uris(
     name: str,
     draw: Sequence[Callable[[Figure, Any], None]],
     shown: Any,
@@ -143,14 +145,14 @@ def _show_image(axis: Any, lens: Lens) -> None:
     )
 
 
-def _image_points(figure: Figure, camera: CalibratedCamera) -> None:
+def _draw_image_points(figure: Figure, camera: CalibratedCamera) -> None:
     axis, views = figure.subplots(), camera.result.views
     axis.plot(*views.uv[views.used].T, '.', color=OURS, ms=2)
     _show_image(axis, camera.lens)
     axis.set_title('image points')
 
 
-def _field(figure: Figure, camera: CalibratedCamera) -> None:
+def _draw_field(figure: Figure, camera: CalibratedCamera) -> None:
     axis = figure.subplots()
     theta, distance = _angles(camera)
     axis.plot(theta, distance, '.', color=OURS, ms=2)
@@ -172,7 +174,7 @@ def _angles(camera: CalibratedCamera) -> tuple[Array, Array]:
     return np.degrees(np.arccos(points[:, 2] / distance)), distance
 
 
-def _residuals(figure: Figure, camera: CalibratedCamera) -> None:
+def _draw_residuals(figure: Figure, camera: CalibratedCamera) -> None:
     axis, views = figure.subplots(), camera.result.views
     uv, residual = views.uv[views.used], camera.result.adjusted.residual[views.used]
     step = max(1, len(uv) // _ARROWS)
@@ -183,7 +185,7 @@ def _residuals(figure: Figure, camera: CalibratedCamera) -> None:
     axis.set_title('residuals')
 
 
-def _radial_residuals(figure: Figure, camera: CalibratedCamera) -> None:
+def _draw_radial_residuals(figure: Figure, camera: CalibratedCamera) -> None:
     axis, views, lens = figure.subplots(), camera.result.views, camera.lens
     arm = views.uv[views.used] - (lens.cx, lens.cy)
     residual = camera.result.adjusted.residual[views.used]
@@ -197,7 +199,7 @@ def _radial_residuals(figure: Figure, camera: CalibratedCamera) -> None:
     axis.legend(loc='upper right')
 
 
-def _frames(figure: Figure, camera: CalibratedCamera) -> None:
+def _draw_frames(figure: Figure, camera: CalibratedCamera) -> None:
     axis, views = figure.subplots(), camera.result.views
     squares = np.where(views.used, (camera.result.adjusted.residual**2).sum(axis=-1), 0.0)
     rms = np.sqrt(squares.sum(axis=1) / views.used.sum(axis=1))
@@ -218,9 +220,9 @@ def _frames(figure: Figure, camera: CalibratedCamera) -> None:
     axis.legend(loc='upper right')
 
 
-def _near_rays(figure: Figure, rays: RayMap) -> None:
+def _draw_near_rays(figure: Figure, rays: RayMap) -> None:
     draw_ray_map(figure, [figure.subplots()], rays)
 
 
-def _far_rays(figure: Figure, rays: RayMap) -> None:
+def _draw_far_rays(figure: Figure, rays: RayMap) -> None:
     draw_ray_map(figure, [figure.subplots()], rays, first=1)

@@ -104,7 +104,9 @@ def calibrate(
     return _as_calibration(observations, fit_lens(start, views, names), views, left_out)
 
 
-def refit(calibration: Calibration, observations: Observations) -> Calibration | None:
+def refit_without_outliers(
+    calibration: Calibration, observations: Observations
+) -> Calibration | None:
     """Fit a calibrated lens anew to nearly all rows that it was fitted to, from where that ended.
 
     None where it is not fitted from there: behind a port, or where its views are other ones.

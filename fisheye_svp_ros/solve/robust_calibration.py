@@ -12,7 +12,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.table_checks import check_frames_differ
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.lens_calibration import Calibration, refit
+from fisheye_svp_ros.solve.lens_calibration import Calibration, refit_without_outliers
 from fisheye_svp_ros.solve.outliers import NO_OUTLIERS, Outliers, find_outliers
 from fisheye_svp_ros.solve.rig_state import group_by_frame
 from fisheye_svp_ros.solve.wrong_landmarks import find_wrong_landmarks
@@ -45,7 +45,9 @@ def calibrate_without_outliers(
         if result is None or rounds or wrong:
             fewer = observations.take(rows)
             near = result and len(rejected.rows) <= _FEW_OUTLIERS * len(observations)
-            result = (result and near and refit(result, fewer)) or calibrate(fewer)
+            result = (result and near and refit_without_outliers(result, fewer)) or calibrate(
+                fewer
+            )
         rows = rows[~np.isin(observations.frame[rows], result.left_out)]
         table = observations.take(rows)
         data = group_by_frame(table)

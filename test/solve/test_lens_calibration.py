@@ -18,7 +18,7 @@ from fisheye_svp_ros.optics.lens import Lens, field_of_view
 from fisheye_svp_ros.scene.observations import group_views
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.bundle_adjustment import adjust_lens
-from fisheye_svp_ros.solve.lens_calibration import _check_focal, calibrate, refit
+from fisheye_svp_ros.solve.lens_calibration import _check_focal, calibrate, refit_without_outliers
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured_poses import posable_views, rms_px
 from fisheye_svp_ros.solve.table_poses import solve_table
@@ -398,7 +398,7 @@ def test_a_lens_fitted_anew_without_some_points_is_that_of_a_fit_from_nothing(
     table = replace(table, uv=uv)
     fewer = table.take(np.arange(len(table)) % 97 > 0)
     first, expected = (calibrate(some, model, SIZE) for some in (table, fewer))
-    found, names = refit(first, fewer), first.adjusted.names
+    found, names = refit_without_outliers(first, fewer), first.adjusted.names
     off, error = (
         parameters(found.adjusted.lens, names) - parameters(expected.adjusted.lens, names),
         np.sqrt(np.diag(expected.adjusted.covariance)),
@@ -408,4 +408,4 @@ def test_a_lens_fitted_anew_without_some_points_is_that_of_a_fit_from_nothing(
         assert figures['observations'] == len(fewer)
     moved = parameters(first.adjusted.lens, names) - parameters(expected.adjusted.lens, names)
     assert np.abs(moved / error).max() > 0.1  # the points that are gone mattered
-    assert refit(first, table.take(table.frame > table.frame.min())) is None
+    assert refit_without_outliers(first, table.take(table.frame > table.frame.min())) is None

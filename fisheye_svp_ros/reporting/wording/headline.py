@@ -41,7 +41,7 @@ def headline(d: Diagnosis) -> str:
         return _recalibrate(d)
     if is_short_of_angle(d):
         return _within_angle(d)
-    flaw, rays, lens = flaw_in_headline(d), used_rays(d), _lens(d)
+    flaw, rays, lens = flaw_in_headline(d), used_rays(d), _lens_in_use(d)
     if flaw not in (None, FlawKind.LENS_UNKNOWN):
         return _of_flawed_data(d)
     if rays is None:
@@ -64,7 +64,7 @@ def _given(d: Diagnosis) -> str:
     return 'these lenses' if len(d.lenses) > 1 else 'this lens'
 
 
-def _lens(d: Diagnosis) -> str:
+def _lens_in_use(d: Diagnosis) -> str:
     """Return which lens is to be used."""
     if not d.offers_extended:
         return _given(d)

@@ -62,7 +62,7 @@ def wrong(d: Diagnosis) -> str:
     '' where the headline says it.
     """
     if d.adequacy.is_misfit:
-        texts = _misfit(d)
+        texts = _misfit_clauses(d)
     elif d.causes:
         texts = _named(d)
     elif d.adequacy.flaws:
@@ -76,10 +76,10 @@ def _named(d: Diagnosis) -> Iterator[str]:
     """Yield the causes, what else is wrong and what correction gains, in ever fewer words."""
     causes = sorted(d.causes, key=lambda cause: (-cause.share, cause.p_value))
     full = [_sentence(d, cause) for cause in causes]
-    brief = [_brief(d, cause) for cause in causes]
+    brief = [_in_few_words(d, cause) for cause in causes]
     first = _plain_statement(d, causes[0])
     forms = [full, [*full[:1], *brief[1:]], [first, *brief[1:]]]
-    others = [*_target_errors(d), *_motion(d), *_lens_errors(d)]
+    others = [*_target_errors(d), *_motion(d), *_possible_lens_errors(d)]
     gains = [[gain] for gain in _gains(d)]
     for count in range(len(others), -1, -1):
         kept = [
@@ -87,17 +87,17 @@ def _named(d: Diagnosis) -> Iterator[str]:
             [other.brief for other in others[:count]],
         ]
         for rest in (*(also + gain for gain in gains for also in kept), *kept):
-            yield from (_join([*form, *rest]) for form in forms)
-    yield _join(brief)
+            yield from (_join_clauses([*form, *rest]) for form in forms)
+    yield _join_clauses(brief)
     for count in range(len(brief) - 1, 0, -1):
-        yield _join([first, *brief[1:count], f'{len(brief) - count} more below'])
+        yield _join_clauses([first, *brief[1:count], f'{len(brief) - count} more below'])
 
 
-def _join(clauses: Iterable[str]) -> str:
+def _join_clauses(clauses: Iterable[str]) -> str:
     return '; '.join(map(_lower, clauses))
 
 
-def _misfit(d: Diagnosis) -> Iterator[str]:
+def _misfit_clauses(d: Diagnosis) -> Iterator[str]:
     """Yield by how much no one lens fits, and in which frames, of these ever fewer."""
     flaw, off, meaning = d.adequacy.flaws[0], '', ''
     if flaw.kind is FlawKind.MIRRORED:
@@ -175,7 +175,7 @@ def _motion(d: Diagnosis) -> list[_Error]:
     ]
 
 
-def _lens_errors(d: Diagnosis) -> list[_Error]:
+def _possible_lens_errors(d: Diagnosis) -> list[_Error]:
     """Return what may be wrong with the lens beside the named causes."""
     if d.open_lens is not None:
         text = open_effect(d.open_lens)
@@ -203,16 +203,16 @@ def nothing_named(d: Diagnosis) -> str:
         return decision_reason(lens)
     of_lens, of_target, motion = (
         [error.full for error in errors]
-        for errors in (_lens_errors(d), _target_errors(d), _motion(d))
+        for errors in (_possible_lens_errors(d), _target_errors(d), _motion(d))
     )
     if of_lens or motion:
-        return _join([*of_lens, *of_target, *motion])
+        return _join_clauses([*of_lens, *of_target, *motion])
     if only_gross(d):
         count = len(d.gross)
         which = f'{count} image points are outliers' if count > 1 else 'one point is an outlier'
         return f'{which}; nothing else is wrong'
     if of_target:
-        return ('only the target: ' if d.verdict == 'adequate' else '') + _join(of_target)
+        return ('only the target: ' if d.verdict == 'adequate' else '') + _join_clauses(of_target)
     if d.verdict == 'adequate':
         confirmed = 'confirmed' if d.offers_extended else 'visible'
         return f'no model error is {confirmed} in these data'
@@ -289,7 +289,7 @@ def _statement(d: Diagnosis, cause: Cause) -> str:
     return f'{words} ({how_large})' if how_large else words
 
 
-def _brief(d: Diagnosis, cause: Cause) -> str:
+def _in_few_words(d: Diagnosis, cause: Cause) -> str:
     """Return a cause in few words, and its size."""
     words = _BRIEF.get(cause.effect) or cause.effect.replace('_', ' ')
     return f'{words} {_size(d, cause)}'.strip()
