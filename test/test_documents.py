@@ -156,7 +156,7 @@ def test_the_glossary_has_the_terms_of_first_screens() -> None:
     entries = re.findall(r'^\| ([^|]+) \|', page, re.MULTILINE)
     terms = {term for entry in entries for term in entry.split(', ')}
     used = (
-        'extended lens, extrapolated, intrinsics, landmark, left-out error, mrad, noise, '
+        'extended lens, extrapolated, intrinsics, landmark, held-out error, mrad, noise, '
         'off axis, outlier, photograph, ray error, readout, rms, sensor tilt, single frame, sure, '
         'target, viewpoint'
     )

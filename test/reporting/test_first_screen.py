@@ -492,8 +492,8 @@ def test_the_pair_of_figures_stays_beside_a_bend_between_frames(found: Diagnosis
     )
     before = found.figures.base.heldout_rms_px
     assert wrong(better) == (
-        'The entrance pupil moves sideways with the angle (0.29 deg); bend between frames '
-        f'0.33 mm rms; left-out error {before:.3f} → 0.270 px if corrected'
+        'The entrance pupil moves sideways with the angle (0.29 deg); board bends 0.33 mm '
+        f'rms between frames; correction: held-out error {before:.3f} → 0.270 px'
     )
 
 

@@ -30,13 +30,13 @@ def target_words(d: Diagnosis) -> str:
     facts, say = decision.facts, decision.say
     assert isinstance(facts, TargetFacts)
     if say == 'undecided':
-        return 'Use it for the next photographs'
+        return 'Keep it for now'
     if say == 'keep':
         return f'{capital(_STIFF_PLATE)} before you take more' if facts.bend_m else 'Keep it'
     if say == 'correct' and d.offers_extended:
         flatten = ', or flatten it' if _is_bent(d) else ''
         use = f'Use it with {LENS_FILE}, which corrects its errors{flatten}'
-        return f'{use}. These corrections hold for no other target'
+        return f'{use}. The lens in it works with any target; these corrections do not'
     return f'For better poses, {_remedy(d, facts)}'
 
 

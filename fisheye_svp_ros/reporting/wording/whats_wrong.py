@@ -47,12 +47,13 @@ _MAX_RUNS = 8  # of frame numbers of a group
 _DISPLACED = (TargetReason.CAUSE_AND_OFFSETS, TargetReason.OFFSETS_COST)
 _BRIEF = {
     'target_shape': 'bent board',
-    'landmark_scale': 'target scale',
+    'landmark_scale': 'target size error',
     'landmark_survey': 'displaced:',
     'board_pose': 'misplaced boards',
-    'session_step': 'jump of intrinsics',
-    'radial_profile': 'lens curve',
-    'pupil_decentering': 'sideways pupil',
+    'session_step': 'intrinsics jump',
+    'radial_profile': 'lens curve error',
+    'viewpoint_shift': 'viewpoint movement',
+    'pupil_decentering': 'sideways pupil movement',
 }
 
 
@@ -139,7 +140,7 @@ def _gains(d: Diagnosis) -> list[str]:
     verb = 'lowers' if named < base else 'raises'
     return [
         f'correction {verb} the error on left-out frames from {before} to {after} px',
-        f'left-out error {before} → {after} px if corrected',
+        f'correction: held-out error {before} → {after} px',
     ]
 
 
@@ -157,7 +158,7 @@ def _target_errors(d: Diagnosis) -> list[_Error]:
         return []
     bend, far = (f'{1e3 * rms:.2g} mm rms' for rms in (target.facts.bend_m, target.facts.local_m))
     if target.facts.bend_m:
-        errors.append(_Error(frame_bend(target.facts), f'bend between frames {bend}'))
+        errors.append(_Error(frame_bend(target.facts), f'board bends {bend} between frames'))
     if target.reason in _DISPLACED and target.facts.local_m:
         errors.append(_Error(f'landmarks are displaced by {far}', f'displaced landmarks {far}'))
     return errors
