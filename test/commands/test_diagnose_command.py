@@ -518,7 +518,7 @@ class TestWords:
         words = what_is_wrong(with_changes(found, causes=[first, board]))
         assert re.match(
             r'The relative poses of the boards are wrong \(0.64 mm\); (the viewpoint of the lens '
-            r'moves by [\d.]+ mm from the axis to \d+ deg|viewpoint shift [\d.]+ mm)',
+            r'moves by [\d.]+ mm from the axis to \d+ deg|viewpoint movement [\d.]+ mm)',
             words,
         )
 
