@@ -224,7 +224,7 @@ def shared_names(linear: Linearization, state: RigState | None = None) -> tuple[
 
 
 def _rig_columns(linear: Linearization) -> int:
-    """Return how many of what is shared, the first ones, place cameras and boards but the first."""
+    """Return how many of what is shared, the first ones, place further cameras and boards."""
     return 6 * (len(linear.state.rig.position) - 1)
 
 
