@@ -30,7 +30,7 @@ def target_words(d: Diagnosis) -> str:
     facts, say = decision.facts, decision.say
     assert isinstance(facts, TargetFacts)
     if say == 'undecided':
-        return 'Keep it for now'
+        return 'Leave it as it is'
     if say == 'keep':
         return f'{capital(_STIFF_PLATE)} before you take more' if facts.bend_m else 'Keep it'
     if say == 'correct' and d.offers_extended:
