@@ -25,7 +25,7 @@ from fisheye_svp_ros.diagnosis.decision import (
     least_likely_offset,
 )
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
-from fisheye_svp_ros.diagnosis.model_errors import mask_shared
+from fisheye_svp_ros.diagnosis.model_errors import count_rig_columns, mask_shared
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.uncertainty import LensCovariance
 from fisheye_svp_ros.effects.base import Effect
@@ -124,7 +124,7 @@ def _rig_response(null: NullModel, at: Index) -> Array:
     As the poses of the frames, those of the cameras on the rig are fitted with either lens:
     otherwise a center that the rig would absorb counts as an error of the lens as given.
     """
-    count = 6 * (null.linear.data.cameras - 1)
+    count = count_rig_columns(null.linear)
     left = flat_rows(project_out(null.fixed.border[..., at], null.linear.frame_columns))
     products = left[:, :count].T @ left
     return pseudo_inverse(products[:, :count]) @ products
@@ -133,7 +133,7 @@ def _rig_response(null: NullModel, at: Index) -> Array:
 def _shared_values(evaluation: Evaluation) -> tuple[Array, Array]:
     """Return what is shared (K,), zeros for the rig, as it was found and as the lenses have it."""
     null, problem = evaluation.null, evaluation.problem
-    start, free = 6 * (null.linear.data.cameras - 1), null.linear.free
+    start, free = count_rig_columns(null.linear), null.linear.free
     now = np.append(np.zeros(start), null.linear.state.shared_values(free))
     stated, given = stated_parameters(problem.inputs.lenses), now.copy()
     given[start : start + len(free)] = [stated[name][0] for name in free]

@@ -219,11 +219,11 @@ def shared_names(linear: Linearization, state: RigState | None = None) -> tuple[
         if is_shared(term.effect)
         for name in parameter_names(term.effect)
     ]
-    rig = (f'rig.{i}' for i in range(_rig_columns(linear)))
+    rig = (f'rig.{i}' for i in range(count_rig_columns(linear)))
     return (*rig, *linear.free, *terms)
 
 
-def _rig_columns(linear: Linearization) -> int:
+def count_rig_columns(linear: Linearization) -> int:
     """Return how many of what is shared, the first ones, place further cameras and boards."""
     return 6 * (len(linear.state.rig.position) - 1)
 
@@ -250,7 +250,7 @@ def mask_shared(linear: Linearization, which: Callable[[Effect], bool]) -> Mask:
     ]
     return np.concatenate(
         [
-            np.zeros(_rig_columns(linear), dtype=bool),
+            np.zeros(count_rig_columns(linear), dtype=bool),
             np.ones(len(linear.free), dtype=bool),
             *own,
         ]
@@ -279,7 +279,7 @@ def with_uncertainty(
         by[name] = np.zeros((len(_numbers(lenses[name])), len(errors.covariance)))
     frames = np.zeros((linear.data.frames, 6))
     for k, stderr in enumerate(np.sqrt(np.diag(errors.covariance))):
-        if k < _rig_columns(linear) or not stderr:
+        if k < count_rig_columns(linear) or not stderr:
             continue  # of the rig
         step = np.zeros(len(errors.covariance))
         step[k] = _STEP_SIGMAS * stderr
